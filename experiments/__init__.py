@@ -1,0 +1,1 @@
+"""Scripts driven by absl flags; run from the root of the checkout."""

@@ -1,0 +1,1 @@
+"""Cameras, rotations, virtual poses, warps and masks: usable alone in any JAX project."""

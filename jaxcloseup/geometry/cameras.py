@@ -1,0 +1,105 @@
+"""Pinhole cameras: pixels to rays to points, and back.
+
+The camera frame is OpenCV's (x right, y down, z forward) and poses are camera-to-world. Pixels are
+continuous (x, y) with the centre of the top-left pixel at (0.5, 0.5). Depth is z-depth in world
+units; ray directions have unit camera-z, so the parameter along a ray *is* the depth.
+
+Functions take one camera and any number of pixels or points `[...]`; batch cameras with `jax.vmap`.
+"""
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxcloseup.numerics import matmul
+
+
+@struct.dataclass
+class Camera:
+    """A pinhole camera; stacked cameras carry leading axes on both arrays.
+
+    Attributes:
+      camtoworld: `[3, 4]` rotation and position, camera to world.
+      intrinsics: `[4]` fx, fy, cx, cy in pixels.
+      height: image height in pixels, static.
+      width: image width in pixels, static.
+    """
+
+    camtoworld: jax.Array
+    intrinsics: jax.Array
+    height: int = struct.field(pytree_node=False)
+    width: int = struct.field(pytree_node=False)
+
+    @property
+    def rotation(self) -> jax.Array:
+        """`[..., 3, 3]` camera-to-world rotation; its columns are the camera's axes."""
+        return self.camtoworld[..., :3]
+
+    @property
+    def position(self) -> jax.Array:
+        """`[..., 3]` centre of projection, world units."""
+        return self.camtoworld[..., 3]
+
+
+def pixel_grid(height: int, width: int) -> jax.Array:
+    """Centres of all pixels, `[height, width, 2]` as (x, y)."""
+    x, y = jnp.meshgrid(jnp.arange(width) + 0.5, jnp.arange(height) + 0.5)
+    return jnp.stack([x, y], axis=-1)
+
+
+def pixels_to_rays(camera: Camera, pixels: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """World rays through pixels.
+
+    Args:
+      camera: one camera.
+      pixels: `[..., 2]` continuous (x, y).
+
+    Returns:
+      `[..., 3]` origins and `[..., 3]` directions. Directions have unit camera-z, not unit length.
+    """
+    _check_camera(camera)
+    chex.assert_axis_dimension(pixels, -1, 2)
+    focal, centre = camera.intrinsics[:2], camera.intrinsics[2:]
+    xy = (pixels - _match(centre, pixels)) / _match(focal, pixels)
+    in_camera = jnp.concatenate([xy, jnp.ones_like(xy[..., :1])], axis=-1)
+    directions = matmul(in_camera, camera.rotation.T)
+    return jnp.broadcast_to(camera.position, directions.shape), directions
+
+
+def pixels_to_points(camera: Camera, pixels: jax.Array, depth: jax.Array) -> jax.Array:
+    """World points `[..., 3]` at z-depth `depth[...]` behind `pixels[..., 2]`."""
+    chex.assert_equal_shape_prefix([pixels, depth], depth.ndim)
+    origins, directions = pixels_to_rays(camera, pixels)
+    return origins + depth[..., None] * directions
+
+
+def points_to_pixels(camera: Camera, points: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Project world points.
+
+    Args:
+      camera: one camera.
+      points: `[..., 3]` in world units.
+
+    Returns:
+      `[..., 2]` pixels and `[...]` depths. Where a point is not in front of the camera (depth <= 0)
+      its pixel has no meaning: values and gradients are finite, and the caller tests the depth.
+    """
+    _check_camera(camera)
+    chex.assert_axis_dimension(points, -1, 3)
+    in_camera = matmul(points - _match(camera.position, points), camera.rotation)
+    depth = in_camera[..., 2]
+    in_front = depth > jnp.finfo(depth.dtype).eps
+    xy = in_camera[..., :2] / jnp.where(in_front, depth, 1)[..., None]
+    focal, centre = camera.intrinsics[:2], camera.intrinsics[2:]
+    return xy * _match(focal, xy) + _match(centre, xy), depth
+
+
+def _check_camera(camera: Camera) -> None:
+    chex.assert_shape(camera.camtoworld, (3, 4))
+    chex.assert_shape(camera.intrinsics, (4,))
+
+
+def _match(vector: jax.Array, like: jax.Array) -> jax.Array:
+    """Reshape a vector to broadcast along the last axis of `like` without rank promotion."""
+    return vector.reshape((1,) * (like.ndim - 1) + vector.shape)

@@ -1,0 +1,1 @@
+"""Host side, what comes in: captures from disk and procedural scenes."""

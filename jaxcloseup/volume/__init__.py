@@ -1,0 +1,1 @@
+"""Volume rendering: ray sampling, encodings, compositing and the NeRF built of them."""

@@ -1,0 +1,26 @@
+"""Strict numerics for every test, and where the shared reference data lies, if it is here."""
+
+import pathlib
+
+import jax
+import pytest
+
+
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+SHARED = pathlib.Path(__file__).parents[2] / "shared"
+
+
+@pytest.fixture(scope="session")
+def shared():
+    """The folder of real captures and golden values beside the checkout."""
+    if not SHARED.is_dir():
+        pytest.skip(f"reference data is not here: {SHARED}")
+    return SHARED
+
+
+@pytest.fixture
+def key(request):
+    """A key that differs from test to test and never from run to run."""
+    return jax.random.key(sum(map(ord, request.node.name)) % 2**31)
