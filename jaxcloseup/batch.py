@@ -65,7 +65,7 @@ def sample_pixels(key: jax.Array, views: Views, count: int) -> Batch:
     x = jax.random.randint(key_x, (count,), 0, width)
     return Batch(
         cameras=camera_at(views.cameras, view),
-        pixels=jnp.stack([x, y], axis=-1) + 0.5,
+        pixels=jnp.stack([x, y], axis=-1).astype(jnp.float32) + 0.5,
         rgb=to_float(views.rgb[view, y, x]),
         weight=views.weight[view, y, x],
     )

@@ -25,3 +25,13 @@ def unproject(camtoworld, intrinsics, pixels, depths):
     for (x, y), z in zip(np.asarray(pixels, np.float64), np.asarray(depths), strict=True):
         points.append(position + rotation @ np.array([(x - cx) / fx * z, (y - cy) / fy * z, z]))
     return np.array(points)
+
+
+def forward_warp(values, pixels, depths, shape):
+    """Z-buffer, one source after the other: `(values [H, W, C], depth [H, W])`, inf where empty."""
+    height, width = shape
+    image, buffer = np.zeros((height, width, values.shape[-1])), np.full(shape, np.inf)
+    for value, (x, y), depth in zip(values, pixels, depths, strict=True):
+        if 0 <= x < width and 0 <= y < height and 0 < depth < buffer[int(y), int(x)]:
+            image[int(y), int(x)], buffer[int(y), int(x)] = value, depth
+    return image, buffer

@@ -44,7 +44,7 @@ class Camera:
 
 def pixel_grid(height: int, width: int) -> jax.Array:
     """Centres of all pixels, `[height, width, 2]` as (x, y)."""
-    x, y = jnp.meshgrid(jnp.arange(width) + 0.5, jnp.arange(height) + 0.5)
+    x, y = jnp.meshgrid(jnp.arange(0.5, width), jnp.arange(0.5, height))
     return jnp.stack([x, y], axis=-1)
 
 
