@@ -1,0 +1,245 @@
+"""Scenes by name or from a folder of photographs."""
+
+import concurrent.futures
+import pathlib
+import warnings
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcloseup.batch import Views
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.scenes.bounds import near_far_from_cameras, near_far_from_points
+from jaxcloseup.scenes.errors import ImageSizeWarning, NearFarWarning, SceneError
+from jaxcloseup.scenes.images import downscale_image, pad_images, read_image, read_mask
+from jaxcloseup.scenes.points import read_ply_points
+from jaxcloseup.scenes.scene import Scene
+from jaxcloseup.scenes.splits import Listing, read_listing, unique_names
+from jaxcloseup.scenes.transforms import Frame, frame_intrinsics, number, rigid_transform
+
+
+class _Photo(NamedTuple):
+    """A photograph after downscaling, and the (width, height) that it had before."""
+
+    rgb: np.ndarray
+    mask: np.ndarray
+    stored_size: tuple[int, int]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.rgb.shape[1], self.rgb.shape[0]
+
+
+def load_scene(
+    name_or_path: str | pathlib.Path,
+    *,
+    downscale: int = 1,
+    half_pixel: bool = False,
+    background: float = 1.0,
+) -> Scene:
+    """A built-in scene by its name, or a capture from its folder.
+
+    A folder holds either
+
+    - `transforms_train.json`, and beside it `transforms_test.json` (split `test`) and
+      `transforms_test_far.json` or, as Blender's datasets name it, `transforms_val.json` (split
+      `test_far`). `test` is meant for close-ups, but nothing checks that its views are; or
+    - `transforms.json`, of instant-ngp or nerfstudio. Its `train_filenames`, `test_filenames` and
+      `val_filenames` are the three splits; without them every 8th photograph, sorted by name, is
+      held out as `test_far`.
+
+    Lenses are pinholes. Photographs of several sizes are padded at the right and the bottom with
+    pixels of weight 0, and each camera keeps its own intrinsics. A frame's `mask_path` weighs its
+    pixels: white counts, black does not. Initial points come from `ply_file_path`, else from
+    `points3d.ply`. `near` and `far` are the file's, or are estimated with a warning.
+
+    Args:
+      name_or_path: one of `PROCEDURAL_SCENES`, or a folder; `./table` is the folder of that name.
+      downscale: whole number by which photographs shrink, by averaging areas.
+      half_pixel: the files count pixel centres at whole numbers, as the paper's do.
+      background: grey level in [0, 1] behind transparent pixels.
+
+    Returns:
+      The scene. For a folder, `metadata` holds `path`, `downscale`, `files` and `sizes` (the path
+      and, before padding, the (width, height) of each photograph, by split) and
+      `applied_transform` (`[3, 4]`, from the capture's original world to this one, or None).
+
+    Raises:
+      SceneError: one sentence that names the file and the field and says what to do.
+    """
+    if isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1:
+        raise SceneError(f"downscale must be a whole number of at least 1, got {downscale!r}.")
+    path = pathlib.Path(name_or_path)
+    if len(path.parts) == 1 and str(name_or_path) == path.name:
+        from jaxcloseup.scenes.procedural import PROCEDURAL_SCENES, procedural_scene
+
+        if path.name in PROCEDURAL_SCENES:
+            return procedural_scene(path.name, downscale=downscale)
+        if not path.exists():
+            raise SceneError(
+                f"{path} is neither a folder nor a built-in scene: choose one of "
+                f"{', '.join(PROCEDURAL_SCENES)}, or give the path of a capture."
+            )
+    if not path.is_dir():
+        raise SceneError(f"{path} is not a folder: give the one that holds the transforms*.json.")
+    return _load_folder(path, downscale, half_pixel, background)
+
+
+def _load_folder(path: pathlib.Path, downscale: int, half_pixel: bool, background: float) -> Scene:
+    listing = read_listing(path)
+    frames = [frame for members in listing.frames.values() for frame in members]
+    with concurrent.futures.ThreadPoolExecutor() as pool:  # OpenCV decodes without Python's lock
+        photos = list(pool.map(lambda frame: _read_photo(frame, downscale, background), frames))
+    _warn_sizes(listing, frames, photos)
+    intrinsics = np.stack(
+        [_intrinsics(*pair, half_pixel) for pair in zip(frames, photos, strict=True)]
+    )
+    camtoworld = np.stack([frame.camtoworld for frame in frames])
+    sizes = np.array([photo.size for photo in photos])
+    points, rgb = _read_points(listing)
+    near, far = _near_far(listing, points, camtoworld, intrinsics, sizes)
+    transform = listing.fields.get("applied_transform")
+    if transform is not None:
+        transform = rigid_transform(str(listing.file), "applied_transform", transform)
+
+    width, height = sizes.max(0).tolist()
+    ends = np.cumsum([len(members) for members in listing.frames.values()])[:-1]
+    parts = dict(zip(listing.frames, np.split(np.arange(len(frames)), ends), strict=True))
+    views = {
+        split: Views(
+            cameras=Camera(
+                camtoworld=jnp.asarray(camtoworld[part], jnp.float32),
+                intrinsics=jnp.asarray(intrinsics[part], jnp.float32),
+                height=height,
+                width=width,
+            ),
+            rgb=jnp.asarray(pad_images([photos[i].rgb for i in part], height, width)),
+            weight=jnp.asarray(pad_images([photos[i].mask for i in part], height, width)) / 255,
+        )
+        for split, part in parts.items()
+    }
+    files = {split: [frame.file for frame in part] for split, part in listing.frames.items()}
+    return Scene(
+        name=path.resolve().name,
+        train=views["train"],
+        test=views.get("test"),
+        test_far=views.get("test_far"),
+        points=points,
+        rgb=rgb,
+        near=near,
+        far=far,
+        names={split: unique_names(paths) for split, paths in files.items()},
+        metadata={
+            "path": path,
+            "downscale": downscale,
+            "files": files,
+            "sizes": {split: [photos[i].size for i in part] for split, part in parts.items()},
+            "applied_transform": transform,
+        },
+    )
+
+
+def _read_photo(frame: Frame, downscale: int, background: float) -> _Photo:
+    rgb = read_image(frame.file, background=background)
+    height, width = rgb.shape[:2]
+    if downscale > min(width, height):
+        raise SceneError(
+            f"{frame.file} is {width} x {height} pixels, so that downscale {downscale} leaves "
+            "nothing of it: take a smaller one."
+        )
+    mask = np.full((height, width), 255, np.uint8)
+    if frame.mask:
+        mask = read_mask(frame.mask)
+        if mask.shape != (height, width):
+            raise SceneError(
+                f"{frame.mask} is {mask.shape[1]} x {mask.shape[0]} pixels and its photograph "
+                f"{width} x {height}: give them one size."
+            )
+    return _Photo(
+        downscale_image(rgb, downscale), downscale_image(mask, downscale), (width, height)
+    )
+
+
+def _intrinsics(frame: Frame, photo: _Photo, half_pixel: bool) -> np.ndarray:
+    """fx, fy, cx, cy in the pixels of the downscaled photograph."""
+    size = frame.size or photo.stored_size
+    return frame_intrinsics(frame, *size, half_pixel=half_pixel) * np.tile(
+        np.divide(photo.size, size), 2
+    )
+
+
+def _warn_sizes(listing: Listing, frames: Sequence[Frame], photos: Sequence[_Photo]) -> None:
+    """Accept images that were resized as a whole, and refuse other sizes than the file's."""
+    resized = []
+    for frame, photo in zip(frames, photos, strict=True):
+        (width, height), (w, h) = photo.stored_size, frame.size or photo.stored_size
+        if (width, height) == (w, h):
+            continue
+        # Resizing rounds each side to whole pixels: its aspect agrees to within one of them.
+        if abs(width * h / w - height) > 1 and abs(height * w / h - width) > 1:
+            turned = (
+                " (an EXIF orientation was applied to one of them)"
+                if (w, h)
+                == (
+                    height,
+                    width,
+                )
+                else ""
+            )
+            raise SceneError(
+                f"{frame.label}: the image is {width} x {height} pixels, but w and h are {w} x {h}"
+                f"{turned}: restore the image that the camera was solved for, or correct w and h."
+            )
+        resized.append(f"{frame.listed} is {width} x {height} and not {w} x {h}")
+    if resized:
+        more = f" and {len(resized) - 1} more" if len(resized) > 1 else ""
+        warnings.warn(
+            f"{listing.file.parent}: {resized[0]}{more}; intrinsics were scaled to the images.",
+            ImageSizeWarning,
+            stacklevel=2,
+        )
+
+
+def _read_points(listing: Listing) -> tuple[np.ndarray, np.ndarray]:
+    folder, named = listing.file.parent, listing.fields.get("ply_file_path")
+    if named and not (folder / str(named)).is_file():
+        raise SceneError(
+            f"{listing.file}: ply_file_path {named!r} does not exist: restore it or drop the field."
+        )
+    file = folder / str(named or "points3d.ply")
+    if file.is_file():
+        return read_ply_points(file)
+    return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
+
+
+def _near_far(
+    listing: Listing,
+    points: np.ndarray,
+    camtoworld: np.ndarray,
+    intrinsics: np.ndarray,
+    sizes: np.ndarray,
+) -> tuple[float, float]:
+    label = str(listing.file)
+    given = {
+        key: number(label, key, listing.fields[key], above=0)
+        for key in ("near", "far")
+        if listing.fields.get(key) is not None
+    }
+    near, far = given.get("near"), given.get("far")
+    if near is None or far is None:
+        estimate = near_far_from_points(points, camtoworld, intrinsics, sizes)
+        source = "points" if estimate else "poses"
+        low, high = estimate or near_far_from_cameras(camtoworld)
+        near, far = near or low, far or high
+        absent = " and ".join(key for key in ("near", "far") if key not in given)
+        warnings.warn(
+            f"{label}: no {absent}; from the {source}, near {near:.4g} and far {far:.4g} are used: "
+            "give both in world units if they do not hold the scene.",
+            NearFarWarning,
+            stacklevel=2,
+        )
+    if near >= far:
+        raise SceneError(f"{label}: near {near:.4g} is not less than far {far:.4g}: correct them.")
+    return near, far

@@ -1,0 +1,93 @@
+"""Photographs from disk: decoding, transparency, downscaling and padding."""
+
+import pathlib
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from jaxcloseup.scenes.errors import SceneError
+
+
+def read_image(path: pathlib.Path, *, background: float = 1.0) -> np.ndarray:
+    """A photograph as uint8 `[H, W, 3]`, red first.
+
+    Grey becomes RGB, 16 bits become 8, and transparency is composited over the grey level
+    `background` in [0, 1]. Pixels stay as they are stored: an EXIF orientation is not applied,
+    because cameras are solved for, and transforms refer to, the stored pixels.
+
+    Raises:
+      SceneError: the file is missing, truncated, damaged or not a picture of 8 or 16 bits.
+    """
+    image = _decode(path)
+    if image.ndim == 2:
+        image = image[..., None]
+    if image.shape[-1] in (2, 4):
+        alpha = image[..., -1:].astype(np.float32) / 255
+        image = np.rint(image[..., :-1] * alpha + 255 * background * (1 - alpha)).astype(np.uint8)
+    # OpenCV stores blue first.
+    return (
+        np.repeat(image, 3, -1) if image.shape[-1] == 1 else np.ascontiguousarray(image[..., ::-1])
+    )
+
+
+def read_mask(path: pathlib.Path) -> np.ndarray:
+    """A mask as uint8 `[H, W]`: white counts, black does not."""
+    return read_image(path)[..., 0]
+
+
+def downscale_image(image: np.ndarray, factor: int) -> np.ndarray:
+    """Average areas of `factor` x `factor` pixels; a remainder is spread over all of them."""
+    if factor == 1:
+        return image
+    height, width = (max(1, side // factor) for side in image.shape[:2])
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def pad_images(images: Sequence[np.ndarray], height: int, width: int) -> np.ndarray:
+    """Stack `[h, w, ...]` images of any sizes into the top left of `[V, height, width, ...]`."""
+    stack = np.zeros((len(images), height, width, *images[0].shape[2:]), images[0].dtype)
+    for target, image in zip(stack, images, strict=True):
+        target[: image.shape[0], : image.shape[1]] = image
+    return stack
+
+
+def _decode(path: pathlib.Path) -> np.ndarray:
+    try:
+        # `cv2.imread` fails on non-ASCII paths on some systems; decoding from memory never does.
+        data = np.fromfile(path, np.uint8)
+    except OSError as error:
+        raise SceneError(f"{path} cannot be read ({error.strerror}): restore the file.") from error
+    image = None
+    if data.size and not _is_truncated_jpeg(data.tobytes()):
+        try:
+            image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)  # ignores EXIF, keeps alpha and depth
+        except cv2.error:
+            image = None
+    if image is None:
+        raise SceneError(
+            f"{path} is not a readable image, or it is truncated: copy or export it again."
+        )
+    if image.dtype == np.uint16:
+        image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    if image.dtype != np.uint8:
+        raise SceneError(
+            f"{path} holds {image.dtype} values: export it with 8 or 16 bits per channel."
+        )
+    return image
+
+
+def _is_truncated_jpeg(data: bytes) -> bool:
+    """Whether a JPEG ends before its end marker; some decoders then return grey without a word.
+
+    Segments before the scan are skipped by their lengths, since a thumbnail inside one of them has
+    an end marker of its own. In the scan itself ff d9 can be nothing else.
+    """
+    if not data.startswith(b"\xff\xd8"):
+        return False
+    position = 2
+    while position + 4 <= len(data) and data[position] == 0xFF:
+        if data[position + 1] == 0xDA:
+            return b"\xff\xd9" not in data[position:]
+        position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
+    return True
