@@ -179,15 +179,8 @@ def _warn_sizes(listing: Listing, frames: Sequence[Frame], photos: Sequence[_Pho
             continue
         # Resizing rounds each side to whole pixels: its aspect agrees to within one of them.
         if abs(width * h / w - height) > 1 and abs(height * w / h - width) > 1:
-            turned = (
-                " (an EXIF orientation was applied to one of them)"
-                if (w, h)
-                == (
-                    height,
-                    width,
-                )
-                else ""
-            )
+            swapped = (w, h) == (height, width)
+            turned = ", turned as by an EXIF orientation" if swapped else ""
             raise SceneError(
                 f"{frame.label}: the image is {width} x {height} pixels, but w and h are {w} x {h}"
                 f"{turned}: restore the image that the camera was solved for, or correct w and h."

@@ -69,11 +69,11 @@ def unique_names(files: Sequence[pathlib.Path]) -> list[str]:
     stems = [file.stem for file in files]
     names = []
     for file, stem in zip(files, stems, strict=True):
-        name = stem if stems.count(stem) == 1 else f"{file.parent.name}_{stem}"
+        name = base = stem if stems.count(stem) == 1 else f"{file.parent.name}_{stem}"
         repeat = 1
         while name in names:
             repeat += 1
-            name = f"{file.parent.name}_{stem}_{repeat}"
+            name = f"{base}_{repeat}"
         names.append(name)
     return names
 

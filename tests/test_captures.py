@@ -1,0 +1,304 @@
+import sys
+import types
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from tiny_capture import (
+    HEIGHT,
+    POSE,
+    WIDTH,
+    frame,
+    paper_capture,
+    single_file,
+    vertices,
+    write_image,
+    write_json,
+    write_ply,
+)
+
+from jaxcloseup.scenes import SceneError, load_scene
+from jaxcloseup.scenes.errors import (
+    DuplicateFileWarning,
+    ImageSizeWarning,
+    NearFarWarning,
+)
+
+
+@pytest.fixture
+def capture(tmp_path):
+    return paper_capture(tmp_path)
+
+
+def test_paper_layout(capture):
+    write_json(capture / "transforms_video.json", [frame("")])
+    scene = load_scene(capture)
+    assert (len(scene.train), len(scene.test), scene.test_far) == (2, 1, None)
+    assert scene.names == {"train": ["a", "b"], "test": ["a"]}
+    assert (scene.near, scene.far, scene.name) == (1.0, 9.0, capture.name)
+    assert scene.train.rgb.dtype == jnp.uint8 and scene.train.rgb.shape == (2, HEIGHT, WIDTH, 3)
+    assert (np.asarray(scene.train.rgb) == 11).all() and (np.asarray(scene.test.rgb) == 10).all()
+    assert (np.asarray(scene.train.weight) == 1).all() and scene.train.weight.dtype == jnp.float32
+    np.testing.assert_allclose(scene.train.cameras.intrinsics, [[10, 11, 4, 3]] * 2)
+    np.testing.assert_allclose(scene.test.cameras.intrinsics, [[30, 11, 4, 3]])
+    assert (scene.train.cameras.width, scene.train.cameras.height) == (WIDTH, HEIGHT)
+    assert scene.points.shape == scene.rgb.shape == (0, 3) and scene.surface is None
+    assert scene.metadata["files"]["test"] == [capture / "test" / "a.png"]
+    assert scene.metadata["sizes"]["test"] == [(WIDTH, HEIGHT)]
+    assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(scene.train))
+
+
+def test_opengl_pose_becomes_opencv(capture):
+    """OpenGL's identity looks along -z with y up: what is up is drawn above, near the top."""
+    scene = load_scene(capture)
+    points = POSE[:3, 3] + [[0, 0, -2], [1, 0, -2], [0, 1, -2]]
+    pixels, depth = reference.project(scene.train.cameras.camtoworld[0], [10, 11, 4, 3], points)
+    np.testing.assert_allclose(depth, 2, atol=1e-6)
+    np.testing.assert_allclose(pixels, [[4, 3], [9, 3], [4, 3 - 5.5]], atol=1e-6)
+
+
+def test_half_pixel_moves_what_the_file_gives(capture):
+    scene = load_scene(capture, half_pixel=True)
+    np.testing.assert_allclose(scene.train.cameras.intrinsics[0], [10, 11, 4.5, 3.5])
+    scene = load_scene(capture, half_pixel=True, downscale=2)
+    np.testing.assert_allclose(scene.train.cameras.intrinsics[0], [5, 5.5, 2.25, 1.75])
+
+
+def test_blender_layout(tmp_path):
+    rgba = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
+    rgba[..., 0], rgba[:, 4:, 3], rgba[0, 0] = 200, 255, [200, 100, 0, 128]
+    poses = [{"file_path": f"./train/r_{i}", "transform_matrix": POSE.tolist()} for i in range(2)]
+    for i in range(2):
+        write_image(tmp_path / f"train/r_{i}.png", rgba)
+    for split in ("train", "test", "val"):
+        write_json(
+            tmp_path / f"transforms_{split}.json",
+            [{**pose, "rotation": 0.01} for pose in poses],
+            camera_angle_x=np.pi / 2,
+        )
+    with pytest.warns(DuplicateFileWarning, match=r"\./train/r_0 \(train and test\)"):
+        scene = load_scene(tmp_path)
+    assert (len(scene.train), len(scene.test), len(scene.test_far)) == (2, 2, 2)
+    np.testing.assert_allclose(scene.train.cameras.intrinsics[0], [4, 4, 4, 3], rtol=1e-6)
+    assert scene.train.rgb[0, 0].tolist() == [[227, 177, 127]] + [[255] * 3] * 3 + [[200, 0, 0]] * 4
+    assert (np.asarray(scene.train.weight) == 1).all()
+    with pytest.warns(DuplicateFileWarning):
+        scene = load_scene(tmp_path, background=0.0, half_pixel=True)
+    assert scene.train.rgb[0, 0].tolist() == [[100, 50, 0]] + [[0] * 3] * 3 + [[200, 0, 0]] * 4
+    # No principal point in the file, so none to move.
+    np.testing.assert_allclose(scene.train.cameras.intrinsics[0], [4, 4, 4, 3], rtol=1e-6)
+
+
+def test_single_file_holds_out_every_eighth(tmp_path, caplog):
+    single_file(tmp_path, 10, camera_model="OPENCV")
+    with caplog.at_level("INFO", "jaxcloseup"):
+        scene = load_scene(tmp_path)
+    assert scene.test is None and scene.names["test_far"] == ["000", "008"]
+    assert scene.names["train"] == [f"{i:03d}" for i in range(10) if i % 8]
+    assert scene.train.rgb[:, 0, 0, 0].tolist() == [1, 2, 3, 4, 5, 6, 7, 9]
+    np.testing.assert_allclose(scene.train.cameras.intrinsics[0], [7, 9, 3.5, 2.5])
+    assert "every 8th" in caplog.text
+
+
+def test_single_file_with_lists(tmp_path):
+    # Rz(90 degrees) and a shift, as nerfstudio writes it.
+    transform = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 2]]
+    lists = {"test_filenames": ["./images/003.png"], "val_filenames": ["images/001.png"]}
+    single_file(tmp_path, 4, applied_transform=transform, **lists)
+    scene = load_scene(tmp_path)
+    assert scene.names == {"train": ["002", "000"], "test": ["003"], "test_far": ["001"]}
+    np.testing.assert_array_equal(scene.metadata["applied_transform"], transform)
+    single_file(tmp_path, 4, train_filenames=["images/000.png"], **lists)
+    assert load_scene(tmp_path).names["train"] == ["000"]
+
+
+def test_one_photograph(tmp_path):
+    single_file(tmp_path, 1)
+    scene = load_scene(tmp_path)
+    assert len(scene.train) == 1 and scene.test is None and scene.test_far is None
+
+
+def test_both_kinds_of_file(capture, caplog):
+    single_file(capture, 3)
+    with caplog.at_level("INFO", "jaxcloseup"):
+        assert load_scene(capture).names["train"] == ["a", "b"]
+    assert "transforms_train.json and not transforms.json" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("lens", "expected"),
+    [
+        ({"camera_angle_y": np.pi / 2}, [3, 3, 4, 3]),
+        ({"camera_angle_x": np.pi / 2, "camera_angle_y": np.pi / 2}, [4, 3, 4, 3]),
+        ({"fl_x": 5.0, "camera_angle_x": 1.0, "cx": 1.0}, [5, 5, 1, 3]),
+        ({"fl_y": 5, "cy": 0}, [5, 5, 4, 0]),
+    ],
+)
+def test_lens_fields(tmp_path, lens, expected):
+    write_image(tmp_path / "a.png")
+    pose = {"file_path": "a.png", "transform_matrix": POSE.tolist()}
+    write_json(tmp_path / "transforms.json", [pose], **lens)
+    np.testing.assert_allclose(
+        load_scene(tmp_path).train.cameras.intrinsics[0], expected, rtol=1e-6
+    )
+    # A frame's own lens wins over the file's, in whatever fields either is written.
+    write_json(tmp_path / "transforms.json", [{**pose, **lens}], fx=99.0, fl_x=98.0)
+    np.testing.assert_allclose(
+        load_scene(tmp_path).train.cameras.intrinsics[0], expected, rtol=1e-6
+    )
+
+
+def test_mixed_sizes_are_padded(tmp_path):
+    write_image(tmp_path / "a.png", np.full((6, 8, 3), 50, np.uint8))
+    write_image(tmp_path / "b.png", np.full((8, 6, 3), 60, np.uint8))
+    frames = [frame("a.png", w=8, h=6), frame("b.png", w=6, h=8, cx=3.0, cy=4.0)]
+    write_json(tmp_path / "transforms_train.json", frames)
+    scene = load_scene(tmp_path)
+    assert scene.train.rgb.shape == (2, 8, 8, 3)
+    expected = np.zeros((2, 8, 8))
+    expected[0, :6, :], expected[1, :, :6] = 1, 1
+    np.testing.assert_array_equal(scene.train.weight, expected)
+    np.testing.assert_array_equal(
+        scene.train.rgb[..., 0], expected * np.array([50, 60])[:, None, None]
+    )
+    np.testing.assert_allclose(scene.train.cameras.intrinsics, [[10, 11, 4, 3], [10, 11, 3, 4]])
+    assert (scene.train.cameras.height, scene.train.cameras.width) == (8, 8)
+    assert scene.metadata["sizes"]["train"] == [(8, 6), (6, 8)]
+
+
+def test_mask_weighs_pixels(capture):
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[:, :3] = 255
+    write_image(capture / "masks/a.png", mask)
+    frames = [frame("train/a.png", mask_path="masks/a.png"), frame("train/b.png", mask_path=None)]
+    write_json(capture / "transforms_train.json", frames)
+    scene = load_scene(capture, downscale=2)
+    assert scene.train.weight[0, 0].tolist() == pytest.approx([1, 0.5, 0, 0], abs=2e-3)
+    assert (np.asarray(scene.train.weight[1]) == 1).all()
+    write_image(capture / "masks/a.png", mask[:3])
+    with pytest.raises(SceneError, match=r"masks/a\.png is 8 x 3 pixels and its photograph 8 x 6"):
+        load_scene(capture)
+
+
+def test_downscale_averages_areas(tmp_path):
+    image = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+    write_image(tmp_path / "a.png", image)
+    write_json(tmp_path / "transforms_train.json", [frame("a.png")])
+    scene = load_scene(tmp_path, downscale=2)
+    expected = image.reshape(3, 2, 4, 2, 3).mean((1, 3))
+    np.testing.assert_allclose(scene.train.rgb[0], expected, atol=0.51)
+    np.testing.assert_allclose(scene.train.cameras.intrinsics[0], [5, 5.5, 2, 1.5])
+    # 8 x 6 becomes 2 x 2: each axis has its own ratio, and both edges stay edges.
+    scene = load_scene(tmp_path, downscale=3)
+    assert scene.train.rgb.shape == (1, 2, 2, 3) and scene.train.cameras.width == 2
+    np.testing.assert_allclose(scene.train.cameras.intrinsics[0], [2.5, 11 / 3, 1, 1], rtol=1e-6)
+    np.testing.assert_allclose(
+        scene.train.rgb[0], image.reshape(2, 3, 2, 4, 3).mean((1, 3)), atol=0.51
+    )
+
+
+def test_resized_images_rescale_intrinsics(capture):
+    frames = [frame("train/a.png", w=16, h=12), frame("train/b.png", w=16, h=12)]
+    write_json(capture / "transforms_train.json", frames)
+    with pytest.warns(ImageSizeWarning, match=r"train/a\.png is 8 x 6 and not 16 x 12 and 1 more"):
+        scene = load_scene(capture)
+    np.testing.assert_allclose(scene.train.cameras.intrinsics[0], [5, 5.5, 2, 1.5])
+
+
+def test_strange_paths(tmp_path):
+    folder = tmp_path / "Büro 写真"
+    write_image(folder / "train/één foto.png", value=7)
+    write_json(folder / "transforms_train.json", [frame("train\\één foto.png")])
+    scene = load_scene(str(folder))
+    assert scene.names["train"] == ["één foto"] and int(scene.train.rgb[0, 0, 0, 0]) == 7
+
+
+def test_names_are_unique(tmp_path):
+    listed = ["c0/x.png", "c1/x.png", "c1/x.jpg", "c1_x.png"]
+    for name in listed:
+        write_image(tmp_path / name)
+    write_json(tmp_path / "transforms_train.json", [frame(name) for name in [*listed, listed[0]]])
+    with pytest.warns(DuplicateFileWarning, match=r"lists 1 photographs again: c0/x\.png"):
+        names = load_scene(tmp_path).names["train"]
+    assert names == ["c0_x", "c1_x", "c1_x_2", "c1_x_3", "c0_x_2"]
+
+
+def test_points_come_with_the_capture(capture):
+    rows = vertices()
+    write_ply(capture / "points3d.ply", rows)
+    np.testing.assert_allclose(load_scene(capture).points[:, 0], rows["x"])
+    write_ply(capture / "other.ply", rows[:2])
+    frames = [frame("train/a.png")]
+    write_json(capture / "transforms_train.json", frames, ply_file_path="other.ply")
+    assert load_scene(capture).points.shape == (2, 3)
+    write_json(capture / "transforms_train.json", frames, ply_file_path="none.ply")
+    with pytest.raises(SceneError, match=r"ply_file_path 'none\.ply' does not exist"):
+        load_scene(capture)
+
+
+@pytest.mark.parametrize("given", [{"near": None, "far": None}, {"near": 0.5, "far": None}])
+def test_missing_near_far_is_estimated(capture, given):
+    write_json(capture / "transforms_train.json", [frame("train/a.png")], **given)
+    with pytest.warns(NearFarWarning, match="far; from the poses, near 0\\.[15] and far 100 are"):
+        scene = load_scene(capture)
+    assert 0 < scene.near < scene.far == 100
+    assert given["near"] in (None, scene.near)
+    rows = vertices()
+    rows["z"] = -7
+    rows["x"], rows["y"] = 1, 2
+    write_ply(capture / "points3d.ply", rows)
+    with pytest.warns(NearFarWarning, match="from the points"):
+        scene = load_scene(capture)
+    np.testing.assert_allclose([scene.near, scene.far], [given["near"] or 7, 15])
+
+
+def test_names_of_built_in_scenes(monkeypatch, tmp_path, capture):
+    built_in = types.SimpleNamespace(
+        PROCEDURAL_SCENES=("table", "room"),
+        procedural_scene=lambda name, *, downscale: (name, downscale),
+    )
+    monkeypatch.setitem(sys.modules, "jaxcloseup.scenes.procedural", built_in)
+    assert load_scene("table", downscale=2) == ("table", 2)
+    with pytest.raises(SceneError, match=r"tabel is neither .* choose one of table, room"):
+        load_scene("tabel")
+    monkeypatch.chdir(capture.parent)
+    assert load_scene(capture.name).names["train"] == ["a", "b"]
+    assert load_scene(f"./{capture.name}").name == capture.name
+
+
+# A real capture
+
+
+def test_plush(shared):
+    """Points look like the photographs where the oracle draws them, and not a few pixels beside."""
+    scene = load_scene(shared / "data" / "plush")
+    assert (len(scene.train), len(scene.test), len(scene.test_far)) == (49, 11, 7)
+    assert scene.train.rgb.shape[1:] == (600, 800, 3) and scene.points.shape == (7548, 3)
+    points, colours = scene.points[::8], scene.rgb[::8]
+    shifts = [(0, 0), (4, 0), (-4, 0), (0, 4), (0, -4)]
+    differences = {shift: [] for shift in shifts}
+    for index in (0, 20, 40):
+        camera = jax.tree.map(lambda leaf, i=index: np.asarray(leaf[i]), scene.train.cameras)
+        pixels, depth = reference.project(camera.camtoworld, camera.intrinsics, points)
+        inside = (depth > 0) & (pixels > 4).all(1) & (pixels < [796, 596]).all(1)
+        assert inside.mean() > 0.4
+        photo = np.asarray(scene.train.rgb[index])
+        for shift in shifts:
+            column, row = (pixels[inside] + shift).astype(int).T
+            seen = photo[row, column] / 255
+            differences[shift].append(np.abs(seen - colours[inside]).mean(1))
+    medians = [np.median(np.concatenate(differences[shift])) for shift in shifts]
+    assert medians[0] < 0.08  # about half of 0.15, that of points in any other order
+    assert medians[0] < 0.75 * min(medians[1:]), medians
+
+
+def test_plush_downscaled(shared):
+    scene = load_scene(shared / "data" / "plush", downscale=4)
+    assert scene.test.rgb.shape == (11, 150, 200, 3)
+    np.testing.assert_allclose(
+        scene.train.cameras.intrinsics[0],
+        [670.93612 / 4, 667.77012 / 4, 400.56091 / 4, 302.70823 / 4],
+        rtol=1e-6,
+    )
