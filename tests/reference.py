@@ -35,3 +35,44 @@ def forward_warp(values, pixels, depths, shape):
         if 0 <= x < width and 0 <= y < height and 0 < depth < buffer[int(y), int(x)]:
             image[int(y), int(x)], buffer[int(y), int(x)] = value, depth
     return image, buffer
+
+
+def composite_ray(rgb, density, depth, length):
+    """Weights, colour, alpha, depth, alpha times depth and median depth of one ray's samples."""
+    rgb, density, depth = (np.asarray(x, np.float64) for x in (rgb, density, depth))
+    transmittance, weights, median = 1.0, [], 0.0
+    for i in range(len(density)):
+        delta = depth[i + 1] - depth[i] if i + 1 < len(depth) else 1e10
+        alpha = 1 - np.exp(-density[i] * delta * float(length))
+        weights.append(transmittance * alpha)
+        if transmittance >= 0.5 > transmittance * (1 - alpha):
+            median = depth[i]
+        transmittance *= 1 - alpha
+    weights = np.array(weights)
+    alpha, expected = weights.sum(), (weights * depth).sum()
+    mean = expected / alpha if alpha > 0 else 0.0
+    return weights, weights @ rgb, alpha, mean, expected, median
+
+
+def invert_cdf(edges, weights, quantiles):
+    """Where the piecewise linear CDF of a histogram, raised by 1e-5, takes the values given."""
+    edges, weights = np.asarray(edges, np.float64), np.asarray(weights, np.float64) + 1e-5
+    cdf = np.concatenate([[0], np.cumsum(weights / weights.sum())])
+    return np.interp(quantiles, cdf, edges)
+
+
+def nerf_network(network, positions, directions):
+    """Raw density `[M]` and rgb `[M, 3]` of encoded samples `[M, I]` that look along `[M, J]`."""
+
+    def layer(params, x):
+        weights = np.concatenate([np.asarray(w, np.float64) for w in params["weights"]], axis=1)
+        return x @ weights.T + np.asarray(params["bias"], np.float64)
+
+    h = positions
+    for i, params in enumerate(network["trunk"]):
+        if i > 0 and len(params["weights"]) == 2:
+            h = np.concatenate([h, positions], axis=1)
+        h = np.maximum(layer(params, h), 0)
+    density = layer(network["density"], h)[:, 0]
+    view = np.concatenate([layer(network["feature"], h), directions], axis=1)
+    return density, layer(network["rgb"], np.maximum(layer(network["view"], view), 0))

@@ -1,0 +1,70 @@
+"""Volume rendering: what a ray sees of the densities and colours sampled along it."""
+
+from typing import NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from jaxcloseup.numerics import safe_divide
+
+
+_INFINITE = 1e10  # length of the last interval: whatever lies beyond the last sample
+_EMPTY = 1e-10  # alpha up to which nothing is seen: depth and its gradient would overflow
+
+
+class Composite(NamedTuple):
+    """What rays `[...]` see.
+
+    Attributes:
+      weights: `[..., S]` the share of each sample, `w_i = T_i (1 - exp(-sigma_i delta_i))`.
+      rgb: `[..., 3]` weighted colours, nothing added behind them.
+      alpha: `[...]` sum of the weights.
+      depth: `[...]` weighted mean z-depth; 0 where alpha is 0 (below 1e-10).
+      expected_depth: `[...]` weighted sum of z-depths, which is depth times alpha.
+      median_depth: `[...]` z-depth of the sample at which the transmittance falls below one half;
+        0 where it never does.
+    """
+
+    weights: jax.Array
+    rgb: jax.Array
+    alpha: jax.Array
+    depth: jax.Array
+    expected_depth: jax.Array
+    median_depth: jax.Array
+
+
+def composite(
+    rgb: jax.Array, density: jax.Array, depth: jax.Array, ray_length: jax.Array
+) -> Composite:
+    """Integrate samples along rays by the quadrature of NeRF, eq. 3.
+
+    Args:
+      rgb: `[..., S, 3]` colours of the samples.
+      density: `[..., S]` non-negative, per world unit.
+      depth: `[..., S]` ascending z-depths; each sample stands for the interval up to the next, the
+        last one for all the rest of its ray.
+      ray_length: `[...]` length of the ray's direction: world units for each unit of depth.
+    """
+    chex.assert_equal_shape([density, depth])
+    chex.assert_shape(rgb, (*density.shape, 3))
+    chex.assert_shape(ray_length, density.shape[:-1])
+    delta = jnp.diff(depth, axis=-1) * ray_length[..., None]
+    optical = density[..., :-1] * delta
+    last = density[..., -1:] * _INFINITE * ray_length[..., None]
+    # Optical depth in front of each sample: a sum, so nothing is lost where transmittance is tiny.
+    before = jnp.concatenate([jnp.zeros_like(last), jnp.cumsum(optical, axis=-1)], axis=-1)
+    transmittance = jnp.exp(-before)
+    weights = transmittance * -jnp.expm1(-jnp.concatenate([optical, last], axis=-1))
+    alpha = jnp.sum(weights, axis=-1)
+    expected = jnp.sum(weights * depth, axis=-1)
+    after = transmittance - weights
+    median = jnp.where((transmittance >= 0.5) & (after < 0.5), depth, 0)
+    return Composite(
+        weights=weights,
+        rgb=jnp.sum(weights[..., None] * rgb, axis=-2),
+        alpha=alpha,
+        depth=safe_divide(expected, jnp.where(alpha < _EMPTY, 0, alpha)),
+        expected_depth=expected,
+        median_depth=jnp.sum(median, axis=-1),
+    )

@@ -1,0 +1,22 @@
+import jax
+import numpy as np
+import pytest
+
+from jaxcloseup.volume.encodings import positional_encoding
+
+
+@pytest.mark.parametrize("shape", [(3,), (3, 7), (2, 4, 5)])
+def test_encoding_is_numpys(key, shape):
+    x = jax.random.uniform(key, shape, minval=-1, maxval=1)
+    wide = np.asarray(x, np.float64)
+    parts = [wide]
+    for k in range(10):
+        parts += [np.sin(2**k * wide), np.cos(2**k * wide)]
+    np.testing.assert_allclose(
+        jax.jit(positional_encoding, static_argnums=1)(x, 10), np.concatenate(parts), atol=1e-6
+    )
+
+
+def test_no_octaves_is_the_input(key):
+    x = jax.random.normal(key, (3, 2))
+    np.testing.assert_array_equal(positional_encoding(x, 0), x)
