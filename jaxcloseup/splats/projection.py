@@ -1,0 +1,182 @@
+"""Surfels to planar homographies and exact boxes, for one camera.
+
+A disc with centre mu, unit tangents t_u, t_v, normal n = t_u x t_v and radii s_u, s_v meets the ray r
+(r_z = 1) of a pixel at depth z with local coordinates (u, v). All of
+
+    u / z = r . (t_v x mu) / (s_u n.mu),   v / z = r . (mu x t_u) / (s_v n.mu),   1 / z = r . n / n.mu
+
+are affine in the pixel: they are the rows of `Footprints`, taken about the projected centre, where
+they are (0, 0, 1 / mu_z) without rounding.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.geometry.rotations import quaternion_to_matrix
+from jaxcloseup.numerics import matmul, safe_norm
+from jaxcloseup.splats.rasterize import ALPHA_MIN, Footprints
+from jaxcloseup.splats.surfels import Surfels
+
+
+LOW_PASS = 2.0  # 1/px^2: the screen-space floor is a Gaussian of sigma = sqrt(1/2) pixel
+EDGE_ON = 1e-4  # |cos| between normal and line of sight below which a disc is not drawn
+MAX_LOG_SCALE = 30.0  # beyond it, products of scales leave the range of float32
+
+
+class Discs(NamedTuple):
+    """Discs in one camera's frame, world units.
+
+    Attributes:
+      centre: `[N, 3]`.
+      axes: `[N, 3, 3]`, columns are the unit tangents t_u, t_v and the normal.
+      scales: `[N, 2]` standard deviations along the tangents.
+    """
+
+    centre: jax.Array
+    axes: jax.Array
+    scales: jax.Array
+
+
+def to_camera(surfels: Surfels, camera: Camera) -> tuple[Discs, jax.Array]:
+    """Discs in the camera's frame, and their world normals `[N, 3]` turned towards the camera."""
+    axes = quaternion_to_matrix(surfels.quaternions)
+    offset = surfels.means - camera.position[None]
+    normal = axes[..., 2]
+    away = jnp.sum(offset * normal, axis=-1, keepdims=True) > 0
+    discs = Discs(
+        centre=matmul(offset, camera.rotation),
+        axes=matmul(camera.rotation.T[None], axes),
+        scales=jnp.exp(jnp.clip(surfels.log_scales, -MAX_LOG_SCALE, MAX_LOG_SCALE)),
+    )
+    return discs, jnp.where(away, -normal, normal)
+
+
+def project_discs(
+    discs: Discs, opacity: jax.Array, payload: jax.Array, camera: Camera, *, near: float
+) -> Footprints:
+    """Homographies and boxes of discs; what cannot be seen has opacity 0 and an empty box.
+
+    Args:
+      discs: `N` discs in the frame of `camera`.
+      opacity: `[N]` in [0, 1].
+      payload: `[N, F]`.
+      camera: gives intrinsics and image size.
+      near: z-depth before which nothing is drawn; a disc may reach through it.
+    """
+    focal, principal = camera.intrinsics[None, :2], camera.intrinsics[None, 2:]
+    size = jnp.array([[camera.width, camera.height]], focal.dtype)
+    mu, depth = discs.centre, discs.centre[:, 2]
+    ahead = depth > near
+    inverse_depth = 1 / jnp.where(ahead, depth, 1)
+    centre = mu[:, :2] * inverse_depth[:, None] * focal + principal
+
+    # A centre far outside the image, or behind the camera, is no good origin for numbers that are
+    # needed within it: any other pixel will do, as long as the low-pass about it stays out of sight.
+    margin = jnp.maximum(size, 16)
+    within = jnp.all((centre > -margin) & (centre < size + margin), axis=-1, keepdims=True)
+    centred = ahead[:, None] & within
+    elsewhere = jnp.where(ahead[:, None], jnp.clip(centre, -margin, size + margin), size / 2)
+    anchor = jnp.where(centred, centre, lax.stop_gradient(elsewhere))
+
+    tangent_u, tangent_v, normal = (discs.axes[..., i] for i in range(3))
+    facing = jnp.sum(normal * mu, axis=-1)
+    edge_on = jnp.abs(facing) <= EDGE_ON * safe_norm(mu)
+    covectors = [
+        jnp.cross(tangent_v, mu) / discs.scales[:, :1],
+        jnp.cross(mu, tangent_u) / discs.scales[:, 1:],
+        normal,
+    ]
+    covectors = jnp.stack(covectors, axis=1) / jnp.where(edge_on, 1, facing)[:, None, None]
+    ray = jnp.concatenate([(anchor - principal) / focal, jnp.ones_like(anchor[:, :1])], axis=-1)
+    at_anchor = jnp.sum(covectors * ray[:, None], axis=-1)
+    at_centre = jnp.stack([jnp.zeros_like(depth), jnp.zeros_like(depth), inverse_depth], axis=-1)
+    constants = jnp.where(centred, at_centre, at_anchor)
+    rows = jnp.concatenate([constants[..., None], covectors[..., :2] / focal[:, None]], axis=-1)
+
+    cutoff = jnp.sqrt(2 * jnp.log(jnp.maximum(opacity / ALPHA_MIN, 1)))
+    reach = cutoff * safe_norm(discs.axes[:, 2, :2] * discs.scales)
+    drawn = ~edge_on & (opacity >= ALPHA_MIN) & (depth + reach >= near)
+    nearest, farthest = jnp.maximum(depth - reach, near), jnp.maximum(depth + reach, near)
+    box = jnp.where(
+        ahead[:, None],
+        _unite(_disc_box(discs, cutoff, camera, near), _low_pass_box(centre, cutoff)),
+        _disc_box(discs, cutoff, camera, near),
+    )
+    return Footprints(
+        anchor=anchor,
+        rows=rows,
+        opacity=jnp.where(drawn, opacity, 0),
+        low_pass=jnp.where(ahead, LOW_PASS, 1e9),
+        inverse_depth=jnp.stack([1 / farthest, 1 / nearest], axis=-1),
+        payload=payload,
+        order=jnp.maximum(depth, near),
+        box=lax.stop_gradient(jnp.where(drawn[:, None], box, -1)),
+    )
+
+
+def _disc_box(discs: Discs, cutoff: jax.Array, camera: Camera, near: float) -> jax.Array:
+    """Exact bounds `[N, 4]` in pixels of the part with z >= near of discs of radius `cutoff`.
+
+    The visible part is convex, so its image is bounded by points of its rim: those where a coordinate
+    is stationary along the circle, and the ends of the chord in which the disc meets z = near.
+    """
+    # Rounding must not cost a pixel that just reaches the cutoff.
+    radius = (1.001 * cutoff)[:, None, None]
+    along_u, along_v = jnp.split(discs.axes[..., :2] * discs.scales[:, None] * radius, 2, axis=-1)
+    circle = jnp.concatenate([along_u, along_v, discs.centre[..., None]], axis=-1)  # [N, xyz, 3]
+    depth = circle[:, 2]
+    chord, has_chord = _meet_circle(depth.at[:, 2].add(-near))
+    low, high = [], []
+    for axis in range(2):
+        a, b = circle[:, axis], depth
+        stationary = jnp.stack(
+            [
+                a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1],
+                a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2],
+                a[:, 1] * b[:, 0] - a[:, 0] * b[:, 1],
+            ],
+            axis=-1,
+        )
+        rim, exists = _meet_circle(stationary)
+        rim_depth = jnp.sum(rim * b[:, None], axis=-1)
+        exists &= rim_depth >= near
+        rim_at = jnp.sum(rim * a[:, None], axis=-1) / jnp.where(exists, rim_depth, 1)
+        chord_at = jnp.sum(chord * a[:, None], axis=-1) / near
+        at = jnp.concatenate([rim_at, chord_at], axis=-1)
+        at = at * camera.intrinsics[axis] + camera.intrinsics[2 + axis]
+        exists = jnp.concatenate([exists, has_chord], axis=-1)
+        low.append(jnp.min(jnp.where(exists, at, jnp.inf), axis=-1) - 0.01)
+        high.append(jnp.max(jnp.where(exists, at, -jnp.inf), axis=-1) + 0.01)
+    return jnp.stack([*low, *high], axis=-1)
+
+
+def _meet_circle(line: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The points (cos, sin, 1) `[N, 2, 3]` with line . point = 0, and whether they exist `[N, 2]`."""
+    line = line / jnp.maximum(jnp.max(jnp.abs(line), axis=-1, keepdims=True), 1e-30)
+    a, b, c = (line[:, i] for i in range(3))
+    squared = a * a + b * b
+    discriminant = squared - c * c
+    root = jnp.sqrt(jnp.maximum(discriminant, 0))
+    # A line that vanishes is met everywhere: a disc without extent, of which any point will do.
+    divisor = jnp.where(squared == 0, 1, squared)
+    points = [
+        jnp.stack([(-c * a - s * b * root) / divisor, (-c * b + s * a * root) / divisor], axis=-1)
+        for s in (-1, 1)
+    ]
+    points = jnp.stack(points, axis=1)
+    points = jnp.concatenate([points, jnp.ones_like(points[..., :1])], axis=-1)
+    return points, jnp.broadcast_to((discriminant >= 0)[:, None], points.shape[:2])
+
+
+def _low_pass_box(centre: jax.Array, cutoff: jax.Array) -> jax.Array:
+    half = (1.001 * cutoff / jnp.sqrt(LOW_PASS) + 0.01)[:, None]
+    return jnp.concatenate([centre - half, centre + half], axis=-1)
+
+
+def _unite(a: jax.Array, b: jax.Array) -> jax.Array:
+    low, high = jnp.minimum(a[:, :2], b[:, :2]), jnp.maximum(a[:, 2:], b[:, 2:])
+    return jnp.concatenate([low, high], axis=-1)

@@ -1,0 +1,63 @@
+"""Real spherical harmonics to degree 3, the view-dependent colour of a splat."""
+
+import math
+
+import chex
+import jax
+import jax.numpy as jnp
+
+
+_CONSTANT = math.sqrt(1 / (4 * math.pi))
+
+
+def sh_basis(directions: jax.Array, degree: int) -> jax.Array:
+    """Orthonormal basis `[..., (degree + 1)^2]` at unit `directions[..., 3]`, `degree` 0 to 3.
+
+    Ordered by degree, then order, with the signs (-1)^m in which trained splats are exchanged.
+    """
+    chex.assert_axis_dimension(directions, -1, 3)
+    if degree not in range(4):
+        raise ValueError(f"spherical harmonics have degree 0 to 3 here, not {degree}")
+    x, y, z = jnp.moveaxis(directions, -1, 0)
+    xx, yy, zz = x * x, y * y, z * z
+    root = lambda numerator, denominator: math.sqrt(numerator / (denominator * math.pi))  # noqa: E731
+    basis = [jnp.full_like(x, _CONSTANT)]
+    if degree >= 1:
+        basis += [-root(3, 4) * y, root(3, 4) * z, -root(3, 4) * x]
+    if degree >= 2:
+        basis += [
+            root(15, 4) * x * y,
+            -root(15, 4) * y * z,
+            root(5, 16) * (2 * zz - xx - yy),
+            -root(15, 4) * x * z,
+            root(15, 16) * (xx - yy),
+        ]
+    if degree >= 3:
+        basis += [
+            -root(35, 32) * y * (3 * xx - yy),
+            root(105, 4) * x * y * z,
+            -root(21, 32) * y * (4 * zz - xx - yy),
+            root(7, 16) * z * (2 * zz - 3 * xx - 3 * yy),
+            -root(21, 32) * x * (4 * zz - xx - yy),
+            root(105, 16) * z * (xx - yy),
+            -root(35, 32) * x * (xx - 3 * yy),
+        ]
+    return jnp.stack(basis, axis=-1)
+
+
+def sh_to_rgb(sh: jax.Array, directions: jax.Array) -> jax.Array:
+    """Colours `[..., 3]` seen along unit `directions[..., 3]`: max(0, 1/2 + sum_k Y_k sh_k).
+
+    Args:
+      sh: `[..., (L + 1)^2, 3]` coefficients.
+      directions: from the camera to the splat, world frame.
+    """
+    degree = math.isqrt(sh.shape[-2]) - 1
+    chex.assert_axis_dimension(sh, -2, (degree + 1) ** 2)
+    basis = sh_basis(directions, degree)
+    return jnp.maximum(jnp.sum(basis[..., None] * sh, axis=-2) + 0.5, 0)
+
+
+def rgb_to_sh(rgb: jax.Array) -> jax.Array:
+    """Constant coefficients `[..., 3]` that show `rgb[..., 3]` in all directions."""
+    return (rgb - 0.5) / _CONSTANT

@@ -1,0 +1,123 @@
+"""Surfels: oriented discs with a Gaussian profile, the unknowns of 2-D Gaussian splatting.
+
+Parameters are stored before their activations (logarithms, logits), so that any real number is valid.
+"""
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import lax
+
+from jaxcloseup.splats.spherical_harmonics import rgb_to_sh
+
+
+@struct.dataclass
+class Surfels:
+    """`N` discs in world units.
+
+    Attributes:
+      means: `[N, 3]` centres.
+      log_scales: `[N, 2]` logarithms of the standard deviations along the two tangents.
+      quaternions: `[N, 4]` (w, x, y, z), of any length; the rotation's columns are the two tangents
+        and the normal.
+      opacity_logits: `[N]`.
+      sh: `[N, (L + 1)^2, 3]` spherical harmonics of the colour.
+    """
+
+    means: jax.Array
+    log_scales: jax.Array
+    quaternions: jax.Array
+    opacity_logits: jax.Array
+    sh: jax.Array
+
+
+def surfels_from_points(
+    key: jax.Array,
+    points: jax.Array,
+    rgb: jax.Array,
+    *,
+    capacity: int,
+    sh_degree: int,
+    opacity: float = 0.1,
+) -> tuple[Surfels, jax.Array]:
+    """Surfels at points, as large as the gaps between them, turned at random; `key` is consumed.
+
+    Args:
+      key: for the rotations, and for choosing points where there are more than `capacity`.
+      points: `[P, 3]` world points; those that are not finite are dropped.
+      rgb: `[P, 3]` colours in [0, 1].
+      capacity: `N`; rows without a point are dead.
+      sh_degree: degree `L` of the colour's harmonics, 0 to 3; all but the constant start at 0.
+      opacity: initial opacity.
+
+    Returns:
+      The surfels and `alive [N]`, False where there is none.
+    """
+    chex.assert_shape([points, rgb], (None, 3))
+    chex.assert_equal_shape([points, rgb])
+    key_choice, key_rotation = jax.random.split(key)
+    finite = jnp.all(jnp.isfinite(points), axis=-1)
+    chosen = jax.random.permutation(key_choice, points.shape[0])
+    chosen = chosen[jnp.argsort(~finite[chosen], stable=True)][:capacity]
+    if capacity >= points.shape[0]:
+        chosen = jnp.sort(chosen)
+    alive = finite[chosen]
+    points = jnp.where(alive[:, None], points[chosen], 0)
+    gaps = neighbour_distance(points, alive)
+    missing = capacity - points.shape[0]
+    fill = (
+        lambda rows, value: jnp.pad(  # noqa: E731
+            rows, ((0, missing), *((0, 0) for _ in rows.shape[1:])), constant_values=value
+        )
+    )
+    alive = fill(alive, False)
+    constant = rgb_to_sh(rgb[chosen])[:, None]
+    higher = jnp.zeros((points.shape[0], (sh_degree + 1) ** 2 - 1, 3), points.dtype)
+    surfels = Surfels(
+        means=fill(points, 0),
+        log_scales=jnp.tile(fill(jnp.log(gaps), 0)[:, None], (1, 2)),
+        quaternions=jax.random.normal(key_rotation, (capacity, 4), points.dtype),
+        opacity_logits=jnp.full(capacity, jax.scipy.special.logit(opacity), points.dtype),
+        sh=fill(jnp.concatenate([constant, higher], axis=1), 0),
+    )
+    return surfels, alive
+
+
+def neighbour_distance(points: jax.Array, valid: jax.Array, *, rows: int = 256) -> jax.Array:
+    """Root mean square distance `[P]` to the three nearest other valid points of `points[P, 3]`.
+
+    Exact, by comparing all pairs: a few seconds for 100k points. At least sqrt(1e-7), so that
+    duplicates keep a size; points with fewer than three neighbours take those they have.
+    """
+    count = points.shape[0]
+    padded = jnp.pad(points, ((0, -count % rows), (0, 0)))
+    # Invalid points are infinitely far from everything.
+    others = jnp.where(jnp.pad(valid, (0, -count % rows))[:, None], padded, jnp.inf)
+    blocks = others.reshape(-1, rows, 3)
+
+    def nearest(start):
+        own = lax.dynamic_slice_in_dim(padded, start, rows)
+        own_index = start + jnp.arange(rows)
+
+        def update(best, block):
+            index, other = block
+            squared = sum((own[:, None, i] - other[None, :, i]) ** 2 for i in range(3))
+            squared = jnp.where(own_index[:, None] == index[None], jnp.inf, squared)
+            # Keep the three smallest in each of `rows` lanes; the lanes are merged at the end.
+            kept = []
+            for smallest in best:
+                kept.append(jnp.minimum(smallest, squared))
+                squared = jnp.maximum(smallest, squared)
+            return tuple(kept), None
+
+        best = (jnp.full((rows, rows), jnp.inf, points.dtype),) * 3
+        indices = jnp.arange(padded.shape[0]).reshape(-1, rows)
+        best, _ = lax.scan(update, best, (indices, blocks))
+        return -lax.top_k(-jnp.concatenate(best, axis=-1), 3)[0]
+
+    starts = jnp.arange(0, padded.shape[0], rows)
+    squared = lax.map(nearest, starts).reshape(-1, 3)[:count]
+    known = jnp.isfinite(squared)
+    mean = jnp.sum(jnp.where(known, squared, 0), axis=-1) / jnp.maximum(jnp.sum(known, axis=-1), 1)
+    return jnp.sqrt(jnp.maximum(mean, 1e-7))

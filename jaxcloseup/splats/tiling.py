@@ -1,0 +1,109 @@
+"""Which splats touch which tile, nearest first: a fixed number of sorted (tile, splat) pairs.
+
+Tiles are squares of pixels in row-major order. Shapes are static: pairs that do not fit are counted.
+"""
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import lax
+
+
+@struct.dataclass
+class TileLists:
+    """The lists of all tiles, tiles of similar length side by side in blocks of `B`.
+
+    Attributes:
+      splats: `[capacity]` indices of splats, tile after tile, each tile's nearest first.
+      starts, counts: `[blocks, B]` a tile's part of `splats`; 0 for tiles that only fill a block.
+      origins: `[blocks, B, 2]` x and y of a tile's first pixel.
+      tile: `[blocks, B]` which tile of the image it is.
+      slot: `[T]` where tile t is found in the flattened blocks.
+      overflow: `[]` pairs that did not fit; those of the farthest splats.
+    """
+
+    splats: jax.Array
+    starts: jax.Array
+    counts: jax.Array
+    origins: jax.Array
+    tile: jax.Array
+    slot: jax.Array
+    overflow: jax.Array
+
+
+def tile_lists(
+    box: jax.Array,
+    order: jax.Array,
+    *,
+    height: int,
+    width: int,
+    tile: int,
+    block: int,
+    capacity: int,
+) -> TileLists:
+    """Sort (tile, splat) pairs by tile, then by `order[N]`, then by index.
+
+    Args:
+      box: `[N, 4]` bounds (x0, y0, x1, y1) in pixels of what each splat touches; a splat is listed
+        in the tiles that hold a pixel *centre* within, and nowhere if x1 < x0 or y1 < y0.
+      order: `[N]` depth of each splat.
+      height, width, tile, block, capacity: static sizes.
+    """
+    chex.assert_shape(box, (order.shape[0], 4))
+    count = order.shape[0]
+    across, down = -(-width // tile), -(-height // tile)
+    first, last = _tile_range(box, jnp.array([width, height]), tile)
+    extent = jnp.maximum(last - first + 1, 0)
+    pairs = extent[:, 0] * extent[:, 1]
+
+    # Pairs are laid out by depth rank, so whatever overflows is what lies farthest away.
+    _, by_depth = lax.sort((order, jnp.arange(count, dtype=jnp.int32)), num_keys=1, is_stable=True)
+    pairs, first, columns = pairs[by_depth], first[by_depth], jnp.maximum(extent[by_depth, 0], 1)
+    ends = jnp.cumsum(pairs)
+    total = ends[-1]
+    place = jnp.arange(capacity, dtype=jnp.int32)
+    rank = jnp.repeat(jnp.arange(count, dtype=jnp.int32), pairs, total_repeat_length=capacity)
+    within = place - (ends - pairs)[rank]
+    row = within // columns[rank]
+    tile_of = (first[rank, 1] + row) * across + first[rank, 0] + within - row * columns[rank]
+    tile_of = jnp.where(place < total, tile_of, across * down)
+    tile_of, rank = _sort_pairs(tile_of, rank, across * down + 1, count)
+
+    starts = jnp.searchsorted(tile_of, jnp.arange(across * down + 1, dtype=jnp.int32))
+    starts = starts.astype(jnp.int32)
+    counts = starts[1:] - starts[:-1]
+    # Blocks run in lockstep: with tiles of equal length side by side little of that is idle.
+    padding = -(across * down) % block
+    longest_first = jnp.argsort(-counts, stable=True).astype(jnp.int32)
+    slot = jnp.argsort(longest_first).astype(jnp.int32)
+    longest_first = jnp.pad(longest_first, (0, padding)).reshape(-1, block)
+    real = jnp.pad(jnp.ones(across * down, bool), (0, padding)).reshape(-1, block)
+    return TileLists(
+        splats=by_depth[rank],
+        starts=starts[longest_first],
+        counts=jnp.where(real, counts[longest_first], 0),
+        origins=tile * jnp.stack([longest_first % across, longest_first // across], axis=-1),
+        tile=longest_first,
+        slot=slot,
+        overflow=jnp.maximum(total - capacity, 0),
+    )
+
+
+def _tile_range(box: jax.Array, size: jax.Array, tile: int) -> tuple[jax.Array, jax.Array]:
+    """First and last tile `[N, 2]` (x, y) whose pixel centres lie in the box; last < first: none."""
+    # Clip before the cast: a box may reach to the horizon, and integers do not.
+    edge = (size - 1).astype(box.dtype)[None]
+    first = jnp.clip(jnp.ceil(box[:, :2] - 0.5), 0, edge + 1).astype(jnp.int32)
+    last = jnp.clip(jnp.floor(box[:, 2:] - 0.5), -1, edge).astype(jnp.int32)
+    empty = jnp.any(last < first, axis=-1, keepdims=True)
+    return jnp.where(empty, 0, first // tile), jnp.where(empty, -1, last // tile)
+
+
+def _sort_pairs(tile, rank, tiles: int, ranks: int):
+    """Sort pairs by (tile, rank). One packed key sorts several times faster than two."""
+    bits = max(ranks - 1, 1).bit_length()
+    if tiles <= 2 ** (32 - bits):
+        key = lax.sort((tile.astype(jnp.uint32) << bits) | rank.astype(jnp.uint32))
+        return (key >> bits).astype(jnp.int32), (key & (2**bits - 1)).astype(jnp.int32)
+    return tuple(lax.sort((tile, rank), num_keys=2))

@@ -1,0 +1,142 @@
+"""A slow splatter in NumPy float64: rays against planes, every splat at every pixel, no tiles.
+
+It shares neither code nor formulas with the package: it intersects, where the package interpolates
+homographies. What the two agree on by decision is listed here: the constants, the order (by centre
+depth, not nearer than `near`), the floor about the projected centre, and depth held to the disc's
+own range where that floor wins.
+"""
+
+import numpy as np
+
+
+ALPHA_MIN, ALPHA_MAX, T_MIN, LOW_PASS = 1 / 255, 0.99, 1e-4, 2.0
+
+
+def rotation_of(wxyz):
+    """Rotation matrix of one quaternion, by rotating the basis with q v q*."""
+    w, *v = np.asarray(wxyz, np.float64) / np.linalg.norm(wxyz)
+    v = np.array(v)
+    return np.stack([e + 2 * np.cross(v, np.cross(v, e) + w * e) for e in np.eye(3)], axis=1)
+
+
+def sh_colour(sh, direction):
+    """Colour of coefficients `[K, 3]` along a unit direction, basis written out as numbers."""
+    x, y, z = direction
+    basis = [
+        0.28209479177387814,
+        *(0.4886025119029199 * np.array([-y, z, -x])),
+        1.0925484305920792 * x * y,
+        -1.0925484305920792 * y * z,
+        0.31539156525252005 * (2 * z * z - x * x - y * y),
+        -1.0925484305920792 * x * z,
+        0.5462742152960396 * (x * x - y * y),
+        -0.5900435899266435 * y * (3 * x * x - y * y),
+        2.890611442640554 * x * y * z,
+        -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
+        0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
+        -0.4570457994644658 * x * (4 * z * z - x * x - y * y),
+        1.445305721320277 * z * (x * x - y * y),
+        -0.5900435899266435 * x * (x * x - 3 * y * y),
+    ]
+    return np.maximum(0.5 + np.array(basis[: len(sh)]) @ sh, 0)
+
+
+def depth_reach(surfels, camtoworld):
+    """How far in depth each disc extends from its centre, out to where it fades."""
+    rotation = np.asarray(camtoworld)[:, :3]
+    opacity = 1 / (1 + np.exp(-surfels["opacity_logits"]))
+    cutoff = np.sqrt(2 * np.log(np.maximum(255 * opacity, 1)))
+    reach = []
+    for quaternion, log_scales in zip(surfels["quaternions"], surfels["log_scales"], strict=True):
+        slopes = (rotation.T @ rotation_of(quaternion))[2, :2] * np.exp(log_scales)
+        reach.append(np.hypot(*slopes))
+    return cutoff * np.array(reach)
+
+
+def intersect(surfels, camtoworld, intrinsics, pixels, *, near, reach=None):
+    """Opacity and depth `[N, P]` of every surfel at `pixels[P, 2]`; opacity 0 is not drawn.
+
+    `reach` is held fixed by finite differences: the package gives the depth range of a disc no
+    derivative but that of its centre.
+    """
+    rotation, position = np.asarray(camtoworld)[:, :3], np.asarray(camtoworld)[:, 3]
+    fx, fy, cx, cy = intrinsics
+    rays = np.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(len(pixels))], -1)
+    reach = depth_reach(surfels, camtoworld) if reach is None else reach
+    alphas, depths = [], []
+    for i in range(len(surfels["means"])):
+        mu = rotation.T @ (surfels["means"][i] - position)
+        tangent_u, tangent_v, normal = (rotation.T @ rotation_of(surfels["quaternions"][i])).T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            z = normal @ mu / (rays @ normal)
+            offset = z[:, None] * rays - mu
+            u, v = offset @ tangent_u, offset @ tangent_v
+            scales = np.exp(surfels["log_scales"][i])
+            rho = (u / scales[0]) ** 2 + (v / scales[1]) ** 2
+        behind = ~(z > 0)
+        rho = np.where(behind, np.inf, rho)
+        if mu[2] > near:
+            centre = np.array([fx * mu[0] / mu[2] + cx, fy * mu[1] / mu[2] + cy])
+            floor = LOW_PASS * np.sum((pixels - centre) ** 2, axis=-1)
+            low, high = max(mu[2] - reach[i], near), max(mu[2] + reach[i], near)
+            clipped = np.clip(np.where(behind, np.inf, z), low, high)
+            depth = np.where(floor < rho, clipped, z)
+            rho = np.minimum(rho, floor)
+        else:
+            depth = z
+        opacity = 1 / (1 + np.exp(-surfels["opacity_logits"][i]))
+        alpha = np.minimum(opacity * np.exp(-rho / 2), ALPHA_MAX)
+        hidden = (alpha < ALPHA_MIN) | ((z > 0) & (z < near))
+        hidden |= abs(normal @ mu) <= 1e-4 * np.linalg.norm(mu)
+        alphas.append(np.where(hidden, 0, alpha))
+        depths.append(np.where(hidden, 1, depth))
+    return np.array(alphas), np.array(depths)
+
+
+def composite(alphas, depths, payload):
+    """Front to back, one splat after the other, of alphas and depths `[N, P]` in order.
+
+    Returns payload sums `[P, F]`, alpha, expected depth, median depth and distortion `[P]`.
+    """
+    count, size = alphas.shape
+    transmittance, running = np.ones(size), np.ones(size, bool)
+    weights, median = np.zeros((count, size)), np.zeros(size)
+    for i in range(count):
+        after = transmittance * (1 - alphas[i])
+        running &= after >= T_MIN
+        drawn = running & (alphas[i] > 0)
+        weights[i] = np.where(drawn, alphas[i] * transmittance, 0)
+        median = np.where(drawn & (transmittance > 0.5), depths[i], median)
+        transmittance = np.where(drawn, after, transmittance)
+    alpha = weights.sum(0)
+    depth = np.divide((weights * depths).sum(0), alpha, out=np.zeros(size), where=alpha > 0)
+    distortion = np.zeros(size)
+    for i in range(count):
+        for j in range(i):
+            distortion += weights[i] * weights[j] * (1 / depths[i] - 1 / depths[j]) ** 2
+    return weights.T @ payload, alpha, depth, median, distortion
+
+
+def render(surfels, camtoworld, intrinsics, height, width, *, near, background=None, reach=None):
+    """An image as a dictionary of `[H, W, ...]`; `surfels` is a dictionary of float64 arrays."""
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
+    camtoworld = np.asarray(camtoworld, np.float64)
+    alphas, depths = intersect(surfels, camtoworld, intrinsics, pixels, near=near, reach=reach)
+    payload, order = [], []
+    for mean, quaternion, sh in zip(
+        surfels["means"], surfels["quaternions"], surfels["sh"], strict=True
+    ):
+        offset = mean - camtoworld[:, 3]
+        normal = rotation_of(quaternion)[:, 2]
+        normal = normal if normal @ offset < 0 else -normal
+        payload.append([*sh_colour(sh, offset / np.linalg.norm(offset)), *normal])
+        order.append(max(offset @ camtoworld[:, 2], near))
+    by_depth = np.argsort(order, kind="stable")
+    sums, alpha, depth, median, distortion = composite(
+        alphas[by_depth], depths[by_depth], np.array(payload)[by_depth]
+    )
+    rgb = sums[:, :3] + (0 if background is None else (1 - alpha)[:, None] * background)
+    image = dict(rgb=rgb, normal=sums[:, 3:], alpha=alpha, depth=depth)
+    image |= dict(median_depth=median, distortion=distortion)
+    return {name: value.reshape(height, width, *value.shape[1:]) for name, value in image.items()}
