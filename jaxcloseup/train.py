@@ -1,0 +1,224 @@
+"""Training steps, pure, for any field: on photographs alone, and with pseudo-labels beside them.
+
+`field`, `optimizer` and `config` are static: bind them with `functools.partial` before `jax.jit`.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from jaxcloseup.batch import Batch, Views, sample_image, sample_pixels
+from jaxcloseup.field import RadianceField
+from jaxcloseup.geometry.cameras import Camera, pixel_grid
+from jaxcloseup.geometry.union_warp import SourceBlocks
+from jaxcloseup.pseudo import PseudoSettings, make_label, sample_virtual_camera
+
+
+Metrics = dict[str, jax.Array]
+
+
+@struct.dataclass
+class TrainState:
+    """Everything a step changes. Steps draw from `fold_in(key, step)`, so a resumed run repeats.
+
+    Attributes:
+      step: `[]` int32 steps taken.
+      params: what the optimizer trains.
+      buffers: what the field keeps besides.
+      opt_state: the optimizer's state.
+      key: the run's key, never changed.
+    """
+
+    step: jax.Array
+    params: Any
+    buffers: Any
+    opt_state: Any
+    key: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """How much one step looks at.
+
+    Attributes:
+      num_rays: training pixels of a step; None takes one whole photograph.
+      num_label_rays: pseudo-labelled pixels of a step; None takes the whole virtual image.
+      perturbed_depth: render virtual depth with sampling noise, as released, not without (paper).
+      undivided_depth: use depth not divided by alpha, as released, for labels.
+      pooled_loss: one mean over all valid pixels, as released, not half of each mean (paper).
+    """
+
+    num_rays: int | None = 1024
+    num_label_rays: int | None = 1024
+    perturbed_depth: bool = False
+    undivided_depth: bool = False
+    pooled_loss: bool = False
+
+
+def init_state(
+    key: jax.Array,
+    points: jax.Array,
+    rgb: jax.Array,
+    *,
+    field: RadianceField,
+    optimizer: optax.GradientTransformation,
+) -> TrainState:
+    """The state before the first step; `key` is consumed.
+
+    Args:
+      key: random key.
+      points: `[P, 3]` initial points, for fields that start from them.
+      rgb: `[P, 3]` their colours.
+      field: what is trained.
+      optimizer: how.
+    """
+    key_init, key_steps = jax.random.split(key)
+    params, buffers = field.init(key_init, points, rgb)
+    return TrainState(jnp.zeros((), jnp.int32), params, buffers, optimizer.init(params), key_steps)
+
+
+def train_step(
+    state: TrainState,
+    views: Views,
+    *,
+    field: RadianceField,
+    optimizer: optax.GradientTransformation,
+    config: TrainConfig,
+) -> tuple[TrainState, Metrics]:
+    """One step on training photographs alone."""
+    key_step = jax.random.fold_in(state.key, state.step)
+    key_batch, key_render, key_adapt, _ = jax.random.split(key_step, 4)
+    batch = _sample_batch(key_batch, views, config)
+
+    def loss(params):
+        rendering = _render(field, params, state.buffers, batch, key_render)
+        return field.loss(rendering, batch.rgb, batch.weight)
+
+    return _update(state, loss, key_adapt, field, optimizer)
+
+
+def pseudo_step(
+    state: TrainState,
+    views: Views,
+    depths: jax.Array,
+    settings: PseudoSettings,
+    *,
+    field: RadianceField,
+    optimizer: optax.GradientTransformation,
+    config: TrainConfig,
+    sources: SourceBlocks | None = None,
+) -> tuple[TrainState, Metrics]:
+    """One step on training photographs and on one pseudo-labelled virtual close-up.
+
+    L = (L_c + L_pl) / 2, where L_pl is the mean over labelled pixels only, and 0 without any. The
+    photographs' draw is that of `train_step` at the same step, so that a control is paired.
+
+    Args:
+      state: what is trained.
+      views: training photographs.
+      depths: `[V, H, W]` their z-depth, from `render_depths`.
+      settings: virtual poses and masks.
+      field: static; what is trained.
+      optimizer: static.
+      config: static.
+      sources: `block_sources(views.cameras, depths, views.weight)`; recomputed here if absent.
+
+    Returns:
+      The next state, and metrics with `label_coverage`, the share of labelled virtual pixels.
+    """
+    key_step = jax.random.fold_in(state.key, state.step)
+    key_batch, key_render, key_adapt, key_label = jax.random.split(key_step, 4)
+    key_virtual, key_pixels, key_depth, key_virtual_render = jax.random.split(key_label, 4)
+    batch = _sample_batch(key_batch, views, config)
+
+    camera, source_index = sample_virtual_camera(key_virtual, views, depths, settings)
+    pixels = _sample_virtual_pixels(key_pixels, camera, config.num_label_rays)
+    seen = field.render(
+        jax.lax.stop_gradient(state.params),
+        state.buffers,
+        camera,
+        pixels,
+        key_depth if config.perturbed_depth else None,
+    )
+    depth = seen.depth * seen.alpha if config.undivided_depth else seen.depth
+    label_pixels = pixel_grid(camera.height, camera.width) if pixels is None else pixels
+    label = make_label(
+        camera, label_pixels, depth, source_index, views, depths, settings, sources=sources
+    )
+    virtual = Batch(camera, pixels, label.rgb, label.weight)
+
+    def loss(params):
+        of_batch = _render(field, params, state.buffers, batch, key_render)
+        of_virtual = _render(field, params, state.buffers, virtual, key_virtual_render)
+        if config.pooled_loss:
+            both = jax.tree.map(lambda *x: jnp.concatenate(x), of_batch, of_virtual)
+            rgb = jnp.concatenate([batch.rgb, virtual.rgb])
+            return field.loss(both, rgb, jnp.concatenate([batch.weight, virtual.weight]))
+        batch_loss, metrics = field.loss(of_batch, batch.rgb, batch.weight)
+        virtual_loss, _ = field.loss(of_virtual, virtual.rgb, virtual.weight)
+        return (batch_loss + virtual_loss) / 2, metrics
+
+    state, metrics = _update(state, loss, key_adapt, field, optimizer)
+    return state, metrics | {"label_coverage": jnp.mean(label.weight)}
+
+
+def run_steps(
+    step: Callable[..., tuple[TrainState, Metrics]], state: TrainState, *data: Any, count: int
+) -> tuple[TrainState, Metrics]:
+    """Take `count` steps `step(state, *data)` in one `lax.scan`; metrics are their means."""
+    state, metrics = jax.lax.scan(lambda state, _: step(state, *data), state, length=count)
+    return state, jax.tree.map(jnp.mean, metrics)
+
+
+def render_depths(
+    field: RadianceField,
+    params: Any,
+    buffers: Any,
+    cameras: Camera,
+    *,
+    near: float,
+    far: float,
+    min_alpha: float = 0.5,
+) -> jax.Array:
+    """Z-depths `[V, H, W]` of whole views, one after the other, for labels and anchors.
+
+    Depth is 0, undefined, where alpha is under `min_alpha` or depth outside [near, far].
+    """
+
+    def one_view(camera):
+        seen = field.render(params, buffers, camera, None, None)
+        defined = (seen.alpha >= min_alpha) & (seen.depth >= near) & (seen.depth <= far)
+        return jnp.where(defined, seen.depth, 0)
+
+    return jax.lax.map(one_view, cameras)
+
+
+def _sample_batch(key, views, config):
+    if config.num_rays is None:
+        return sample_image(key, views)
+    return sample_pixels(key, views, config.num_rays)
+
+
+def _sample_virtual_pixels(key, camera, count):
+    """Distinct pixels are not worth their cost: `[count, 2]` centres with replacement, or None."""
+    if count is None:
+        return None
+    size = jnp.array([[camera.width, camera.height]])
+    return jax.random.randint(key, (count, 2), 0, size).astype(jnp.float32) + 0.5
+
+
+def _render(field, params, buffers, batch, key):
+    return field.render(params, buffers, batch.cameras, batch.pixels, key)
+
+
+def _update(state, loss, key_adapt, field, optimizer):
+    (value, metrics), gradients = jax.value_and_grad(loss, has_aux=True)(state.params)
+    updates, opt_state = optimizer.update(gradients, state.opt_state, state.params)
+    params = optax.apply_updates(state.params, updates)
+    state = state.replace(step=state.step + 1, params=params, opt_state=opt_state)
+    return field.adapt(key_adapt, state), {"loss": value} | metrics
