@@ -76,3 +76,20 @@ def nerf_network(network, positions, directions):
     density = layer(network["density"], h)[:, 0]
     view = np.concatenate([layer(network["feature"], h), directions], axis=1)
     return density, layer(network["rgb"], np.maximum(layer(network["view"], view), 0))
+
+
+def ssim_map(a, b):
+    """SSIM `[H - 10, W - 10, 3]` of images `[H, W, 3]`, one Gaussian window at a time."""
+    offsets = np.arange(-5, 6)
+    window = np.exp(-(offsets[:, None] ** 2 + offsets[None] ** 2) / (2 * 1.5**2))
+    window /= window.sum()
+    height, width, channels = a.shape
+    result = np.zeros((height - 10, width - 10, channels))
+    for y, x, c in np.ndindex(*result.shape):
+        p, q = (np.asarray(i, np.float64)[y : y + 11, x : x + 11, c] for i in (a, b))
+        mean_p, mean_q = (window * p).sum(), (window * q).sum()
+        var_p, var_q = (window * (p - mean_p) ** 2).sum(), (window * (q - mean_q) ** 2).sum()
+        covariance = (window * (p - mean_p) * (q - mean_q)).sum()
+        luminance = (2 * mean_p * mean_q + 0.01**2) / (mean_p**2 + mean_q**2 + 0.01**2)
+        result[y, x, c] = luminance * (2 * covariance + 0.03**2) / (var_p + var_q + 0.03**2)
+    return result
