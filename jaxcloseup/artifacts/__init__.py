@@ -1,0 +1,1 @@
+"""Host side, what goes out: pictures and files."""

@@ -1,0 +1,135 @@
+import base64
+import re
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxcloseup.artifacts.files import write_file
+from jaxcloseup.artifacts.images import (
+    colorize_depth,
+    colorize_error,
+    png_data_uri,
+    side_by_side,
+    to_uint8,
+    write_png,
+)
+from jaxcloseup.metrics import quantize
+
+
+@pytest.fixture
+def image():
+    return np.random.default_rng(0).uniform(-0.1, 1.1, (5, 7, 3)).astype(np.float32)
+
+
+def read_png(path):
+    return cv2.imread(str(path))[..., ::-1]
+
+
+def test_to_uint8():
+    values = np.array([[-1, 0, 0.5], [1, 2, np.nan]], np.float32)
+    expected = np.array([[0, 0, 128], [255, 255, 0]])
+    np.testing.assert_array_equal(to_uint8(values), np.stack([expected] * 3, -1))
+    np.testing.assert_array_equal(to_uint8(jnp.asarray(values)), to_uint8(values))
+    assert to_uint8(np.full((2, 2, 3), np.inf)).tolist() == [[[255] * 3] * 2] * 2
+    with pytest.raises(ValueError, match=r"this one is \(2, 3, 4\)"):
+        to_uint8(np.zeros((2, 3, 4)))
+
+
+def test_write_png(tmp_path, image):
+    path = tmp_path / "new" / "folder é" / "a.png"
+    write_png(path, image)
+    loaded = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)[..., ::-1]
+    # What is read back is what the metrics were computed on.
+    np.testing.assert_array_equal(loaded, np.rint(np.asarray(quantize(jnp.asarray(image))) * 255))
+    write_png(path, np.full((2, 3, 3), 7, np.uint8))
+    assert cv2.imdecode(np.fromfile(path, np.uint8), -1).shape == (2, 3, 3)
+    assert [file.name for file in path.parent.iterdir()] == ["a.png"]
+
+
+def test_failed_write_leaves_the_old_file(tmp_path, image, monkeypatch):
+    write_png(tmp_path / "a.png", image)
+    before = (tmp_path / "a.png").read_bytes()
+
+    def fail(self, target):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.replace", fail)
+    with pytest.raises(OSError, match=r"a\.png cannot be written \(No space left on device\)"):
+        write_file(tmp_path / "a.png", b"other")
+    assert (tmp_path / "a.png").read_bytes() == before
+    assert [file.name for file in tmp_path.iterdir()] == ["a.png"]
+
+
+def test_unwritable_path(tmp_path, image):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match=r"file/a\.png cannot be written .*: choose another"):
+        write_png(tmp_path / "file" / "a.png", image)
+
+
+def test_png_data_uri(image, tmp_path):
+    address = png_data_uri(image)
+    head, _, body = address.partition(",")
+    assert head == "data:image/png;base64" and re.fullmatch(r"[A-Za-z0-9+/=]+", body)
+    (tmp_path / "a.png").write_bytes(base64.b64decode(body))
+    np.testing.assert_array_equal(read_png(tmp_path / "a.png"), to_uint8(image))
+
+
+def test_colorize_depth():
+    depth = np.array([[1.0, 2, 4, 0], [np.nan, np.inf, -1, 9]])
+    valid = np.ones((2, 4), bool)
+    valid[1, 3] = False
+    colours = colorize_depth(depth, near=1, far=4, valid=valid)
+    assert colours.dtype == np.uint8 and colours.shape == (2, 4, 3)
+    # Turbo: dark red, then green to the blue side of the middle (1/2 is a third of [1/4, 1]), then
+    # dark blue; nothing is black.
+    red, green, blue = colours[0, :3].astype(int).T
+    assert red[0] > 100 > green[0] and blue[0] < 20
+    assert green[1] > 200 > red[1]
+    assert blue[2] > red[2] and green[2] < 60
+    assert not colours[0, 3].any() and not colours[1].any()
+    assert colours[0, :3].any(-1).all()
+    np.testing.assert_array_equal(
+        colorize_depth(jnp.asarray([[1.0, 2, 4]]), near=1, far=4), colours[:1, :3]
+    )
+
+
+def test_colorize_depth_is_robust():
+    depth = np.linspace(2, 3, 400).reshape(20, 20)
+    stray = depth.copy()
+    stray[0, 0], stray[0, 1] = 1e-6, 1e6
+    assert np.abs(colorize_depth(stray)[1:].astype(int) - colorize_depth(depth)[1:]).max() < 12
+    assert colorize_depth(np.full((2, 2), 3.0)).shape == (2, 2, 3)
+    assert not colorize_depth(np.zeros((2, 2))).any()
+
+
+def test_colorize_error():
+    error = np.linspace(0, 0.5, 9)[None]
+    colours = colorize_error(error).astype(int)
+    assert (np.diff(colours.sum(-1)[0, :5]) > 0).all()  # brighter with error, to 0.25
+    assert (colours[0, 4:] == colours[0, 4]).all() and colours[0, 0].sum() < 10
+    np.testing.assert_array_equal(colorize_error(-error), colours)
+    np.testing.assert_array_equal(colorize_error(np.repeat(error[..., None], 3, -1)), colours)
+    np.testing.assert_array_equal(colorize_error(error * 2, highest=0.5), colours)
+
+
+def test_side_by_side(image):
+    tall = np.zeros((9, 4), np.float32)
+    row = side_by_side([image, tall], gap=2)
+    assert row.shape == (9, 13, 3) and row.dtype == np.uint8
+    np.testing.assert_array_equal(row[:5, :7], to_uint8(image))
+    assert (row[5:, :7] == 255).all() and (row[:, 7:9] == 255).all() and not row[:, 9:].any()
+
+
+def test_labels():
+    panel = np.full((10, 60, 3), 200, np.uint8)
+    row = side_by_side([panel, panel], labels=["a", "très long label that cannot fit"], gap=4)
+    strip = row[:-10]
+    np.testing.assert_array_equal(row[-10:, :60], panel)
+    for left in (0, 64):
+        ink = np.argwhere(strip[:, left : left + 60].min(-1) < 128)
+        assert len(ink) > 3 and ink[:, 1].max() < 59
+    assert (strip[:, 60:64] == 255).all()
+    with pytest.raises(ValueError, match="zip"):
+        side_by_side([panel], labels=["a", "b"])
