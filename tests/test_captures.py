@@ -103,7 +103,6 @@ def test_single_file_holds_out_every_eighth(tmp_path, caplog):
 
 
 def test_single_file_with_lists(tmp_path):
-    # Rz(90 degrees) and a shift, as nerfstudio writes it.
     transform = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 2]]
     lists = {"test_filenames": ["./images/003.png"], "val_filenames": ["images/001.png"]}
     single_file(tmp_path, 4, applied_transform=transform, **lists)

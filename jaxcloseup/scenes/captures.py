@@ -17,7 +17,7 @@ from jaxcloseup.scenes.images import downscale_image, pad_images, read_image, re
 from jaxcloseup.scenes.points import read_ply_points
 from jaxcloseup.scenes.scene import Scene
 from jaxcloseup.scenes.splits import Listing, read_listing, unique_names
-from jaxcloseup.scenes.transforms import Frame, frame_intrinsics, number, rigid_transform
+from jaxcloseup.scenes.transforms import Frame, affine_transform, frame_intrinsics, number
 
 
 class _Photo(NamedTuple):
@@ -89,6 +89,11 @@ def load_scene(
 
 def _load_folder(path: pathlib.Path, downscale: int, half_pixel: bool, background: float) -> Scene:
     listing = read_listing(path)
+    points, rgb = _read_points(listing)
+    transform = listing.fields.get("applied_transform")
+    if transform is not None:
+        transform = affine_transform(str(listing.file), "applied_transform", transform)
+
     frames = [frame for members in listing.frames.values() for frame in members]
     with concurrent.futures.ThreadPoolExecutor() as pool:  # OpenCV decodes without Python's lock
         photos = list(pool.map(lambda frame: _read_photo(frame, downscale, background), frames))
@@ -98,11 +103,7 @@ def _load_folder(path: pathlib.Path, downscale: int, half_pixel: bool, backgroun
     )
     camtoworld = np.stack([frame.camtoworld for frame in frames])
     sizes = np.array([photo.size for photo in photos])
-    points, rgb = _read_points(listing)
     near, far = _near_far(listing, points, camtoworld, intrinsics, sizes)
-    transform = listing.fields.get("applied_transform")
-    if transform is not None:
-        transform = rigid_transform(str(listing.file), "applied_transform", transform)
 
     width, height = sizes.max(0).tolist()
     ends = np.cumsum([len(members) for members in listing.frames.values()])[:-1]

@@ -20,16 +20,16 @@ _LENS_KEYS = {
     *("fx", "fy", "fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y"),
     *("camera_model", "is_fisheye", *_DISTORTION),
 }
-# The second line of each is known, does not bear on what is loaded, and is passed over in silence.
 _FILE_KEYS = _LENS_KEYS | {
     *("frames", "near", "far", "ply_file_path", "applied_transform"),
     *("train_filenames", "test_filenames", "val_filenames"),
-    *("aabb_scale", "scale", "offset", "applied_scale", "orientation_override", "render_aabb"),
-    *("auto_scale_poses_override", "depth_unit_scale_factor", "integer_depth_scale"),
 }
-_FRAME_KEYS = _LENS_KEYS | {
-    *("file_path", "transform_matrix", "mask_path"),
-    *("sharpness", "rotation", "colmap_im_id", "depth_file_path"),
+_FRAME_KEYS = _LENS_KEYS | {"file_path", "transform_matrix", "mask_path"}
+# Well known, of no bearing on what is loaded, and passed over in silence.
+_UNUSED_KEYS = {
+    *("aabb_scale", "scale", "offset", "render_aabb", "sharpness", "rotation", "colmap_im_id"),
+    *("applied_scale", "orientation_override", "auto_scale_poses_override"),
+    *("depth_file_path", "depth_unit_scale_factor", "integer_depth_scale"),
 }
 _PINHOLES = {"PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "FULL_OPENCV", "SIMPLE_RADIAL", "RADIAL"}
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
@@ -76,6 +76,7 @@ def read_transforms(path: pathlib.Path) -> tuple[dict[str, Any], list[Frame]]:
         raise SceneError(f'{path}: "frames" is empty: list at least one photograph.')
     unknown = set(fields) - _FILE_KEYS
     unknown |= {key for entry in entries for key in entry} - _FRAME_KEYS
+    unknown -= _UNUSED_KEYS
     if unknown:
         names = ", ".join(sorted(unknown))
         warnings.warn(
@@ -124,27 +125,18 @@ def number(label: str, key: str, value: Any, *, above: float = -math.inf) -> flo
     return float(value)
 
 
-def rigid_transform(label: str, key: str, value: Any) -> np.ndarray:
-    """A `[3, 4]` float64 rotation and position out of a 3x4 or 4x4 list of lists."""
+def affine_transform(label: str, key: str, value: Any) -> np.ndarray:
+    """A `[3, 4]` float64 matrix out of a 3x4 or 4x4 list of lists."""
     try:
         matrix = np.array(value, np.float64)
     except (TypeError, ValueError):
         matrix = np.zeros(())
     if matrix.shape not in ((3, 4), (4, 4)):
-        raise SceneError(f"{label}: {key} must be a 4x4 matrix of numbers, camera to world.")
+        raise SceneError(f"{label}: {key} must be a 4x4 matrix of numbers: correct it.")
     if not np.isfinite(matrix).all():
         raise SceneError(f"{label}: {key} holds a value that is not finite: drop or correct it.")
     if len(matrix) == 4 and not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
         raise SceneError(f"{label}: {key} must end in the row 0, 0, 0, 1: it may be transposed.")
-    rotation = matrix[:3, :3]
-    error = np.abs(rotation.T @ rotation - np.eye(3)).max()
-    if error > 1e-3:
-        raise SceneError(
-            f"{label}: {key} is not rigid, its rotation is off by {error:.2g}: scale positions "
-            "only, and leave the rotation's columns orthogonal and of unit length."
-        )
-    if np.linalg.det(rotation) < 0:
-        raise SceneError(f"{label}: {key} mirrors space: flip one axis of its rotation.")
     return matrix[:3]
 
 
@@ -176,7 +168,7 @@ def _read_frame(path: pathlib.Path, fields: dict[str, Any], entry: dict[str, Any
     size = tuple(int(number(label, key, lens[key], above=0)) for key in "wh" if key in lens)
     if "transform_matrix" not in entry:
         raise SceneError(f"{label}: no transform_matrix: give its camera-to-world pose.")
-    pose = rigid_transform(label, "transform_matrix", entry["transform_matrix"])
+    pose = _rigid_transform(label, "transform_matrix", entry["transform_matrix"])
     mask = entry.get("mask_path")
     frame = Frame(
         source=path,
@@ -189,6 +181,21 @@ def _read_frame(path: pathlib.Path, fields: dict[str, Any], entry: dict[str, Any
     )
     frame_intrinsics(frame, *(size or (1, 1)))  # complain before any image is decoded
     return frame
+
+
+def _rigid_transform(label: str, key: str, value: Any) -> np.ndarray:
+    """As `affine_transform`, and made of a rotation and a position."""
+    matrix = affine_transform(label, key, value)
+    rotation = matrix[:, :3]
+    error = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if error > 1e-3:
+        raise SceneError(
+            f"{label}: {key} is not rigid, its rotation is off by {error:.2g}: scale positions "
+            "only, and leave the rotation's columns orthogonal and of unit length."
+        )
+    if np.linalg.det(rotation) < 0:
+        raise SceneError(f"{label}: {key} mirrors space: flip one axis of its rotation.")
+    return matrix
 
 
 def _find(folder: pathlib.Path, listed: str) -> pathlib.Path:
