@@ -1,0 +1,104 @@
+"""How good pseudo-labels are, where the truth is known: on procedural scenes.
+
+A label can at best be what its source photograph resolves, so it is compared with the true close-up
+blurred to the footprint that the source's pixels have there.
+"""
+
+from typing import Any
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcloseup.batch import camera_at
+from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_points, points_to_pixels
+from jaxcloseup.geometry.masks import depth_consistent, in_bounds
+from jaxcloseup.geometry.warp import backward_warp
+from jaxcloseup.pseudo import PseudoSettings, make_label, sample_virtual_camera
+from jaxcloseup.scenes import Scene
+
+
+_SIGMAS = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
+
+
+def blur_to_footprint(image: np.ndarray, footprint: np.ndarray) -> np.ndarray:
+    """Blur an image as if it were photographed with pixels `footprint` times as large.
+
+    A photograph averages over its pixel (variance 1/12) and bilinear reading over its neighbours
+    (1/6), so the standard deviation is half a source pixel; what the image's own pixels average
+    already is taken off.
+
+    Args:
+      image: `[H, W, 3]`.
+      footprint: `[H, W]` side of a source pixel in pixels of the image.
+    """
+    sigma = np.sqrt(np.maximum(footprint**2 / 4 - 1 / 12, 0))
+    levels = [image] + [cv2.GaussianBlur(image, (0, 0), s) for s in _SIGMAS[1:]]
+    position = np.interp(sigma, _SIGMAS, np.arange(len(_SIGMAS)))
+    low = np.minimum(position.astype(int), len(_SIGMAS) - 2)
+    rows, columns = np.indices(sigma.shape)
+    stack, share = np.stack(levels), (position - low)[..., None]
+    return (1 - share) * stack[low, rows, columns] + share * stack[low + 1, rows, columns]
+
+
+def audit_labels(
+    key: jax.Array,
+    scene: Scene,
+    settings: PseudoSettings,
+    exact_depths: jax.Array,
+    depths: jax.Array,
+    render_depth: Any,
+    *,
+    count: int = 16,
+) -> dict[str, float]:
+    """Label error and yield over random virtual close-ups of a procedural scene.
+
+    Args:
+      key: random key.
+      scene: a scene with `surface`.
+      settings: of the labels.
+      exact_depths: `[V, H, W]` exact depths of the training views, which decide what is visible.
+      depths: `[V, H, W]` the depths that labels are made with.
+      render_depth: `camera -> [H, W]`, the virtual depth that labels are made with.
+      count: virtual cameras.
+
+    Returns:
+      `error`, mean absolute difference of kept labels from the blurred truth; `kept`, share of the
+      pixels that the source view truly sees; `leaked`, share of kept pixels that it does not.
+    """
+    sample = jax.jit(sample_virtual_camera)
+    label_image = jax.jit(make_label)
+    error = kept = kept_visible = visible_total = 0.0
+    for one in jax.random.split(key, count):
+        camera, index = sample(one, scene.train, depths, settings)
+        pixels = pixel_grid(camera.height, camera.width)
+        label = label_image(
+            camera, pixels, render_depth(camera), index, scene.train, depths, settings
+        )
+        truth = scene.surface(camera)
+        visible, footprint = _seen_by(
+            camera, pixels, truth.depth, camera_at(scene.train.cameras, index), exact_depths[index]
+        )
+        blurred = blur_to_footprint(np.asarray(truth.rgb), np.asarray(footprint))
+        weight = np.asarray(label.weight)
+        error += float((weight * np.abs(label.rgb - blurred).mean(axis=-1)).sum())
+        kept += float(weight.sum())
+        kept_visible += float((weight * visible).sum())
+        visible_total += float(visible.sum())
+    return {
+        "error": error / max(kept, 1),
+        "kept": kept_visible / max(visible_total, 1),
+        "leaked": 1 - kept_visible / max(kept, 1),
+    }
+
+
+@jax.jit
+def _seen_by(camera, pixels, depth, source, source_depth):
+    """Whether the source sees each pixel's surface, and its pixel's size in pixels of `camera`."""
+    landed, landed_depth = points_to_pixels(source, pixels_to_points(camera, pixels, depth))
+    observed = backward_warp(source_depth[..., None], landed, order=0)[..., 0]
+    inside = in_bounds(landed, source.height, source.width)
+    visible = (depth > 0) & inside & depth_consistent(observed, landed_depth, 0.02)
+    magnification = landed_depth / jnp.where(depth > 0, depth, 1)
+    return visible, magnification * camera.intrinsics[0] / source.intrinsics[0]

@@ -1,0 +1,157 @@
+"""Scoring a field on held-out views, full frame and where training photographs saw the surface."""
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcloseup.batch import Views, camera_at, to_float
+from jaxcloseup.field import Rendering
+from jaxcloseup.geometry.cameras import Camera, pixel_grid
+from jaxcloseup.metrics import cc_psnr, psnr, quantize, ssim
+from jaxcloseup.pseudo import count_seen
+from jaxcloseup.scenes import Scene
+
+
+SEEN_BY = (1, 3)
+LPIPS_REASON = "LPIPS is not part of this version"
+
+
+class Target(NamedTuple):
+    """A held-out view.
+
+    Attributes:
+      name: of its photograph.
+      camera: its camera.
+      rgb: `[H, W, 3]` the photograph, float.
+      weight: `[H, W]` 0 in padding.
+      seen: `[H, W]` how many training photographs saw the surface there.
+      depth: `[H, W]` exact z-depth, or None where it is not known.
+    """
+
+    name: str
+    camera: Camera
+    rgb: jax.Array
+    weight: jax.Array
+    seen: jax.Array
+    depth: jax.Array | None
+
+
+def exact_depths(scene: Scene, cameras: Camera) -> jax.Array:
+    """Exact z-depths `[V, H, W]` of stacked cameras on a procedural scene."""
+    return jnp.stack([scene.surface(camera_at(cameras, i)).depth for i in range(_count(cameras))])
+
+
+def make_targets(
+    scene: Scene, split: str, train_depths: jax.Array, render: Callable[[Camera], Rendering]
+) -> list[Target]:
+    """The held-out views of a split, with their coverage.
+
+    Depth, for the coverage, is exact on procedural scenes and rendered on captures: from the
+    baseline, so that every stage is scored on the same pixels.
+    """
+    views: Views = getattr(scene, split)
+    count = jax.jit(count_seen)
+    targets = []
+    for i, name in enumerate(scene.names[split]):
+        camera = camera_at(views.cameras, i)
+        exact = scene.surface(camera).depth if scene.surface else None
+        depth = render(camera).depth if exact is None else exact
+        pixels = pixel_grid(camera.height, camera.width)
+        seen = count(camera, pixels, depth, scene.train, train_depths)
+        rgb = to_float(jnp.asarray(views.rgb[i]))
+        targets.append(Target(name, camera, rgb, jnp.asarray(views.weight[i]), seen, exact))
+    return targets
+
+
+def score(rendering: Rendering, target: Target) -> dict[str, float | str | None]:
+    """Metrics of one view, on 8-bit colours; what cannot be computed is None beside its reason."""
+    rows, columns = _frame(np.asarray(target.weight))
+
+    def crop(array):
+        return array[rows, columns]
+
+    image, truth, weight = map(crop, (rendering.rgb, target.rgb, target.weight))
+    seen = crop(target.seen)
+    values = {}
+    if min(truth.shape[:2]) < 11:
+        values["ssim_reason"] = "SSIM needs 11 pixels a side"
+    values |= _full_metrics(image, truth, weight)
+    for least in SEEN_BY:
+        values |= {
+            f"{key}_seen{least}": value
+            for key, value in _masked_metrics(image, truth, weight * (seen >= least)).items()
+        }
+    if target.depth is not None:
+        values |= _depth_error(rendering.depth, target.depth)
+    result = {}
+    for key, value in values.items():
+        if isinstance(value, str):
+            result[key] = value
+            continue
+        result[key] = float(value) if np.isfinite(value) else None
+        if result[key] is None and "_reason" not in key:
+            result[f"{key}_reason"] = "no pixel of this view counts"
+    return result | {"lpips_vgg": None, "lpips_vgg_reason": LPIPS_REASON}
+
+
+def summarise(views: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Means over views of every metric that some view has, and the views themselves."""
+    keys = sorted({key for values in views.values() for key in values if "_reason" not in key})
+    summary: dict[str, Any] = {}
+    for key in keys:
+        known = [values[key] for values in views.values() if values.get(key) is not None]
+        summary[key] = float(np.mean(known)) if known else None
+        if not known:
+            summary[f"{key}_reason"] = next(iter(views.values()))[f"{key}_reason"]
+    return summary | {"views": {name: dict(values) for name, values in views.items()}}
+
+
+def evaluate(
+    render: Callable[[Camera], Rendering], targets: Sequence[Target]
+) -> tuple[dict[str, Any], dict[str, Rendering]]:
+    """Render and score every target; returns the summary and the renderings by name."""
+    renderings = {target.name: jax.device_get(render(target.camera)) for target in targets}
+    return summarise({t.name: score(renderings[t.name], t) for t in targets}), renderings
+
+
+@functools.partial(jax.jit)
+def _full_metrics(image, truth, weight):
+    image, truth = quantize(image), quantize(truth)
+    metrics = {"psnr": psnr, "cc_psnr": cc_psnr}
+    if min(truth.shape[:2]) >= 11:
+        metrics["ssim"] = ssim
+    return {name: metric(image, truth, weight=weight) for name, metric in metrics.items()}
+
+
+@jax.jit
+def _masked_metrics(image, truth, weight):
+    image, truth = quantize(image), quantize(truth)
+    metrics = {"psnr": psnr(image, truth, weight=weight), "coverage": jnp.mean(weight > 0)}
+    if min(truth.shape[:2]) >= 11:
+        metrics["ssim"] = ssim(image, truth, weight=weight)
+    return metrics
+
+
+@jax.jit
+def _depth_error(depth, exact):
+    error = jnp.where(exact > 0, jnp.abs(depth - exact) / jnp.where(exact > 0, exact, 1), jnp.nan)
+    return {
+        "depth_error_median": jnp.nanmedian(error),
+        "depth_error_p90": jnp.nanpercentile(error, 90.0),
+    }
+
+
+def _frame(weight):
+    """The smallest rectangle that holds all weight: photographs are padded at two sides."""
+    rows, columns = np.nonzero(weight.any(axis=1))[0], np.nonzero(weight.any(axis=0))[0]
+    if not len(rows):
+        return slice(None), slice(None)
+    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+
+
+def _count(cameras):
+    return cameras.intrinsics.shape[0]

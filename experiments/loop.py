@@ -1,0 +1,48 @@
+"""Running a stage: steps in chunks, with rates and the time left."""
+
+import functools
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+from jaxcloseup.train import TrainState, run_steps
+
+
+def make_runner(step: Callable[..., Any]) -> Callable[..., Any]:
+    """`runner(state, *data, count=...)`, compiled; it leaves its input state alone."""
+    return jax.jit(functools.partial(run_steps, step), static_argnames="count")
+
+
+def run_stage(
+    name: str,
+    runner: Callable[..., Any],
+    state: TrainState,
+    *data: Any,
+    steps: int,
+    chunk: int,
+    report: Callable[[str], None] = print,
+) -> tuple[TrainState, list[dict[str, float]]]:
+    """Take `steps` steps, reporting after each chunk.
+
+    Returns:
+      The state, and for each chunk its metrics with `step`, counted within the stage.
+    """
+    history = []
+    start = time.perf_counter()
+    done = 0
+    while done < steps:
+        count = min(chunk, steps - done)
+        state, metrics = runner(state, *data, count=count)
+        done += count
+        values = {key: float(value) for key, value in metrics.items()}
+        history.append({"step": done} | values)
+        seconds = time.perf_counter() - start
+        left = seconds / done * (steps - done)
+        shown = "  ".join(f"{key} {value:.4g}" for key, value in values.items())
+        report(
+            f"{name:>9} {done:>{len(str(steps))}}/{steps}  {done / seconds:6.1f} steps/s  "
+            f"{int(left // 60)}:{int(left % 60):02d} left  {shown}"
+        )
+    return state, history

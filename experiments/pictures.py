@@ -1,0 +1,87 @@
+"""The pictures of a run: renders, side-by-side comparisons, labels."""
+
+import pathlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from experiments.evaluation import Target
+from experiments.report import SPLIT_TITLES, Picture
+from jaxcloseup.artifacts.images import colorize_depth, colorize_error, side_by_side, write_png
+from jaxcloseup.field import Rendering
+from jaxcloseup.geometry.cameras import Camera, pixel_grid
+from jaxcloseup.pseudo import PseudoSettings, best_source, make_label, sample_virtual_camera
+from jaxcloseup.scenes import Scene
+
+
+SHOWN_LABELS = 6
+
+
+def write_renders(folder: pathlib.Path, renderings: Mapping[str, Rendering], scene: Scene) -> None:
+    """Write `rgb/<name>.png` and `depth/<name>.png`, the depth in colour over the scene's range."""
+    for name, rendering in renderings.items():
+        write_png(folder / "rgb" / f"{name}.png", rendering.rgb)
+        depth = colorize_depth(rendering.depth, near=scene.near, far=scene.far)
+        write_png(folder / "depth" / f"{name}.png", depth)
+
+
+def comparisons(
+    folder: pathlib.Path,
+    targets: Mapping[str, Sequence[Target]],
+    renderings: Mapping[tuple[str, str], Mapping[str, Rendering]],
+) -> list[Picture]:
+    """Write `<name>.png`: truth, every stage, error of the last; returns them for the report."""
+    pictures = []
+    for split, views in targets.items():
+        stages = [stage for stage, of_split in renderings if of_split == split]
+        for target in views:
+            images = [renderings[stage, split][target.name].rgb for stage in stages]
+            truth = np.asarray(target.rgb)
+            error = colorize_error(np.abs(images[-1] - truth).mean(axis=-1))
+            panels = [truth, *images, error]
+            labels = ["truth", *stages, f"error of {stages[-1]}"]
+            image = side_by_side(panels, labels=labels)
+            write_png(folder / f"{target.name}.png", image)
+            pictures.append(Picture(SPLIT_TITLES[split], target.name, image))
+    return pictures
+
+
+def label_pictures(
+    folder: pathlib.Path,
+    key: jax.Array,
+    scene: Scene,
+    settings: PseudoSettings,
+    depths: jax.Array,
+    targets: Sequence[Target],
+    render: Callable[[Camera], Rendering],
+) -> list[Picture]:
+    """Write pictures of labels: of random virtual views, and of the held-out close-ups."""
+    label_image = jax.jit(make_label)
+    sample = jax.jit(sample_virtual_camera)
+    shots: list[tuple[str, Camera, Any, Any]] = []
+    for i, one in enumerate(jax.random.split(key, SHOWN_LABELS)):
+        camera, index = sample(one, scene.train, depths, settings)
+        truth = scene.surface(camera).rgb if scene.surface else None
+        shots.append((f"virtual_{i}", camera, index, truth))
+    nearest = jax.jit(best_source)
+    for target in targets[:SHOWN_LABELS]:
+        index = nearest(target.camera, scene.train, depths)
+        shots.append((f"closeup_{target.name}", target.camera, index, target.rgb))
+    pictures = []
+    for name, camera, index, truth in shots:
+        pixels = pixel_grid(camera.height, camera.width)
+        depth = render(camera).depth
+        label = label_image(camera, pixels, depth, index, scene.train, depths, settings)
+        kept = np.where(label.weight[..., None] > 0, label.rgb, 0)
+        panels = {"backward warp": label.backward, "forward warp": label.forward, "kept": kept}
+        panels["mask"] = np.repeat(np.asarray(label.weight)[..., None], 3, axis=-1)
+        panels["rendered depth"] = colorize_depth(depth, near=scene.near, far=scene.far)
+        if truth is not None:
+            panels["truth"] = np.asarray(truth)
+        image = side_by_side([np.asarray(p) for p in panels.values()], labels=list(panels))
+        write_png(folder / f"{name}.png", image)
+        source = scene.names["train"][int(index)]
+        pictures.append(Picture("Pseudo-labels", f"{name}, from {source}", image))
+    return pictures

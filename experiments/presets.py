@@ -1,0 +1,140 @@
+"""Named sets of hyper-parameters.
+
+`quick` is the smallest run that shows the method honestly, `paper` the text of the paper and
+`released` what its public NeRF script does where the two differ.
+"""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from jaxcloseup.field import RadianceField
+from jaxcloseup.geometry.poses import PoseSettings
+from jaxcloseup.pseudo import PseudoSettings
+from jaxcloseup.scenes import Scene
+from jaxcloseup.train import TrainConfig
+from jaxcloseup.volume.nerf import NerfConfig, nerf
+
+
+@dataclasses.dataclass(frozen=True)
+class Preset:
+    """One experiment; plain numbers, so that it prints and serialises.
+
+    Attributes:
+      nerf: the network and its sampling.
+      train: what a step looks at.
+      baseline_steps: stage 1, on photographs alone.
+      closeup_steps: stage 2, with labels, and as many of its control without.
+      learning_rate: Adam's, at the first step.
+      decay_rate: factor on it over `decay_steps`, continued through both stages.
+      decay_steps: see `decay_rate`.
+      downscale: photographs are reduced by this factor.
+      normalise: scale the scene to the unit cube around what the cameras look at.
+      magnification: range of lambda.
+      max_angle: epsilon, radians.
+      anchor_tolerance: relative distance of anchors from the mean depth.
+      rgb_tolerance: epsilon of the mask.
+      depth_tolerance: relative agreement with the source view's depth.
+      forward_label: colours from the forward warps.
+    """
+
+    nerf: NerfConfig = dataclasses.field(default_factory=NerfConfig)
+    train: TrainConfig = dataclasses.field(default_factory=TrainConfig)
+    baseline_steps: int = 200_000
+    closeup_steps: int = 10_000
+    learning_rate: float = 5e-4
+    decay_rate: float = 0.1
+    decay_steps: int = 250_000
+    downscale: int = 1
+    normalise: bool = False
+    magnification: tuple[float, float] = (2.0, 8.0)
+    max_angle: float = math.pi / 4
+    anchor_tolerance: float = math.inf
+    rgb_tolerance: float = 0.05
+    depth_tolerance: float = math.inf
+    forward_label: bool = False
+
+
+PAPER = Preset()
+
+RELEASED = dataclasses.replace(
+    PAPER,
+    train=TrainConfig(
+        num_rays=1536,
+        num_label_rays=563,
+        perturbed_depth=True,
+        undivided_depth=True,
+        pooled_loss=True,
+    ),
+    magnification=(4.0, 4.0),
+    anchor_tolerance=0.2,
+    rgb_tolerance=0.1,
+    depth_tolerance=0.05,
+    forward_label=True,
+)
+
+QUICK = dataclasses.replace(
+    PAPER,
+    nerf=NerfConfig(
+        depth=4, width=64, skip_after=2, direction_width=64, num_coarse=32, num_fine=32
+    ),
+    baseline_steps=1500,
+    closeup_steps=400,
+    learning_rate=2e-3,
+    decay_steps=2000,
+    downscale=8,
+    normalise=True,
+    depth_tolerance=0.05,
+)
+
+PRESETS = {"quick": QUICK, "paper": PAPER, "released": RELEASED}
+
+
+def make_field(preset: Preset, scene: Scene) -> RadianceField:
+    """The preset's NeRF for a scene."""
+    # Chunks that stay in a CPU's cache would leave an accelerator idle; the result is the same.
+    config = preset.nerf
+    if jax.default_backend() != "cpu":
+        config = dataclasses.replace(config, chunk=4096)
+    centre, scale = (0.0, 0.0, 0.0), 1.0
+    if preset.normalise:
+        centre, scale = unit_cube(scene)
+    return nerf(config, near=scene.near, far=scene.far, centre=centre, scale=scale)
+
+
+def unit_cube(scene: Scene) -> tuple[tuple[float, float, float], float]:
+    """Centre and scale that bring the cameras and most of what they see into [-1, 1]."""
+    positions = np.asarray(scene.train.cameras.position)
+    forward = np.asarray(scene.train.cameras.rotation)[..., 2]
+    middle = positions + 0.5 * (scene.near + scene.far) * forward
+    seen = scene.points if len(scene.points) else middle
+    both = np.concatenate([positions, np.percentile(seen, [5, 95], axis=0)])
+    low, high = both.min(axis=0), both.max(axis=0)
+    return tuple(((low + high) / 2).tolist()), float(2 / (high - low).max())
+
+
+def make_optimizer(preset: Preset) -> optax.GradientTransformation:
+    """Adam with exponentially decaying learning rate."""
+    schedule = optax.exponential_decay(preset.learning_rate, preset.decay_steps, preset.decay_rate)
+    return optax.adam(schedule)
+
+
+def pseudo_settings(preset: Preset) -> PseudoSettings:
+    """The preset's traced settings."""
+    return PseudoSettings(
+        pose=PoseSettings(
+            magnification=jnp.array(preset.magnification),
+            max_angle=jnp.float32(preset.max_angle),
+            anchor_tolerance=jnp.float32(preset.anchor_tolerance),
+        ),
+        use_mask=jnp.float32(1),
+        rgb_tolerance=jnp.float32(preset.rgb_tolerance),
+        depth_tolerance=jnp.float32(preset.depth_tolerance),
+        fixed_anchors=jnp.float32(0),
+        forward_label=jnp.float32(preset.forward_label),
+        leave_out_source=jnp.float32(0),
+    )

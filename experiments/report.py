@@ -1,0 +1,142 @@
+"""What a run leaves behind: a table, results.json and one self-contained page."""
+
+import html
+import json
+import os
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from jaxcloseup.artifacts.images import png_data_uri
+
+
+SPLIT_TITLES = {"test": "Close-ups", "test_far": "Ordinary views"}
+COLUMNS = {
+    "psnr": "PSNR (dB)",
+    "ssim": "SSIM",
+    "cc_psnr": "PSNR, colour-corrected (dB)",
+    "psnr_seen1": "PSNR where seen by 1+ (dB)",
+    "psnr_seen3": "PSNR where seen by 3+ (dB)",
+    "coverage_seen1": "share seen by 1+",
+    "coverage_seen3": "share seen by 3+",
+    "depth_error_median": "median depth error (relative)",
+}
+
+
+class Picture(NamedTuple):
+    """A picture of the page: `image` is uint8 `[H, W, 3]`, `section` groups pictures."""
+
+    section: str
+    caption: str
+    image: np.ndarray
+
+
+def rows(results: Mapping[str, Any]) -> list[list[str]]:
+    """The table of a run: a row for each split and stage, first the header."""
+    shown = [
+        key
+        for key in COLUMNS
+        if any(
+            split.get(key) is not None for s in results["stages"].values() for split in s.values()
+        )
+    ]
+    table = [["views", "stage", *(COLUMNS[key] for key in shown)]]
+    for split, title in SPLIT_TITLES.items():
+        for stage, splits in results["stages"].items():
+            if split in splits:
+                values = [splits[split].get(key) for key in shown]
+                table.append([title, stage, *map(_format, shown, values)])
+    return table
+
+
+def print_table(results: Mapping[str, Any]) -> None:
+    """Print the table of a run."""
+    header, *body = rows(results)
+    table = Table(*header)
+    for row in body:
+        table.add_row(*row)
+    Console().print(table)
+
+
+def write_json(path: pathlib.Path, results: Mapping[str, Any]) -> None:
+    """Write strict JSON, whole or not at all."""
+    _write_text(path, json.dumps(results, indent=1, allow_nan=False))
+
+
+def write_report(
+    path: pathlib.Path, results: Mapping[str, Any], pictures: Sequence[Picture]
+) -> None:
+    """Write the page: title, table, pictures by section, configuration; no file beside it."""
+    title = f"{results['scene']}: {results['method']}, preset {results['preset']}"
+    width, height = results["resolution"]
+    header, *body = rows(results)
+    parts = [
+        "<!doctype html><html lang=en><meta charset=utf-8>",
+        "<meta name=viewport content='width=device-width'>",
+        f"<title>{html.escape(title)}</title><style>{_STYLE}</style>",
+        f"<h1>{html.escape(title)}</h1>",
+        f"<p>{width} x {height} pixels, seed {results['seed']}. Metrics are means over views, on "
+        "8-bit images. <i>control</i> is the baseline after as many further steps as "
+        "<i>closeup</i>, without pseudo-labels: a gain counts against it.</p>",
+        "<div class=wide><table><tr>",
+        *(f"<th>{html.escape(cell)}" for cell in header),
+        *("<tr>" + "".join(f"<td>{html.escape(cell)}" for cell in row) for row in body),
+        "</table></div>",
+    ]
+    if "labels" in results:
+        parts.append(_labels_table(results["labels"]))
+    section = None
+    for picture in pictures:
+        if picture.section != section:
+            section = picture.section
+            parts.append(f"<h2>{html.escape(section)}</h2>")
+        caption = html.escape(picture.caption)
+        parts.append(
+            f"<figure><img alt='{caption}' src='{png_data_uri(picture.image)}'>"
+            f"<figcaption>{caption}</figcaption></figure>"
+        )
+    config = html.escape(json.dumps({k: results[k] for k in ("config", "versions")}, indent=1))
+    parts.append(f"<details><summary>Configuration</summary><pre>{config}</pre></details></html>")
+    _write_text(path, "\n".join(parts))
+
+
+def _labels_table(labels):
+    lines = "".join(
+        f"<tr><td>{depth.replace('_', ' ')}<td>{values['error']:.4f}<td>{values['kept']:.1%}"
+        f"<td>{values['leaked']:.1%}"
+        for depth, values in labels.items()
+    )
+    return (
+        "<h2>Labels against the truth</h2><p>Random virtual close-ups; the truth is blurred to the "
+        "source photograph's pixels.</p><table><tr><th>depth<th>mean absolute error of kept "
+        "labels<th>kept, of what the source sees<th>leaked: kept though the source does not see it"
+        f"{lines}</table>"
+    )
+
+
+def _format(key, value):
+    if value is None:
+        return "-"
+    return f"{value:.2f}" if "psnr" in key else f"{value:.4f}"
+
+
+def _write_text(path, text):
+    temporary = path.with_name(path.name + ".part")
+    temporary.write_text(text, encoding="utf-8")
+    os.replace(temporary, path)
+
+
+_STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 1200px; margin: 2em auto; padding: 0 1em }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums }
+th, td { padding: .25em .8em; text-align: right; border-bottom: 1px solid #ccc }
+th:nth-child(-n+2), td:nth-child(-n+2) { text-align: left }
+.wide { overflow-x: auto }
+figure { margin: 1em 0 }
+img { width: 100%; image-rendering: pixelated }
+figcaption { color: #555 }
+"""

@@ -1,0 +1,266 @@
+"""Train, fine-tune on pseudo-labelled close-ups, evaluate, report.
+
+    python -m experiments.run --scene=table
+
+Stages: `baseline` trains on the photographs; `control` and `closeup` both go on from it for the
+same number of steps, without and with pseudo-labels. The scene is a built-in one or a folder.
+"""
+
+import dataclasses
+import datetime
+import functools
+import os
+import pathlib
+import platform
+import sys
+import time
+from typing import Any
+
+import jax
+import numpy as np
+from absl import app, flags
+
+import jaxcloseup
+from experiments.audit import audit_labels
+from experiments.evaluation import evaluate, exact_depths, make_targets
+from experiments.loop import make_runner, run_stage
+from experiments.pictures import comparisons, label_pictures, write_renders
+from experiments.presets import PRESETS, Preset, make_field, make_optimizer, pseudo_settings
+from experiments.report import print_table, write_json, write_report
+from jaxcloseup.geometry.union_warp import block_sources
+from jaxcloseup.scenes import Scene, SceneError, load_scene
+from jaxcloseup.train import init_state, pseudo_step, render_depths, train_step
+
+
+FLAGS = flags.FLAGS
+flags.DEFINE_string(
+    "scene", "table", "a built-in scene (counter, table, room, bench, stairs) or a folder"
+)
+flags.DEFINE_enum("method", "nerf", ["nerf"], "radiance field")
+flags.DEFINE_enum("preset", "quick", list(PRESETS), "hyper-parameters; flags below override them")
+flags.DEFINE_integer("seed", 0, "random seed; the same seed gives the same metrics", lower_bound=0)
+flags.DEFINE_string(
+    "output_dir", None, "where results go; default outputs/<scene>/<method>/<date_time>"
+)
+flags.DEFINE_integer(
+    "downscale",
+    None,
+    "reduce photographs by this factor, by area; default: the preset's",
+    lower_bound=1,
+)
+flags.DEFINE_integer(
+    "baseline_steps", None, "steps of stage 1; default: the preset's", lower_bound=1
+)
+flags.DEFINE_integer(
+    "closeup_steps", None, "steps of closeup and of control; default: the preset's", lower_bound=1
+)
+flags.DEFINE_enum(
+    "compute_dtype",
+    "float32",
+    ["float32", "bfloat16"],
+    "operands of the network's products; bfloat16 is faster and less exact",
+)
+flags.DEFINE_bool(
+    "half_pixel", False, "the capture has pixel centres at integers: add 0.5 to cx, cy"
+)
+flags.DEFINE_string(
+    "compilation_cache",
+    None,
+    "folder of compiled programs, kept between runs; empty: none; default: under ~/.cache",
+)
+
+
+def main(argv: list[str]) -> None:
+    """Run all stages with the settings of the flags."""
+    if len(argv) > 1:
+        raise app.UsageError(f"unexpected argument: {argv[1]}")
+    set_up_compilation_cache(FLAGS.compilation_cache)
+    preset = preset_from_flags()
+    try:
+        scene = load_scene(FLAGS.scene, downscale=preset.downscale, half_pixel=FLAGS.half_pixel)
+        output_dir = claim_output_dir(FLAGS.output_dir, scene.name, FLAGS.method)
+    except (SceneError, OSError) as error:
+        sys.exit(f"experiments.run: {error}")
+    results = run(scene, preset, FLAGS.seed, output_dir, preset_name=FLAGS.preset)
+    print_table(results)
+    print(f"report: {output_dir / 'report.html'}")
+
+
+def preset_from_flags() -> Preset:
+    """The preset, with the flags that were given in place of its values."""
+    preset = PRESETS[FLAGS.preset]
+    given = {
+        name: getattr(FLAGS, name)
+        for name in ("downscale", "baseline_steps", "closeup_steps")
+        if getattr(FLAGS, name) is not None
+    }
+    network = dataclasses.replace(preset.nerf, compute_dtype=FLAGS.compute_dtype)
+    return dataclasses.replace(preset, nerf=network, **given)
+
+
+def set_up_compilation_cache(folder: str | None) -> None:
+    """Keep compiled programs on disk, so that the next run starts at once."""
+    if folder is None:
+        cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+        folder = os.path.join(cache, "jaxcloseup", "xla")
+    if folder:
+        jax.config.update("jax_compilation_cache_dir", folder)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def claim_output_dir(folder: str | None, scene: str, method: str) -> pathlib.Path:
+    """Make the output folder, before any work is spent; never one that holds something."""
+    if folder is None:
+        stamp = datetime.datetime.now().strftime("%Y-%m-%d_%H%M%S")
+        folder = os.path.join("outputs", scene, method, stamp)
+    path = pathlib.Path(folder)
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise FileExistsError(
+            f"--output_dir={folder} already holds something: name a new folder, or remove it first"
+        )
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def run(
+    scene: Scene, preset: Preset, seed: int, output_dir: pathlib.Path, *, preset_name: str
+) -> dict[str, Any]:
+    """All stages on one scene; writes everything under `output_dir` and returns the results."""
+    key_init, key_audit, key_pictures = jax.random.split(jax.random.key(seed), 3)
+    scene = dataclasses.replace(scene, train=jax.device_put(scene.train))
+    views = scene.train
+    print(
+        f"{scene.name}: {len(views)} training photographs of {views.cameras.width} x "
+        f"{views.cameras.height}, depth {scene.near:.3g} to {scene.far:.3g}"
+    )
+    field, optimizer = make_field(preset, scene), make_optimizer(preset)
+    bound = {"field": field, "optimizer": optimizer, "config": preset.train}
+    render = jax.jit(
+        lambda state, camera: field.render(state.params, state.buffers, camera, None, None)
+    )
+    seconds, stages, pictures, renderings, history = {}, {}, [], {}, {}
+    targets = {}
+
+    def train_stage(name, runner, state, *data, steps):
+        start = time.perf_counter()
+        state, history[name] = run_stage(
+            name, runner, state, *data, steps=steps, chunk=max(1, min(steps // 10, 500))
+        )
+        seconds[name] = time.perf_counter() - start
+        return state
+
+    def evaluate_stage(name, state):
+        start = time.perf_counter()
+        stages[name] = {}
+        for split, views_of_split in targets.items():
+            stages[name][split], renderings[name, split] = evaluate(
+                functools.partial(render, state), views_of_split
+            )
+            write_renders(output_dir / "renders" / name / split, renderings[name, split], scene)
+            print(f"{name:>9} {split}: PSNR {stages[name][split]['psnr']:.2f} dB")
+        seconds[f"{name}_evaluation"] = time.perf_counter() - start
+
+    state = init_state(key_init, scene.points, scene.rgb, field=field, optimizer=optimizer)
+    photographs_only = make_runner(functools.partial(train_step, **bound))
+    baseline = train_stage("baseline", photographs_only, state, views, steps=preset.baseline_steps)
+
+    start = time.perf_counter()
+    depths = jax.jit(
+        lambda state: render_depths(
+            field, state.params, state.buffers, views.cameras, near=scene.near, far=scene.far
+        )
+    )(baseline).block_until_ready()
+    seconds["depths"] = time.perf_counter() - start
+    exact = exact_depths(scene, views.cameras) if scene.surface else None
+    for split in ("test", "test_far"):
+        if getattr(scene, split) is not None:
+            seen_from = depths if exact is None else exact
+            targets[split] = make_targets(
+                scene, split, seen_from, functools.partial(render, baseline)
+            )
+    evaluate_stage("baseline", baseline)
+
+    control = train_stage("control", photographs_only, baseline, views, steps=preset.closeup_steps)
+    evaluate_stage("control", control)
+
+    settings = pseudo_settings(preset)
+    sources = block_sources(views.cameras, depths, views.weight)
+    with_labels = make_runner(
+        lambda state, views, depths, settings, sources: pseudo_step(
+            state, views, depths, settings, sources=sources, **bound
+        )
+    )
+    closeup = train_stage(
+        "closeup",
+        with_labels,
+        baseline,
+        views,
+        depths,
+        settings,
+        sources,
+        steps=preset.closeup_steps,
+    )
+    evaluate_stage("closeup", closeup)
+
+    pictures += comparisons(output_dir / "compare", targets, renderings)
+    pictures += label_pictures(
+        output_dir / "labels",
+        key_pictures,
+        scene,
+        settings,
+        depths,
+        targets.get("test", []),
+        functools.partial(render, baseline),
+    )
+    results = {
+        "scene": scene.name,
+        "method": "nerf",
+        "preset": preset_name,
+        "seed": seed,
+        "resolution": [views.cameras.width, views.cameras.height],
+        "stages": stages,
+        "seconds": seconds,
+        "history": history,
+        "config": jsonable(preset),
+        "versions": versions(),
+    }
+    if scene.surface is not None:
+        results["labels"] = {
+            "exact_depth": audit_labels(
+                key_audit, scene, settings, exact, exact, lambda c: scene.surface(c).depth
+            ),
+            "trained_depth": audit_labels(
+                key_audit, scene, settings, exact, depths, lambda c: render(baseline, c).depth
+            ),
+        }
+    write_json(output_dir / "results.json", results)
+    write_report(output_dir / "report.html", results, pictures)
+    return results
+
+
+def jsonable(preset: Preset) -> dict[str, Any]:
+    """The configuration as JSON can hold it: infinities become text."""
+
+    def plain(value):
+        if isinstance(value, dict):
+            return {key: plain(inner) for key, inner in value.items()}
+        if isinstance(value, tuple):
+            return [plain(inner) for inner in value]
+        return str(value) if isinstance(value, float) and not np.isfinite(value) else value
+
+    return plain(dataclasses.asdict(preset))
+
+
+def versions() -> dict[str, str]:
+    """What made the numbers."""
+    return {
+        "jaxcloseup": jaxcloseup.__version__,
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "numpy": np.__version__,
+        "device": jax.devices()[0].device_kind,
+    }
+
+
+if __name__ == "__main__":
+    app.run(main)
