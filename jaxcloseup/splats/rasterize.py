@@ -142,6 +142,7 @@ def rasterize(
 
 # Columns of the packed table that a chunk gathers; the payload follows.
 _ANCHOR, _ROWS, _OPACITY, _LOW_PASS, _RANGE, _PAYLOAD = 0, 2, 11, 12, 13, 15
+_EXACT = lax.Precision.HIGHEST
 
 
 def _pack(footprints: Footprints) -> jax.Array:
@@ -171,12 +172,11 @@ class _Trace(NamedTuple):
 
     transmittance: jax.Array  # behind the last drawn splat
     stop: jax.Array  # position in the list where the pixel was finished
-    median: jax.Array  # position of the median splat, -1 if none
     reference: jax.Array  # inverse depth of the first drawn splat
 
 
 class _Shade(NamedTuple):
-    """One chunk's splats at every pixel, `[B, K, P]`."""
+    """One chunk's splats at every pixel, `[K, B, P]`."""
 
     alpha: jax.Array  # 0 where not drawn
     inverse_depth: jax.Array
@@ -189,7 +189,7 @@ class _Shade(NamedTuple):
 
 
 def _shade(splats: jax.Array, x: jax.Array, y: jax.Array, near: float) -> _Shade:
-    """Evaluate gathered table rows `[B, K, C]` (anchors local to the tile) at pixels `[P]`."""
+    """Evaluate gathered table rows `[K, B, C]` (anchors local to the tile) at pixels `[P]`."""
     column = lambda i: splats[:, :, i, None]  # noqa: E731
     dx, dy = x[None, None] - column(_ANCHOR), y[None, None] - column(_ANCHOR + 1)
     u, v, w = (
@@ -207,16 +207,17 @@ def _shade(splats: jax.Array, x: jax.Array, y: jax.Array, near: float) -> _Shade
     return _Shade(alpha, inverse, z, u, v, w, on_plane, rho)
 
 
-def _gather(table, lists: TileLists, starts, counts, origins, position, chunk):
-    """Rows `[B, K, C]` of one chunk of each tile, anchors made local; index `[B, K]`."""
-    place = position + jnp.arange(chunk, dtype=jnp.int32)[None]
-    inside = place < counts[:, None]
-    index = lists.splats[jnp.where(inside, starts[:, None] + place, 0)]
+def _gather(table, lists: TileLists, tiles, position, chunk):
+    """Rows `[K, B, C]` of one chunk of each tile with anchors made local, and their splats `[K, B]`."""
+    starts, counts, origins = tiles
+    place = position + jnp.arange(chunk, dtype=jnp.int32)[:, None]
+    inside = place < counts[None]
+    index = lists.splats[jnp.where(inside, starts[None] + place, 0)]
     rows = table[index]
-    anchor = rows[..., :2] - origins[:, None]
+    anchor = rows[..., :_ROWS] - origins[None].astype(table.dtype)
     opacity = jnp.where(inside, rows[..., _OPACITY], 0)[..., None]
     rows = jnp.concatenate(
-        [anchor, rows[..., _ROWS:_OPACITY], opacity, rows[..., _LOW_PASS:]], axis=-1
+        [anchor, rows[..., _ROWS:_OPACITY], opacity, rows[..., _OPACITY + 1 :]], axis=-1
     )
     return rows, index
 
@@ -229,7 +230,7 @@ def _pixels(tile: int, dtype) -> tuple[jax.Array, jax.Array]:
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _composite(config: RasterizeConfig, table: jax.Array, lists: TileLists):
-    """Sums `[T, F + 4, P]` (payload, depth, 1, two moments) and median depth `[T, P]` of all tiles."""
+    """Sums `[T, F + 4, P]` (payload, z, 1 and two moments) and median z `[T, P]` of all tiles."""
     return _composite_forward(config, table, lists)[0]
 
 
@@ -237,72 +238,57 @@ def _composite_forward(config, table, lists):
     features = table.shape[1] - _PAYLOAD
     x, y = _pixels(config.tile, table.dtype)
 
+    def attenuate(product, alpha):
+        # The product keeps falling once a pixel is finished, so that it stays finished.
+        product = product - alpha * product
+        return product, product
+
     def block(tiles):
-        starts, counts, origins = tiles
-        origins = origins.astype(table.dtype)
-        shape = (config.block, config.tile**2)
+        counts = tiles[1]
         longest = counts.max()
 
         def unfinished(state):
-            position, transmittance = state[:2]
-            return (position < longest) & jnp.any(
-                (transmittance >= TRANSMITTANCE_MIN) & (position < counts)[:, None]
-            )
+            position, product = state[:2]
+            listed = (position < counts)[:, None]
+            return (position < longest) & jnp.any((product >= TRANSMITTANCE_MIN) & listed)
 
         def step(state):
-            position, product, remaining, stop, median_at, reference, median, sums = state
-            rows, _ = _gather(table, lists, starts, counts, origins, position, config.chunk)
+            position, product, remaining, stop, reference, median, sums = state
+            rows, _ = _gather(table, lists, tiles, position, config.chunk)
             shade = _shade(rows, x, y, config.near)
-            alphas, inverses, zs = lax.optimization_barrier(
-                (shade.alpha, shade.inverse_depth, shade.z)
-            )
-            sums = list(sums)
+            before = product
+            product, afters = lax.scan(attenuate, product, shade.alpha)
+            weights = []
             for k in range(config.chunk):
-                alpha, inverse, z = alphas[:, k], inverses[:, k], zs[:, k]
-                weight = alpha * product
-                # The product keeps falling once a pixel is finished, so it stays finished.
-                after = product - weight
+                alpha, after = shade.alpha[k], afters[k]
                 open_ = after >= TRANSMITTANCE_MIN
-                drawn = alpha > 0
-                weight = jnp.where(open_, weight, 0)
-                reference = jnp.where(drawn & (product == 1), inverse, reference)
-                half = drawn & (product > 0.5)
-                median = jnp.where(half, z, median)
-                median_at = jnp.where(half, position + k, median_at)
+                weights.append(jnp.where(open_, alpha * before, 0))
                 remaining = jnp.where(open_, after, remaining)
                 stop = jnp.where(open_, position + (k + 1), stop)
-                shifted = inverse - reference
-                first = weight * shifted
-                for f in range(features):
-                    sums[f] = sums[f] + weight * rows[:, k, _PAYLOAD + f, None]
-                sums[features] = sums[features] + weight * z
-                sums[features + 1] = sums[features + 1] + first
-                sums[features + 2] = sums[features + 2] + first * shifted
-                product = after
-            position = position + config.chunk
-            return position, product, remaining, stop, median_at, reference, median, tuple(sums)
+                drawn = alpha > 0
+                reference = jnp.where(drawn & (before == 1), shade.inverse_depth[k], reference)
+                median = jnp.where(drawn & (before > 0.5), shade.z[k], median)
+                before = after
+            # A splat in front of the first one drawn weighs nothing, so one reference serves all.
+            shifted = shade.inverse_depth - reference[None]
+            channels = [rows[:, :, _PAYLOAD + f, None] for f in range(features)]
+            channels += [shade.z, jnp.ones_like(shade.z), shifted, shifted * shifted]
+            sums = tuple(
+                total + sum(weights[k] * channel[k] for k in range(config.chunk))
+                for total, channel in zip(sums, channels, strict=True)
+            )
+            return position + config.chunk, product, remaining, stop, reference, median, sums
 
+        shape = (config.block, config.tile**2)
         ones, zeros = jnp.ones(shape, table.dtype), jnp.zeros(shape, table.dtype)
-        whole = jnp.zeros(shape, jnp.int32)
-        state = (
-            jnp.int32(0),
-            ones,
-            ones,
-            whole,
-            whole - 1,
-            zeros,
-            zeros,
-            (zeros,) * (features + 3),
-        )
-        _, _, remaining, stop, median_at, reference, median, sums = lax.while_loop(
-            unfinished, step, state
-        )
-        sums = jnp.stack([*sums[: features + 1], 1 - remaining, *sums[features + 1 :]], axis=1)
-        return sums, median, _Trace(remaining, stop, median_at, reference)
+        stop = jnp.zeros(shape, jnp.int32)
+        state = (jnp.int32(0), ones, ones, stop, zeros, zeros, (zeros,) * (features + 4))
+        _, _, *trace, median, sums = lax.while_loop(unfinished, step, state)
+        return jnp.stack(sums, axis=1), median, _Trace(*trace)
 
     sums, median, trace = lax.map(block, (lists.starts, lists.counts, lists.origins))
-    unsort = lambda a: a.reshape((-1, *a.shape[2:]))[lists.slot]  # noqa: E731
-    return (unsort(sums), unsort(median)), (table, lists, trace)
+    in_order = lambda tiles: tiles.reshape((-1, *tiles.shape[2:]))[lists.slot]  # noqa: E731
+    return (in_order(sums), in_order(median)), (table, lists, trace)
 
 
 def _composite_backward(config, residuals, cotangents):
@@ -310,103 +296,108 @@ def _composite_backward(config, residuals, cotangents):
     columns = table.shape[1]
     features = columns - _PAYLOAD
     x, y = _pixels(config.tile, table.dtype)
-    basis = jnp.stack([jnp.ones_like(x), x, y], axis=1)
-    sums_bar, median_bar = (bar[lists.tile] for bar in cotangents)
+    linear = jnp.stack([jnp.ones_like(x), x, y], axis=1)
+    quadratic = jnp.concatenate([linear, jnp.stack([x * x, x * y, y * y], axis=1)], axis=1)
+    cotangents = tuple(bar[lists.tile] for bar in cotangents)
+
+    def recede(carry, splat):
+        behind, after = carry
+        alpha, passing, worth = splat
+        before = after * passing
+        return (behind + alpha * before * worth, before), (behind, after)
 
     def block(table_bar, tiles):
-        starts, counts, origins, sums_bar, median_bar, trace = tiles
-        origins = origins.astype(table.dtype)
-        bars = [sums_bar[:, i] for i in range(features + 4)]
-        depth_bar, alpha_bar, first_bar, second_bar = bars[features:]
+        *tiles, (sums_bar, median_bar), trace = tiles
+        z_bar, alpha_bar, first_bar, second_bar = (
+            sums_bar[None, :, features + i] for i in range(4)
+        )
 
         def step(state):
-            position, behind, transmittance, table_bar = state
-            rows, index = _gather(table, lists, starts, counts, origins, position, config.chunk)
+            position, behind, after, table_bar = state
+            rows, index = _gather(table, lists, tiles, position, config.chunk)
             shade = _shade(rows, x, y, config.near)
-            place = position + jnp.arange(config.chunk, dtype=jnp.int32)[None, :, None]
-            alphas = jnp.where(place < trace.stop[:, None], shade.alpha, 0)
-            shifted = shade.inverse_depth - trace.reference[:, None]
+            place = position + jnp.arange(config.chunk, dtype=jnp.int32)[:, None, None]
+            alpha = jnp.where(place < trace.stop[None], shade.alpha, 0)
+            shifted = shade.inverse_depth - trace.reference[None]
             # What a unit of weight of each splat is worth to the loss.
-            worth = alpha_bar[:, None] + shade.z * depth_bar[:, None]
-            worth = worth + shifted * (first_bar[:, None] + shifted * second_bar[:, None])
-            for f in range(features):
-                worth = worth + rows[:, :, _PAYLOAD + f, None] * bars[f][:, None]
-            inverse = 1 / (1 - alphas)
-            alphas, worth, inverse = lax.optimization_barrier((alphas, worth, inverse))
-            weights, alphas_bar = [], []
-            for k in reversed(range(config.chunk)):
-                transmittance = transmittance * inverse[:, k]
-                weight = alphas[:, k] * transmittance
-                alphas_bar.append(transmittance * worth[:, k] - behind * inverse[:, k])
-                behind = behind + weight * worth[:, k]
-                weights.append(weight)
-            weights, alphas_bar = lax.optimization_barrier(
-                (jnp.stack(weights[::-1], 1), jnp.stack(alphas_bar[::-1], 1))
+            worth = jnp.einsum(
+                "kbf,bfp->kbp", rows[..., _PAYLOAD:], sums_bar[:, :features], precision=_EXACT
             )
-            z_bar = weights * depth_bar[:, None]
-            z_bar = z_bar + jnp.where(place == trace.median[:, None], median_bar[:, None], 0)
-            inverse_bar = weights * (first_bar[:, None] + 2 * shifted * second_bar[:, None])
-            inverse_bar = inverse_bar - shade.z * shade.z * z_bar
-            scaled = alphas * alphas_bar
-            scaled = jnp.where(alphas < ALPHA_MAX, scaled, 0)
-            plane_bar = jnp.where(shade.on_plane, -scaled * shade.z, 0)  # -2 rho_bar z
-            u_bar = plane_bar * shade.z * shade.u_numerator
-            v_bar = plane_bar * shade.z * shade.v_numerator
+            worth = worth + alpha_bar + shade.z * z_bar
+            worth = worth + shifted * (first_bar + shifted * second_bar)
+            passing = 1 / (1 - alpha)
+            (behind, after), (behinds, afters) = lax.scan(
+                recede, (behind, after), (alpha, passing, worth), reverse=True
+            )
+            before = afters * passing
+            weight = alpha * before
+            # The splat in which half of the light is lost, or else the last one that is drawn.
+            last = (afters <= 0.5) | (afters == trace.transmittance[None])
+            median = (alpha > 0) & (before > 0.5) & last
+            depth_bar = weight * z_bar + jnp.where(median, median_bar[None], 0)
+            inverse_bar = weight * (first_bar + 2 * shifted * second_bar)
+            inverse_bar = inverse_bar - shade.z * shade.z * depth_bar
+            scaled = alpha * (before * worth - behinds * passing)  # d loss / d log(alpha)
+            scaled = jnp.where(alpha < ALPHA_MAX, scaled, 0)
+            plane = jnp.where(shade.on_plane, scaled * shade.z, 0)
             clipped = ~shade.on_plane & (shade.inverse_depth != shade.w)
-            w_bar = jnp.where(clipped, 0, inverse_bar) - plane_bar * shade.rho
-            clip_bar = jnp.where(clipped, inverse_bar * shade.inverse_depth**2, 0)
-            pass_bar = jnp.where(shade.on_plane, 0, scaled)
-            maps = lax.optimization_barrier((u_bar, v_bar, w_bar, pass_bar, clip_bar, scaled))
-            moments = [_reduce(m, basis) for m in maps[:4]]
-            clip_sum, scaled_sum = (m.sum(-1, keepdims=True) for m in maps[4:])
-            payload_bar = jnp.einsum("bkp,bfp->bkf", weights, sums_bar[:, :features])
-            update = _assemble(rows, moments, clip_sum, scaled_sum, payload_bar)
+            update = _assemble(
+                rows,
+                plane=_reduce(-plane * shade.z, quadratic),
+                w=_reduce(jnp.where(clipped, 0, inverse_bar) + plane * shade.rho, linear),
+                low_pass=_reduce(jnp.where(shade.on_plane, 0, scaled), linear),
+                clip=jnp.where(clipped, inverse_bar * shade.inverse_depth**2, 0).sum(-1),
+                scaled=scaled.sum(-1),
+                payload=jnp.einsum(
+                    "kbp,bfp->kbf", weight, sums_bar[:, :features], precision=_EXACT
+                ),
+            )
             table_bar = table_bar.at[index.reshape(-1)].add(update.reshape(-1, columns))
-            return position - config.chunk, behind, transmittance, table_bar
+            return position - config.chunk, behind, after, table_bar
 
-        last = jnp.minimum(trace.stop.max(), counts.max()) - 1
-        state = (
-            jnp.maximum(last, -1) // config.chunk * config.chunk,
-            jnp.zeros_like(median_bar),
-            trace.transmittance,
-            table_bar,
-        )
+        longest = jnp.minimum(trace.stop.max(), tiles[1].max())
+        position = (longest - 1) // config.chunk * config.chunk
+        state = (position, jnp.zeros_like(median_bar), trace.transmittance, table_bar)
         return lax.while_loop(lambda state: state[0] >= 0, step, state)[-1], None
 
-    tiles = (lists.starts, lists.counts, lists.origins, sums_bar, median_bar, trace)
+    tiles = (lists.starts, lists.counts, lists.origins, cotangents, trace)
     return lax.scan(block, jnp.zeros_like(table), tiles)[0], None
 
 
 def _reduce(values: jax.Array, basis: jax.Array) -> jax.Array:
-    return jnp.einsum("bkp,pm->bkm", values, basis, precision=lax.Precision.HIGHEST)
+    return jnp.einsum("kbp,pm->kbm", values, basis, precision=_EXACT)
 
 
-def _assemble(rows, moments, clip_sum, scaled_sum, payload_bar):
-    anchor = rows[..., :2]
-    about = [
-        jnp.concatenate([m[..., :1], m[..., 1:] - m[..., :1] * anchor], axis=-1) for m in moments
+def _assemble(rows, *, plane, w, low_pass, clip, scaled, payload):
+    """Cotangents `[K, B, C]` of gathered rows from sums over the tile's pixels."""
+    anchor, opacity = rows[..., :_ROWS], rows[..., _OPACITY]
+    coefficients = rows[..., _ROWS:_OPACITY].reshape(*rows.shape[:2], 3, 3)
+    ax, ay = anchor[..., 0], anchor[..., 1]
+    # Moments about the anchor instead of the tile's corner.
+    p0, px, py, pxx, pxy, pyy = jnp.moveaxis(plane, -1, 0)
+    pxx = pxx - 2 * ax * px + ax * ax * p0
+    pxy = pxy - ax * py - ay * px + ax * ay * p0
+    pyy = pyy - 2 * ay * py + ay * ay * p0
+    px, py = px - ax * p0, py - ay * p0
+    moments = [[p0, px, py], [px, pxx, pxy], [py, pxy, pyy]]
+    rows_bar = [
+        [sum(coefficients[..., i, j] * moments[j][m] for j in range(3)) for m in range(3)]
+        for i in range(2)
     ]
-    anchor_bar = rows[..., _LOW_PASS : _LOW_PASS + 1] * about[3][..., 1:]
-    for i in range(3):
-        slope = rows[..., _ROWS + 3 * i + 1 : _ROWS + 3 * i + 3]
-        anchor_bar = anchor_bar - about[i][..., :1] * slope
-    # A clipped depth moves with the depth of the centre, 1 / rows[2, 0].
-    clip_sum = safe_divide(clip_sum, rows[..., _ROWS + 6 : _ROWS + 7] ** 2)
-    constant = jnp.concatenate([clip_sum, jnp.zeros_like(anchor)], axis=-1)
-    opacity = rows[..., _OPACITY : _OPACITY + 1]
-    zeros = jnp.zeros_like(rows[..., _LOW_PASS:_PAYLOAD])
-    return jnp.concatenate(
-        [
-            anchor_bar,
-            about[0],
-            about[1],
-            about[2] + constant,
-            safe_divide(scaled_sum, opacity),
-            zeros,
-            payload_bar,
-        ],
-        axis=-1,
-    )
+    w0, wx, wy = jnp.moveaxis(w, -1, 0)
+    # A clipped depth moves with the depth of the anchor, 1 / rows[2, 0].
+    at_anchor = safe_divide(clip, coefficients[..., 2, 0] ** 2)
+    rows_bar.append([w0, wx - ax * w0, wy - ay * w0])
+    l0, lx, ly = jnp.moveaxis(low_pass, -1, 0)
+    drift = [rows[..., _LOW_PASS] * (lx - ax * l0), rows[..., _LOW_PASS] * (ly - ay * l0)]
+    anchor_bar = [
+        drift[axis] - sum(rows_bar[i][0] * coefficients[..., i, axis + 1] for i in range(3))
+        for axis in range(2)
+    ]
+    rows_bar[2][0] = rows_bar[2][0] + at_anchor
+    unused = [jnp.zeros_like(ax)] * (_PAYLOAD - _LOW_PASS)
+    flat = [*anchor_bar, *sum(rows_bar, []), safe_divide(scaled, opacity), *unused]
+    return jnp.concatenate([jnp.stack(flat, axis=-1), payload], axis=-1)
 
 
 _composite.defvjp(_composite_forward, _composite_backward)
