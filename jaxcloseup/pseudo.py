@@ -168,7 +168,8 @@ def count_seen(
         maps = jnp.stack([view_depth, weight], axis=-1)
         observed, weight = jnp.moveaxis(backward_warp(maps, landed, order=0), -1, 0)
         confirmed = depth_consistent(observed, landed_depth, tolerance)
-        return count + ((depth > 0) & (weight > 0) & confirmed), None
+        saw = (depth > 0) & (weight > 0) & confirmed
+        return count + saw.astype(jnp.int32), None
 
     count = jnp.zeros(depth.shape, jnp.int32)
     return jax.lax.scan(add_view, count, (views.cameras, depths, views.weight))[0]

@@ -1,0 +1,50 @@
+"""A world simple enough to know by heart: a textured plane z = 0, photographed from above."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcloseup.batch import Views
+from jaxcloseup.geometry.cameras import Camera
+
+
+HEIGHT, WIDTH, FOCAL = 24, 32, 30.0
+
+
+def camera_above(x, y, height, *, tilt=0.0):
+    """A camera that looks down on the plane, its right along +x; `tilt` turns it about its x."""
+    c, s = np.cos(tilt), np.sin(tilt)
+    down = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
+    rotation = down @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+    camtoworld = np.concatenate([rotation, [[x], [y], [height]]], axis=1)
+    intrinsics = jnp.array([FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2])
+    return Camera(jnp.asarray(camtoworld, jnp.float32), intrinsics, HEIGHT, WIDTH)
+
+
+def texture(points):
+    """Smooth colours `[..., 3]` of points `[..., 3]` of the plane."""
+    x, y = points[..., 0], points[..., 1]
+    return 0.5 + 0.4 * np.stack([np.sin(2 * x), np.cos(3 * y), np.sin(x + 2 * y)], axis=-1)
+
+
+def photograph(camera):
+    """Colours, depths and points, `[H, W, ...]` in float64, ray by ray from the definition."""
+    fx, fy, cx, cy = np.asarray(camera.intrinsics, np.float64)
+    pose = np.asarray(camera.camtoworld, np.float64)
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    directions = np.stack([(x - cx) / fx, (y - cy) / fy, np.ones_like(x)], -1) @ pose[:, :3].T
+    depth = -pose[2, 3] / directions[..., 2]
+    points = pose[:, 3] + depth[..., None] * directions
+    return texture(points), depth, points
+
+
+def make_views(cameras):
+    """`Views` of the plane, and their exact depths `[V, H, W]`."""
+    shots = [photograph(camera) for camera in cameras]
+    stacked = Camera(
+        jnp.stack([camera.camtoworld for camera in cameras]),
+        jnp.stack([camera.intrinsics for camera in cameras]),
+        HEIGHT,
+        WIDTH,
+    )
+    rgb, depths = (jnp.asarray(np.stack([s[i] for s in shots]), jnp.float32) for i in range(2))
+    return Views(stacked, rgb, jnp.ones(depths.shape)), depths

@@ -1,0 +1,179 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import plane
+import pytest
+
+from jaxcloseup.geometry.cameras import pixel_grid
+from jaxcloseup.geometry.poses import PoseSettings
+from jaxcloseup.pseudo import (
+    PseudoSettings,
+    best_source,
+    count_seen,
+    make_label,
+    sample_virtual_camera,
+)
+
+
+label = jax.jit(make_label)
+GRID = pixel_grid(plane.HEIGHT, plane.WIDTH)
+
+
+def settings(**changes):
+    pose = PoseSettings(jnp.array([2.0, 8.0]), jnp.float32(0.5), jnp.float32(jnp.inf))
+    values = {
+        "use_mask": 1.0,
+        "rgb_tolerance": 0.15,
+        "depth_tolerance": jnp.inf,
+        "fixed_anchors": 0.0,
+        "forward_label": 0.0,
+        "leave_out_source": 0.0,
+    }
+    return PseudoSettings(pose, **{k: jnp.float32(v) for k, v in (values | changes).items()})
+
+
+@pytest.fixture(scope="module")
+def capture():
+    cameras = [plane.camera_above(x, 0.1 * x, 4.0, tilt=0.1 * x) for x in (-1.0, 0.0, 1.0, 0.5)]
+    views, depths = plane.make_views(cameras)
+    closeup = plane.camera_above(0.2, 0.1, 1.2, tilt=0.2)
+    return views, depths, closeup
+
+
+def truth(camera):
+    rgb, depth, points = plane.photograph(camera)
+    return rgb, jnp.asarray(depth, jnp.float32), points
+
+
+def seen_by_first(points, camera):
+    """Which points lie in the photograph of a camera, from the definition."""
+    pose = np.asarray(camera.camtoworld, np.float64)
+    x, y, z = np.moveaxis((points - pose[:, 3]) @ pose[:, :3], -1, 0)
+    u = plane.FOCAL * x / z + plane.WIDTH / 2
+    v = plane.FOCAL * y / z + plane.HEIGHT / 2
+    return (z > 0) & (u >= 0) & (u < plane.WIDTH) & (v >= 0) & (v < plane.HEIGHT)
+
+
+def test_labels_from_exact_depth_are_the_true_colours(capture):
+    views, depths, closeup = capture
+    rgb, depth, _ = truth(closeup)
+    result = label(closeup, GRID, depth, 1, views, depths, settings())
+    kept = np.asarray(result.weight) > 0
+    assert kept.mean() > 0.25  # the union, rounded to pixels, is sparse at this magnification
+    np.testing.assert_allclose(result.rgb[kept], rgb[kept], atol=0.02)
+    assert np.abs(np.asarray(result.forward)[kept] - rgb[kept]).max() < 0.17
+
+
+def test_without_the_mask_every_pixel_that_the_source_sees_is_labelled(capture):
+    views, depths, closeup = capture
+    high = plane.camera_above(1.0, 0.0, 3.5)  # sees more than the first photograph does
+    for camera in (closeup, high):
+        rgb, depth, points = truth(camera)
+        result = label(camera, GRID, depth, 0, views, depths, settings(use_mask=0.0))
+        source = jax.tree.map(lambda leaf: leaf[0], views.cameras)
+        np.testing.assert_array_equal(result.weight > 0, seen_by_first(points, source))
+        kept = np.asarray(result.weight) > 0
+        np.testing.assert_allclose(result.rgb[kept], rgb[kept], atol=0.04)
+
+
+def test_a_photograph_that_lies_is_masked_by_the_others(capture):
+    views, depths, closeup = capture
+    _, depth, _ = truth(closeup)
+    lying = views.replace(rgb=views.rgb.at[1].set(1 - views.rgb[1]))
+    honest = label(closeup, GRID, depth, 1, views, depths, settings(leave_out_source=1.0))
+    result = label(closeup, GRID, depth, 1, lying, depths, settings(leave_out_source=1.0))
+    assert honest.weight.mean() > 0.2
+    assert result.weight.mean() < 0.1 * honest.weight.mean()
+    # With itself in the union, the liar vouches for itself.
+    fooled = label(closeup, GRID, depth, 1, lying, depths, settings())
+    assert fooled.weight.mean() > 2 * result.weight.mean()
+
+
+def test_depth_agreement_rejects_what_the_source_does_not_see(capture):
+    views, depths, closeup = capture
+    _, depth, _ = truth(closeup)
+    occluded = depths.at[1, :, : plane.WIDTH // 2].multiply(0.5)  # a wall before the left half
+    loose = label(closeup, GRID, depth, 1, views, occluded, settings(use_mask=0.0))
+    strict = settings(use_mask=0.0, depth_tolerance=0.05)
+    tight = label(closeup, GRID, depth, 1, views, occluded, strict)
+    landed_left = np.asarray(loose.weight) > np.asarray(tight.weight)
+    assert jnp.all(loose.weight == 1)
+    assert 0.1 < landed_left.mean() < 0.9
+    assert landed_left[:, :4].all()
+
+
+def test_the_released_label_is_the_forward_warp(capture):
+    views, depths, closeup = capture
+    _, depth, _ = truth(closeup)
+    result = label(closeup, GRID, depth, 1, views, depths, settings(forward_label=1.0))
+    kept = np.asarray(result.weight) > 0
+    np.testing.assert_array_equal(result.rgb, result.forward)
+    assert not np.array_equal(result.rgb[kept], result.backward[kept])
+
+
+def test_undefined_depth_and_weightless_photographs_give_no_label(capture):
+    views, depths, closeup = capture
+    _, depth, _ = truth(closeup)
+    for undefined in (0.0, -1.0, jnp.nan, jnp.inf):
+        some = depth.at[:5].set(undefined)
+        result = label(closeup, GRID, some, 1, views, depths, settings(use_mask=0.0))
+        np.testing.assert_array_equal(result.weight[:5], 0)
+        assert jnp.all(jnp.isfinite(result.rgb))
+        assert result.weight[5:].mean() > 0.9
+    blank = views.replace(weight=views.weight.at[1].set(0))
+    result = label(closeup, GRID, depth, 1, blank, depths, settings(use_mask=0.0))
+    np.testing.assert_array_equal(result.weight, 0)
+
+
+def test_settings_stack_and_no_gradient_flows(capture):
+    views, depths, closeup = capture
+    _, depth, _ = truth(closeup)
+    arms = jax.tree.map(lambda *leaves: jnp.stack(leaves), settings(), settings(use_mask=0.0))
+    both = jax.jit(jax.vmap(make_label, (None,) * 6 + (0,)))(
+        closeup, GRID, depth, 1, views, depths, arms
+    )
+    for arm, alone in enumerate((settings(), settings(use_mask=0.0))):
+        expected = label(closeup, GRID, depth, 1, views, depths, alone)
+        np.testing.assert_array_equal(both.weight[arm], expected.weight)
+
+    def total(depth):
+        return jnp.sum(label(closeup, GRID, depth, 1, views, depths, settings()).rgb)
+
+    np.testing.assert_array_equal(jax.grad(total)(depth), 0)
+
+
+def test_virtual_cameras_come_from_every_view_and_keep_to_their_anchors(capture):
+    views, depths, _ = capture
+    sample = jax.jit(jax.vmap(sample_virtual_camera, (0, None, None, None)))
+    keys = jax.random.split(jax.random.key(0), 64)
+    cameras, index = sample(keys, views, depths, settings())
+    assert set(np.asarray(index).tolist()) == {0, 1, 2, 3}
+    heights = np.asarray(cameras.position)[:, 2]
+    assert heights.min() > 4 / 8 - 1e-3  # the anchor is on the plane, 4 below the photographs
+    assert heights.max() < 4 / 2 + 1e-3
+    cameras, _ = sample(keys, views, depths, settings(fixed_anchors=1.0))
+    ground = np.asarray(cameras.position)[:, :2]
+    assert len(np.unique(np.round(ground, 1), axis=0)) > 4  # magnification still varies
+
+
+def test_best_source_sees_most_of_the_target(capture):
+    views, depths, _ = capture
+    for index, x in enumerate((-1.0, 0.0, 1.0)):
+        target = plane.camera_above(x, 0.1 * x, 3.9, tilt=0.1 * x)
+        assert best_source(target, views, depths) == index
+
+
+def test_photographs_that_saw_a_pixel_are_counted(capture):
+    views, depths, _ = capture
+    wide = plane.camera_above(0.0, 0.0, 6.0)
+    _, depth, points = truth(wide)
+    expected = sum(
+        seen_by_first(points, jax.tree.map(lambda leaf, i=i: leaf[i], views.cameras))
+        for i in range(len(views))
+    )
+    seen = jax.jit(count_seen)(wide, GRID, depth, views, depths)
+    assert {0, 1, 4} <= set(np.unique(expected).tolist())
+    # At the border of a photograph a projected edge may fall to either side.
+    assert np.mean(np.asarray(seen) == expected) > 0.98
+    none = jax.jit(count_seen)(wide, GRID, depth * 0.7, views, depths)
+    assert none.max() == 0

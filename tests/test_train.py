@@ -1,0 +1,188 @@
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import plane
+import pytest
+from test_pseudo import settings
+
+from jaxcloseup.batch import sample_image, sample_pixels
+from jaxcloseup.field import RadianceField, Rendering
+from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_rays
+from jaxcloseup.train import (
+    TrainConfig,
+    init_state,
+    pseudo_step,
+    render_depths,
+    run_steps,
+    train_step,
+)
+
+
+RATE = 0.25
+
+
+def one_colour_field():
+    """A field of one trainable colour, whose depth is that of the plane: steps in closed form."""
+
+    def render(params, buffers, camera, pixels, key):
+        if camera.intrinsics.ndim > 1:
+            shape = pixels.shape[:-1]
+            depth = jnp.ones(shape)
+        else:
+            depth = jnp.asarray(plane_depth(camera, pixels))
+            shape = depth.shape
+        rgb = jnp.broadcast_to(params.reshape((1,) * len(shape) + (3,)), (*shape, 3))
+        return Rendering(rgb, depth, jnp.ones(shape))
+
+    def loss(rendering, target, weight):
+        total = jnp.sum(weight)
+        squared = jnp.sum((rendering.rgb - target) ** 2, axis=-1)
+        return jnp.sum(weight * squared) / jnp.where(total == 0, 1, total), {}
+
+    def init(key, points, rgb):
+        return jnp.full(3, 0.2), ()
+
+    return RadianceField(init, render, loss)
+
+
+def plane_depth(camera, pixels):
+    if pixels is None:
+        pixels = pixel_grid(camera.height, camera.width)
+    origins, directions = pixels_to_rays(camera, pixels)
+    return -origins[..., 2] / directions[..., 2]
+
+
+@pytest.fixture(scope="module")
+def capture():
+    cameras = [plane.camera_above(x, 0.0, 4.0) for x in (-0.5, 0.0, 0.5)]
+    return plane.make_views(cameras)
+
+
+@functools.cache
+def bind(step, **config):
+    bound = functools.partial(
+        step, field=one_colour_field(), optimizer=optax.sgd(RATE), config=TrainConfig(**config)
+    )
+    return jax.jit(bound)
+
+
+def fresh_state(seed=0):
+    return init_state(
+        jax.random.key(seed),
+        jnp.zeros((0, 3)),
+        jnp.zeros((0, 3)),
+        field=one_colour_field(),
+        optimizer=optax.sgd(RATE),
+    )
+
+
+def drawn(state, views, count):
+    """The photographs' colours that a step of this state sees."""
+    key = jax.random.split(jax.random.fold_in(state.key, state.step), 4)[0]
+    batch = sample_image(key, views) if count is None else sample_pixels(key, views, count)
+    return batch.rgb.reshape(-1, 3)
+
+
+@pytest.mark.parametrize("count", [64, None])
+def test_a_step_on_photographs_is_gradient_descent_on_their_pixels(capture, count):
+    views, _ = capture
+    state = fresh_state()
+    after, metrics = bind(train_step, num_rays=count)(state, views)
+    rgb = drawn(state, views, count)
+    # d/dc mean |c - t|^2 = 2 (c - mean t)
+    expected = state.params - RATE * 2 * (state.params - rgb.mean(axis=0))
+    np.testing.assert_allclose(after.params, expected, atol=1e-6)
+    assert after.step == 1
+    error = jnp.mean(jnp.sum((rgb - state.params[None]) ** 2, axis=-1))
+    np.testing.assert_allclose(metrics["loss"], error, rtol=1e-5)
+
+
+@pytest.mark.parametrize("count", [64, None])
+def test_when_nothing_is_labelled_half_the_photographs_loss_remains(capture, count):
+    views, depths = capture
+    state = fresh_state()
+    step = bind(pseudo_step, num_rays=count, num_label_rays=count and 256)
+    after, metrics = step(state, views, depths, settings(rgb_tolerance=0.0))
+    expected = state.params - RATE * (state.params - drawn(state, views, count).mean(axis=0))
+    np.testing.assert_allclose(after.params, expected, atol=1e-6)
+    assert metrics["label_coverage"] == 0
+    assert jnp.isfinite(metrics["loss"])
+
+
+def test_labels_pull_with_half_the_weight_whatever_their_number(capture):
+    views, depths = capture
+    # Photographs are black beyond what is drawn, labels white: their shares can be read off.
+    white = views.replace(rgb=jnp.ones_like(views.rgb))
+    state = fresh_state()
+    step = bind(pseudo_step, num_rays=64, num_label_rays=256)
+    after, metrics = step(state, white, depths, settings())
+    assert 0 < metrics["label_coverage"] < 1
+    # Both means are white: (L_c + L_pl) / 2 has the gradient 2 (c - 1), as each has alone.
+    np.testing.assert_allclose(
+        after.params, state.params - RATE * 2 * (state.params - 1), atol=1e-6
+    )
+    # With loss summed per mean, a coverage under 1 does not weaken the labels.
+    pooled = bind(pseudo_step, num_rays=64, num_label_rays=256, pooled_loss=True)
+    after_pooled, _ = pooled(state, white, depths, settings())
+    np.testing.assert_allclose(after_pooled.params, after.params, atol=1e-6)
+
+
+def test_pooling_weighs_photographs_and_labels_by_their_pixels(capture):
+    views, depths = capture
+    state = fresh_state()
+    arguments = views, depths, settings(use_mask=0.0)
+    halves, metrics = bind(pseudo_step, num_rays=64, num_label_rays=256)(state, *arguments)
+    pooled, _ = bind(pseudo_step, num_rays=64, num_label_rays=256, pooled_loss=True)(
+        state, *arguments
+    )
+    photographs = drawn(state, views, 64).mean(axis=0)
+    # Solve the mean label out of the first step; predict the second from it.
+    pull = (state.params - halves.params) / RATE  # = (c - p) + (c - l)
+    labels = 2 * state.params - photographs - pull
+    kept = metrics["label_coverage"] * 256
+    mean = (64 * photographs + kept * labels) / (64 + kept)
+    expected = state.params - RATE * 2 * (state.params - mean)
+    np.testing.assert_allclose(pooled.params, expected, atol=1e-5)
+
+
+def test_the_control_sees_the_same_photographs(capture):
+    views, depths = capture
+    state = fresh_state()
+    step = bind(pseudo_step, num_rays=64, num_label_rays=256)
+    unlabelled, _ = step(state, views, depths, settings(rgb_tolerance=0.0))
+    control, _ = bind(train_step, num_rays=64)(state, views)
+    half_way = (control.params - state.params) / 2
+    np.testing.assert_allclose(unlabelled.params - state.params, half_way, atol=1e-6)
+
+
+def test_steps_in_one_scan_equal_steps_one_by_one(capture):
+    views, depths = capture
+    step = bind(pseudo_step, num_rays=64, num_label_rays=256)
+    data = views, depths, settings()
+    at_once, metrics = jax.jit(lambda state: run_steps(step, state, *data, count=2))(fresh_state())
+    first, first_metrics = step(fresh_state(), *data)
+    second, second_metrics = step(first, *data)
+    np.testing.assert_allclose(at_once.params, second.params, rtol=1e-6)
+    mean = (first_metrics["loss"] + second_metrics["loss"]) / 2
+    np.testing.assert_allclose(metrics["loss"], mean, rtol=1e-5)
+    other, _ = step(fresh_state(seed=1), *data)
+    assert not np.array_equal(first.params, other.params)
+
+
+def test_depths_are_undefined_where_the_field_is_thin_or_out_of_range(capture):
+    views, _ = capture
+    alpha = jnp.linspace(0, 1, plane.WIDTH)[None].repeat(plane.HEIGHT, axis=0)
+    depth = jnp.linspace(1, 5, plane.HEIGHT)[:, None].repeat(plane.WIDTH, axis=1)
+
+    def render(params, buffers, camera, pixels, key):
+        assert pixels is None
+        assert key is None
+        return Rendering(jnp.zeros((*depth.shape, 3)), depth, alpha)
+
+    field = one_colour_field()._replace(render=render)
+    result = render_depths(field, None, (), views.cameras, near=2, far=4)
+    expected = np.where((alpha >= 0.5) & (depth >= 2) & (depth <= 4), depth, 0)
+    np.testing.assert_array_equal(result, np.stack([expected] * 3))
