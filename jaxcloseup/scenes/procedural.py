@@ -1,0 +1,236 @@
+"""Captures of the built-in scenes: far photographs, close-up test views, and the exact truth.
+
+Everything follows from the scene's name: cameras are planned on the exact geometry with fixed
+seeds, at full size, and only then scaled. Photographs are kept on disk, since a full-size capture
+takes minutes; the key covers the source files that draw them.
+"""
+
+import functools
+import hashlib
+import os
+import pathlib
+import tempfile
+import warnings
+import zipfile
+import zlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcloseup.batch import Views, camera_at
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.scenes import modelling, shading
+from jaxcloseup.scenes.builtin import SCENES
+from jaxcloseup.scenes.planning import (
+    FOCAL,
+    HEIGHT,
+    WIDTH,
+    cast,
+    grid_rays,
+    plan_closeups,
+    plan_far,
+)
+from jaxcloseup.scenes.scene import Scene, Surface
+
+
+PROCEDURAL_SCENES: tuple[str, ...] = tuple(SCENES)
+NUM_TRAIN, NUM_TEST, NUM_FAR = 60, 12, 8
+_SAMPLES = 8  # rays a pixel
+_SOURCES = ("raycast", "shading", "materials", "prints", "modelling", "builtin", "planning")
+
+
+def procedural_scene(
+    name: str,
+    *,
+    downscale: int = 1,
+    noise: float = 0.0,
+    exposure_jitter: float = 0.0,
+    pose_noise: float = 0.0,
+) -> Scene:
+    """A built-in scene as if it had been captured, with its exact surface at any pose.
+
+    World units are metres and z is up. Full size is 960 x 540; sizes round up, and focal lengths
+    scale with the true ratio. The three realism options touch the training photographs alone.
+
+    Args:
+      name: one of `PROCEDURAL_SCENES`.
+      downscale: divisor of the image size.
+      noise: standard deviation of sensor noise, in units of colour.
+      exposure_jitter: standard deviation of the logarithm of each photograph's exposure.
+      pose_noise: standard deviation of reported training positions (metres) and angles (radians).
+
+    Raises:
+      ValueError: the name is not a built-in scene, or `downscale` is not a positive integer.
+    """
+    if name not in SCENES:
+        raise ValueError(f"no built-in scene {name!r}; there are {', '.join(PROCEDURAL_SCENES)}")
+    if downscale < 1 or downscale != int(downscale):
+        raise ValueError(f"downscale must be a positive integer, not {downscale}")
+    width, height = -(-WIDTH // downscale), -(-HEIGHT // downscale)
+    capture = _cached(name, width, height)
+    splits = {}
+    for split in ("train", "test", "test_far"):
+        rgb = jnp.asarray(capture[f"{split}_rgb"])
+        cameras = _cameras(capture[f"{split}_poses"], width, height)
+        splits[split] = Views(cameras, rgb, jnp.ones(rgb.shape[:3], jnp.float32))
+    if noise or exposure_jitter or pose_noise:
+        splits["train"] = _degrade(
+            splits["train"], _rng(name, 2), noise, exposure_jitter, pose_noise
+        )
+
+    def surface(camera: Camera) -> Surface:
+        return _render_surface(_world(name), camera)
+
+    return Scene(
+        name=name,
+        **splits,
+        points=capture["points"],
+        rgb=capture["colours"],
+        near=float(capture["near"]),
+        far=float(capture["far"]),
+        names={
+            split: [f"{split}_{i:03d}" for i in range(len(views))]
+            for split, views in splits.items()
+        },
+        metadata={
+            "downscale": downscale,
+            "magnification": capture["magnification"].tolist(),
+            "subjects": capture["subjects"],
+        },
+        surface=surface,
+    )
+
+
+_render_surface = jax.jit(shading.render_surface, static_argnames="samples")
+_render_rgb = jax.jit(shading.render_rgb, static_argnames="samples")
+
+
+@functools.lru_cache(maxsize=2)
+def _world(name: str) -> shading.World:
+    model, _ = SCENES[name]()
+    return modelling.light_world(*modelling.assemble(model))
+
+
+def _rng(name: str, stream: int) -> np.random.Generator:
+    return np.random.default_rng([zlib.crc32(name.encode()), stream])
+
+
+def _cameras(poses: np.ndarray, width: int, height: int) -> Camera:
+    """Stacked cameras of `poses[V, 3, 4]`."""
+    intrinsics = [FOCAL * width / WIDTH, FOCAL * height / HEIGHT, width / 2, height / 2]
+    return Camera(
+        camtoworld=jnp.asarray(poses, jnp.float32),
+        intrinsics=jnp.tile(jnp.asarray(intrinsics, jnp.float32), (len(poses), 1)),
+        height=height,
+        width=width,
+    )
+
+
+def _cached(name: str, width: int, height: int) -> dict[str, np.ndarray]:
+    """`_capture`, from disk where it has been made before.
+
+    A cache that cannot be read or written costs time and a warning, never more.
+    """
+    path = _cache_path(name, width, height)
+    if path.exists():
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                return dict(stored)
+        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+            warnings.warn(f"ignoring the unreadable cache {path}: {error}", stacklevel=3)
+    capture = _capture(name, width, height)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
+            try:
+                np.savez(file, **capture)
+                file.close()
+                os.replace(file.name, path)
+            except BaseException:
+                os.unlink(file.name)
+                raise
+    except OSError as error:
+        warnings.warn(f"cannot keep the capture in {path}: {error}", stacklevel=3)
+    return capture
+
+
+def _cache_path(name: str, width: int, height: int) -> pathlib.Path:
+    here = pathlib.Path(__file__)
+    digest = hashlib.sha256()
+    for source in (*_SOURCES, here.stem):
+        digest.update(here.with_name(f"{source}.py").read_bytes())
+    root = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
+    file = f"{name}-{width}x{height}-{digest.hexdigest()[:16]}.npz"
+    return pathlib.Path(root) / "jaxcloseup" / file
+
+
+def _capture(name: str, width: int, height: int) -> dict[str, np.ndarray]:
+    """All that is kept of a capture, from scratch."""
+    world, (_, rig) = _world(name), SCENES[name]()
+    rng = _rng(name, 0)
+    far = plan_far(world.solids, rig, rng, NUM_TRAIN + NUM_FAR)
+    held_out = np.arange(len(far)) % ((NUM_TRAIN + NUM_FAR) // NUM_FAR + 1) == 4
+    train, test_far = far[~held_out], far[held_out]
+    closeups = plan_closeups(world.solids, rig, train, rng, NUM_TEST)
+
+    every = np.concatenate([train, test_far, closeups.poses])
+    depths = cast(world.solids, *grid_rays(every, 64, 36)).depth
+    capture = {
+        "train_poses": train,
+        "test_far_poses": test_far,
+        "test_poses": closeups.poses,
+        "magnification": closeups.magnification,
+        "subjects": closeups.subjects,
+        "near": 0.8 * depths.min(),
+        "far": 1.1 * depths.max(),
+    }
+    for split in ("train", "test", "test_far"):
+        cameras = _cameras(capture[f"{split}_poses"], width, height)
+        capture[f"{split}_rgb"] = np.stack(
+            [_photograph(world, camera_at(cameras, i)) for i in range(len(cameras.camtoworld))]
+        )
+    capture["points"], capture["colours"] = _sparse_points(
+        world, train, capture["train_rgb"], _rng(name, 1)
+    )
+    return capture
+
+
+def _photograph(world: shading.World, camera: Camera) -> np.ndarray:
+    rgb = _render_rgb(world, camera, samples=_SAMPLES)
+    return np.round(np.asarray(rgb) * 255).astype(np.uint8)
+
+
+def _sparse_points(
+    world: shading.World, poses: np.ndarray, rgb: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """About 5000 surface points `[P, 3]` at training pixels, with the photographs' colours."""
+    views, height, width = rgb.shape[:3]
+    count = 5040 // views * views
+    view = np.repeat(np.arange(views), count // views)
+    y, x = rng.integers(height, size=count), rng.integers(width, size=count)
+    xy = np.stack([((x + 0.5) / width - 0.5) * WIDTH, ((y + 0.5) / height - 0.5) * HEIGHT], -1)
+    in_camera = np.column_stack([xy / FOCAL, np.ones(count)])
+    directions = np.einsum("pj,pij->pi", in_camera, poses[view, :, :3])
+    depth = cast(world.solids, poses[view, :, 3], directions).depth
+    found = np.isfinite(depth)
+    points = poses[view, :, 3] + np.where(found, depth, 0)[:, None] * directions
+    return points[found].astype(np.float32), rgb[view, y, x][found].astype(np.float32) / 255
+
+
+def _degrade(
+    views: Views, rng: np.random.Generator, noise: float, exposure_jitter: float, pose_noise: float
+) -> Views:
+    """Photographs and reported poses as a hand-held camera and its calibration would give them."""
+    poses = np.array(views.cameras.camtoworld, np.float64)
+    exposure = np.exp(exposure_jitter * rng.normal(size=(len(poses), 1, 1, 1)))
+    rgb = np.asarray(views.rgb) / np.float32(255) * exposure.astype(np.float32)
+    rgb = rgb + np.float32(noise) * rng.standard_normal(rgb.shape, np.float32)
+    for pose in poses:
+        turns = pose_noise * rng.normal(size=3)
+        pose[:, :3] = pose[:, :3] @ modelling.turn(*np.rad2deg(turns))
+        pose[:, 3] += pose_noise * rng.normal(size=3)
+    return views.replace(
+        cameras=views.cameras.replace(camtoworld=jnp.asarray(poses, jnp.float32)),
+        rgb=jnp.asarray(np.round(np.clip(rgb, 0, 1) * 255).astype(np.uint8)),
+    )
