@@ -64,8 +64,8 @@ class Footprints:
         there is that of the depth at the anchor.
       payload: `[N, F]` what is composited: colours, normals, anything.
       order: `[N]` z-depth, positive, by which splats are sorted. No gradient.
-      box: `[N, 4]` x and y of the first, then of the last pixel edge that may be touched; empty
-        where last <= first. No gradient.
+      box: `[N, 4]` bounds (x0, y0, x1, y1) in pixels of all that is not fainter than `ALPHA_MIN`;
+        empty where x1 < x0. No gradient.
     """
 
     anchor: jax.Array
@@ -181,11 +181,9 @@ class _Shade(NamedTuple):
     alpha: jax.Array  # 0 where not drawn
     inverse_depth: jax.Array
     z: jax.Array
-    u_numerator: jax.Array
-    v_numerator: jax.Array
-    w: jax.Array
-    on_plane: jax.Array  # where the disc, not the low-pass, gives rho
     rho: jax.Array
+    on_plane: jax.Array  # where the disc, not the low-pass, gives rho
+    clipped: jax.Array  # where the low-pass does and the disc's plane leaves the disc's depths
 
 
 def _shade(splats: jax.Array, x: jax.Array, y: jax.Array, near: float) -> _Shade:
@@ -199,12 +197,13 @@ def _shade(splats: jax.Array, x: jax.Array, y: jax.Array, near: float) -> _Shade
     low_pass = column(_LOW_PASS) * (dx * dx + dy * dy)
     # rho compares without dividing, and w <= 0 (a ray that misses the plane) leaves the low-pass.
     on_plane = (w > 0) & (squared <= low_pass * (w * w))
-    inverse = jnp.where(on_plane, w, jnp.clip(w, column(_RANGE), column(_RANGE + 1)))
+    low, high = column(_RANGE), column(_RANGE + 1)
+    inverse = jnp.where(on_plane, w, jnp.clip(w, low, high))
     z = 1 / inverse
     rho = jnp.where(on_plane, squared * (z * z), low_pass)
     alpha = jnp.minimum(column(_OPACITY) * jnp.exp(-0.5 * rho), ALPHA_MAX)
     alpha = jnp.where((alpha >= ALPHA_MIN) & (w * near <= 1), alpha, 0)
-    return _Shade(alpha, inverse, z, u, v, w, on_plane, rho)
+    return _Shade(alpha, inverse, z, rho, on_plane, ~on_plane & ((w < low) | (w > high)))
 
 
 def _gather(table, lists: TileLists, tiles, position, chunk):
@@ -304,7 +303,8 @@ def _composite_backward(config, residuals, cotangents):
         behind, after = carry
         alpha, passing, worth = splat
         before = after * passing
-        return (behind + alpha * before * worth, before), (behind, after)
+        behind = behind + alpha * before * worth
+        return (behind, before), (behind, before)
 
     def block(table_bar, tiles):
         *tiles, (sums_bar, median_bar), trace = tiles
@@ -320,16 +320,19 @@ def _composite_backward(config, residuals, cotangents):
             alpha = jnp.where(place < trace.stop[None], shade.alpha, 0)
             shifted = shade.inverse_depth - trace.reference[None]
             # What a unit of weight of each splat is worth to the loss.
-            worth = jnp.einsum(
-                "kbf,bfp->kbp", rows[..., _PAYLOAD:], sums_bar[:, :features], precision=_EXACT
+            worth = sum(
+                rows[:, :, _PAYLOAD + f, None] * sums_bar[None, :, f] for f in range(features)
             )
             worth = worth + alpha_bar + shade.z * z_bar
             worth = worth + shifted * (first_bar + shifted * second_bar)
             passing = 1 / (1 - alpha)
-            (behind, after), (behinds, afters) = lax.scan(
-                recede, (behind, after), (alpha, passing, worth), reverse=True
+            ends = (behind, after)
+            (behind, after), (behinds, before) = lax.scan(
+                recede, ends, (alpha, passing, worth), reverse=True
             )
-            before = afters * passing
+            # What a splat finds behind it is what the next one leaves, up to the chunk's end.
+            behinds = jnp.concatenate([behinds[1:], ends[0][None]])
+            afters = jnp.concatenate([before[1:], ends[1][None]])
             weight = alpha * before
             # The splat in which half of the light is lost, or else the last one that is drawn.
             last = (afters <= 0.5) | (afters == trace.transmittance[None])
@@ -340,13 +343,12 @@ def _composite_backward(config, residuals, cotangents):
             scaled = alpha * (before * worth - behinds * passing)  # d loss / d log(alpha)
             scaled = jnp.where(alpha < ALPHA_MAX, scaled, 0)
             plane = jnp.where(shade.on_plane, scaled * shade.z, 0)
-            clipped = ~shade.on_plane & (shade.inverse_depth != shade.w)
             update = _assemble(
                 rows,
                 plane=_reduce(-plane * shade.z, quadratic),
-                w=_reduce(jnp.where(clipped, 0, inverse_bar) + plane * shade.rho, linear),
+                w=_reduce(jnp.where(shade.clipped, 0, inverse_bar) + plane * shade.rho, linear),
                 low_pass=_reduce(jnp.where(shade.on_plane, 0, scaled), linear),
-                clip=jnp.where(clipped, inverse_bar * shade.inverse_depth**2, 0).sum(-1),
+                clip=jnp.where(shade.clipped, inverse_bar * shade.inverse_depth**2, 0).sum(-1),
                 scaled=scaled.sum(-1),
                 payload=jnp.einsum(
                     "kbp,bfp->kbf", weight, sums_bar[:, :features], precision=_EXACT
@@ -370,34 +372,30 @@ def _reduce(values: jax.Array, basis: jax.Array) -> jax.Array:
 
 def _assemble(rows, *, plane, w, low_pass, clip, scaled, payload):
     """Cotangents `[K, B, C]` of gathered rows from sums over the tile's pixels."""
-    anchor, opacity = rows[..., :_ROWS], rows[..., _OPACITY]
-    coefficients = rows[..., _ROWS:_OPACITY].reshape(*rows.shape[:2], 3, 3)
-    ax, ay = anchor[..., 0], anchor[..., 1]
-    # Moments about the anchor instead of the tile's corner.
-    p0, px, py, pxx, pxy, pyy = jnp.moveaxis(plane, -1, 0)
-    pxx = pxx - 2 * ax * px + ax * ax * p0
-    pxy = pxy - ax * py - ay * px + ax * ay * p0
-    pyy = pyy - 2 * ay * py + ay * ay * p0
-    px, py = px - ax * p0, py - ay * p0
-    moments = [[p0, px, py], [px, pxx, pxy], [py, pxy, pyy]]
-    rows_bar = [
-        [sum(coefficients[..., i, j] * moments[j][m] for j in range(3)) for m in range(3)]
-        for i in range(2)
-    ]
-    w0, wx, wy = jnp.moveaxis(w, -1, 0)
-    # A clipped depth moves with the depth of the anchor, 1 / rows[2, 0].
-    at_anchor = safe_divide(clip, coefficients[..., 2, 0] ** 2)
-    rows_bar.append([w0, wx - ax * w0, wy - ay * w0])
-    l0, lx, ly = jnp.moveaxis(low_pass, -1, 0)
-    drift = [rows[..., _LOW_PASS] * (lx - ax * l0), rows[..., _LOW_PASS] * (ly - ay * l0)]
+    ax, ay = rows[..., 0], rows[..., 1]
+    u, v, inverse = (jnp.moveaxis(rows[..., i : i + 3], -1, 0) for i in (2, 5, 8))
+    one, x, y, xx, xy, yy = jnp.moveaxis(plane, -1, 0)
+    moments = ((one, x, y), (x, xx, xy), (y, xy, yy))
+    rows_bar = []
+    for row in (u, v):
+        corner = (row[0] - row[1] * ax - row[2] * ay, row[1], row[2])
+        rows_bar.append([sum(c * m for c, m in zip(corner, ms, strict=True)) for ms in moments])
+    rows_bar.append(jnp.moveaxis(w, -1, 0))
+    # From pixels about the tile's corner to pixels about the anchor.
+    about = lambda m: [m[0], m[1] - ax * m[0], m[2] - ay * m[0]]  # noqa: E731
+    rows_bar = [about(row_bar) for row_bar in rows_bar]
+    drift = about(jnp.moveaxis(low_pass, -1, 0))
     anchor_bar = [
-        drift[axis] - sum(rows_bar[i][0] * coefficients[..., i, axis + 1] for i in range(3))
-        for axis in range(2)
+        rows[..., _LOW_PASS] * drift[axis]
+        - sum(bar[0] * row[axis] for bar, row in zip(rows_bar, (u, v, inverse), strict=True))
+        for axis in (1, 2)
     ]
-    rows_bar[2][0] = rows_bar[2][0] + at_anchor
-    unused = [jnp.zeros_like(ax)] * (_PAYLOAD - _LOW_PASS)
-    flat = [*anchor_bar, *sum(rows_bar, []), safe_divide(scaled, opacity), *unused]
-    return jnp.concatenate([jnp.stack(flat, axis=-1), payload], axis=-1)
+    # A clipped depth moves with the depth of the anchor, 1 / inverse[0].
+    rows_bar[2][0] = rows_bar[2][0] + safe_divide(clip, inverse[0] ** 2)
+    opacity_bar = safe_divide(scaled, rows[..., _OPACITY])
+    constants = [jnp.zeros_like(ax)] * (_PAYLOAD - _LOW_PASS)
+    columns = [*anchor_bar, *rows_bar[0], *rows_bar[1], *rows_bar[2], opacity_bar, *constants]
+    return jnp.concatenate([jnp.stack(columns, axis=-1), payload], axis=-1)
 
 
 _composite.defvjp(_composite_forward, _composite_backward)
