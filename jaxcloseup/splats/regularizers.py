@@ -1,0 +1,58 @@
+"""Losses that pull surfels onto a surface: normals that agree with depth, and depth without spread.
+
+All are per pixel and unreduced.
+"""
+
+import chex
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points
+from jaxcloseup.numerics import safe_norm
+
+
+def depth_to_normal(camera: Camera, depth: jax.Array) -> jax.Array:
+    """World normals `[H, W, 3]` of a depth map `[H, W]`, towards the camera, by central differences.
+
+    Exact on planes. Zero, with zero gradient, at the border and beside pixels without depth.
+    """
+    chex.assert_shape(depth, (camera.height, camera.width))
+    pixels = pixel_grid(camera.height, camera.width).astype(depth.dtype)
+    points = pixels_to_points(camera, pixels, depth)
+    down = points[2:, 1:-1] - points[:-2, 1:-1]
+    across = points[1:-1, 2:] - points[1:-1, :-2]
+    normal = jnp.cross(down, across)
+    length = safe_norm(normal, keepdims=True)
+    seen = depth > 0
+    seen = seen[2:, 1:-1] & seen[:-2, 1:-1] & seen[1:-1, 2:] & seen[1:-1, :-2]
+    defined = seen[..., None] & (length > 0)
+    normal = jnp.where(defined, normal / jnp.where(defined, length, 1), 0)
+    return jnp.pad(normal, ((1, 1), (1, 1), (0, 0)))
+
+
+def normal_inconsistency(
+    normal: jax.Array, depth_normal: jax.Array, alpha: jax.Array
+) -> jax.Array:
+    """alpha (1 - <normal, depth_normal>) `[H, W]`, and 0 where there is no `depth_normal`.
+
+    Args:
+      normal: `[H, W, 3]` composited normals, not normalised, as rendered.
+      depth_normal: `[H, W, 3]` of `depth_to_normal`.
+      alpha: `[H, W]`, which weighs and gets no gradient.
+    """
+    chex.assert_equal_shape([normal, depth_normal])
+    defined = jnp.any(depth_normal != 0, axis=-1)
+    agreement = jnp.sum(normal * depth_normal, axis=-1)
+    return lax.stop_gradient(alpha) * jnp.where(defined, 1 - agreement, 0)
+
+
+def scale_free_distortion(distortion: jax.Array, reference_depth: jax.Array | float) -> jax.Array:
+    """Distortion of m = 1 - reference_depth / z, which does not depend on the unit of length.
+
+    Args:
+      distortion: as rendered, of inverse depths.
+      reference_depth: such as the median depth of the scene. The published mapping of z to normalised
+        device coordinates with planes n and f is that of n f / (f - n), 0.2004 by default there.
+    """
+    return reference_depth**2 * distortion

@@ -1,0 +1,58 @@
+"""Small random splat scenes, and renderers that all tests share so that each compiles once."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.splats import RasterizeConfig, Surfels, render_surfels
+
+
+COUNT, HEIGHT, WIDTH, NEAR = 16, 24, 32, 0.2
+INTRINSICS = np.array([30.0, 34.0, 14.5, 13.0])  # fx != fy, principal point off the centre
+IDENTITY = np.eye(4)[:3]
+BACKGROUND = np.array([0.2, 0.4, 0.6])
+CONFIG = RasterizeConfig(capacity=1024, near=NEAR, tile=8, chunk=4, block=4)
+
+
+def random_scene(seed, *, depth=(1.0, 3.0), log_scale=(-4.0, -0.7), count=COUNT):
+    """A dictionary of float32-representable float64 arrays in front of the identity pose."""
+    rng = np.random.default_rng(seed)
+    z = rng.uniform(*depth, count)
+    xy = rng.uniform(-0.5, 0.5, (count, 2)) * np.maximum(np.abs(z), 0.5)[:, None]
+    scene = dict(
+        means=np.concatenate([xy, z[:, None]], axis=1),
+        log_scales=rng.uniform(*log_scale, (count, 2)),
+        quaternions=rng.normal(size=(count, 4)),
+        opacity_logits=rng.uniform(-2, 4, count),
+        sh=0.4 * rng.normal(size=(count, 4, 3)),
+    )
+    scene["opacity_logits"][0] = 8.0  # beyond the largest alpha
+    return {name: value.astype(np.float32).astype(np.float64) for name, value in scene.items()}
+
+
+SCENES = {
+    "in front": random_scene(0),
+    "through the camera": random_scene(1, depth=(-0.5, 1.5), log_scale=(-2.0, 0.5)),
+    "far and small": random_scene(2, depth=(2.0, 3.0), log_scale=(-6.0, -3.0)),
+}
+
+
+def to_surfels(scene, dtype=jnp.float32):
+    return Surfels(**{name: jnp.asarray(value, dtype) for name, value in scene.items()})
+
+
+def to_camera(camtoworld=IDENTITY, intrinsics=INTRINSICS, size=(HEIGHT, WIDTH), dtype=jnp.float32):
+    return Camera(jnp.asarray(camtoworld, dtype), jnp.asarray(intrinsics, dtype), *size)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def render(surfels, camera, alive=None, config=CONFIG):
+    """All images of `render_surfels` by name, over `BACKGROUND`."""
+    alive = jnp.ones(surfels.means.shape[0], bool) if alive is None else alive
+    background = jnp.asarray(BACKGROUND, surfels.means.dtype)
+    image = render_surfels(surfels, alive, camera, config, background=background)
+    aux = image.aux._asdict()
+    return dict(rgb=image.rgb, alpha=image.alpha, depth=image.depth, **aux)

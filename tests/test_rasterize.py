@@ -1,0 +1,343 @@
+"""Images and derivatives of surfels against a NumPy splatter without tiles, and what must not matter."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference_splats as reference
+from splat_scenes import (
+    BACKGROUND,
+    CONFIG,
+    COUNT,
+    HEIGHT,
+    IDENTITY,
+    INTRINSICS,
+    NEAR,
+    SCENES,
+    WIDTH,
+    random_scene,
+    render,
+    to_camera,
+    to_surfels,
+)
+
+from jaxcloseup.geometry.rotations import euler_to_matrix
+from jaxcloseup.splats.rasterize import Footprints, RasterizeConfig, rasterize
+
+
+OUTPUTS = ("rgb", "alpha", "depth", "normal", "median_depth", "distortion")
+
+
+def oracle(scene, camtoworld=IDENTITY, intrinsics=INTRINSICS, size=(HEIGHT, WIDTH), reach=None):
+    return reference.render(
+        scene, camtoworld, intrinsics, *size, near=NEAR, background=BACKGROUND, reach=reach
+    )
+
+
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_images_are_those_of_rays_and_planes(name, precision):
+    expected = oracle(SCENES[name])
+    with jax.enable_x64(precision == "float64"):
+        images = render(to_surfels(SCENES[name], precision), to_camera(dtype=precision))
+    assert images["overflow"] == 0
+    assert expected["alpha"].max() > 0.5
+    for output in OUTPUTS:
+        tolerance = 2e-5 if precision == "float32" else 1e-9
+        assert images[output].dtype == precision
+        np.testing.assert_allclose(images[output], expected[output], atol=tolerance, rtol=0)
+
+
+def pose(twist):
+    """Camera-to-world of Euler angles and a position, in NumPy."""
+    (cx, cy, cz), (sx, sy, sz) = np.cos(twist[:3]), np.sin(twist[:3])
+    x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    return np.concatenate([z @ y @ x, twist[3:, None]], axis=1)
+
+
+@jax.jit
+def pullback(surfels, twist, intrinsics, cotangents):
+    def images(surfels, twist, intrinsics):
+        camtoworld = jnp.concatenate([euler_to_matrix(twist[:3]), twist[3:, None]], axis=1)
+        camera = to_camera().replace(camtoworld=camtoworld, intrinsics=intrinsics)
+        out = render(surfels, camera)
+        return {name: out[name] for name in OUTPUTS}
+
+    return jax.vjp(images, surfels, twist, intrinsics)[1](cotangents)
+
+
+@pytest.fixture(scope="module", params=["in front", "through the camera"])
+def jacobian(request):
+    """Central differences `[parameter, ...]` of every image of the oracle, by parameter name."""
+    scene = SCENES[request.param]
+    at = dict(scene, pose=np.zeros(6), intrinsics=INTRINSICS)
+    reach, step = reference.depth_reach(scene, IDENTITY), 1e-7
+    differences = {}
+    for name, value in at.items():
+        rows = []
+        for i in range(value.size):
+            images = []
+            for sign in (1, -1):
+                moved = value.copy()
+                moved.flat[i] += sign * step
+                moved = {**at, name: moved}
+                twist, intrinsics = moved.pop("pose"), moved.pop("intrinsics")
+                images.append(oracle(moved, pose(twist), intrinsics, reach=reach))
+            plus, minus = images
+            rows.append({out: (plus[out] - minus[out]) / (2 * step) for out in OUTPUTS})
+        differences[name] = rows
+    return scene, differences
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_every_derivative_is_a_finite_difference(jacobian, precision):
+    scene, differences = jacobian
+    rng = np.random.default_rng(3)
+    weights = {name: rng.normal(size=(HEIGHT, WIDTH)) for name in OUTPUTS}
+    weights |= {name: rng.normal(size=(HEIGHT, WIDTH, 3)) for name in ("rgb", "normal")}
+    for output in OUTPUTS:
+        with jax.enable_x64(precision == "float64"):
+            cotangents = {
+                name: jnp.asarray(weights[name] * (name == output), precision) for name in OUTPUTS
+            }
+            surfels, twist, intrinsics = pullback(
+                to_surfels(scene, precision),
+                jnp.zeros(6, precision),
+                jnp.asarray(INTRINSICS, precision),
+                cotangents,
+            )
+        computed = {name: getattr(surfels, name) for name in scene}
+        computed |= dict(pose=twist, intrinsics=intrinsics)
+        for name, rows in differences.items():
+            expected = np.array([np.sum(row[output] * weights[output]) for row in rows])
+            error = np.abs(np.ravel(computed[name]) - expected).max()
+            scale = max(np.abs(expected).max(), 1e-2)
+            assert error <= (1e-3 if precision == "float32" else 1e-6) * scale, (output, name)
+
+
+def test_tiles_do_not_matter():
+    scene = random_scene(5, depth=(0.1, 2.0), log_scale=(-4.0, 0.0))
+    images = [
+        render(
+            to_surfels(scene),
+            to_camera(),
+            config=RasterizeConfig(capacity=1024, near=NEAR, tile=tile, chunk=chunk, block=block),
+        )
+        for tile, chunk, block in ((8, 4, 4), (16, 3, 1), (32, 8, 2))
+    ]
+    for other in images[1:]:
+        for name in OUTPUTS:
+            np.testing.assert_allclose(other[name], images[0][name], atol=1e-6, rtol=0)
+
+
+def test_same_bits_every_time_and_in_any_order():
+    scene = SCENES["in front"]
+    order = np.random.default_rng(0).permutation(COUNT)
+    cotangents = {
+        name: jnp.ones((HEIGHT, WIDTH, 3) if name in ("rgb", "normal") else (HEIGHT, WIDTH))
+        for name in OUTPUTS
+    }
+    results = []
+    for index in (np.arange(COUNT), np.arange(COUNT), order):
+        surfels = jax.tree.map(lambda leaf, index=index: leaf[index], to_surfels(scene))
+        gradient = pullback(surfels, jnp.zeros(6), jnp.asarray(INTRINSICS, jnp.float32), cotangents)
+        unsorted = jax.tree.map(lambda leaf, i=index: np.asarray(leaf)[np.argsort(i)], gradient[0])
+        results.append((render(surfels, to_camera()), unsorted))
+    for result in results[1:]:
+        jax.tree.map(np.testing.assert_array_equal, result, results[0])
+
+
+def test_crops_are_the_image():
+    scene = random_scene(6, depth=(0.1, 2.0), log_scale=(-4.0, 0.0))
+    whole = render(to_surfels(scene), to_camera())
+    for top in (0, 12):
+        for left in (0, 16):
+            shifted = INTRINSICS - np.array([0, 0, left, top])
+            crop = render(to_surfels(scene), to_camera(intrinsics=shifted, size=(12, 16)))
+            for name in OUTPUTS:
+                expected = whole[name][top : top + 12, left : left + 16]
+                np.testing.assert_allclose(crop[name], expected, atol=4e-6, rtol=0)
+
+
+def test_rigid_motion_of_everything_changes_nothing():
+    scene = random_scene(7, depth=(0.1, 2.0), log_scale=(-4.0, 0.0))
+    scene["sh"][:, 1:] = 0
+    motion = pose(np.array([0.4, -0.7, 1.9, 0.3, -0.2, 0.5]))
+    turn = motion[:, :3]
+    # The quaternion of `turn`, from its axis and angle.
+    angle = np.arccos((np.trace(turn) - 1) / 2)
+    skew = (turn - turn.T) / (2 * np.sin(angle))
+    w, v = np.cos(angle / 2), np.sin(angle / 2) * np.array([skew[2, 1], skew[0, 2], skew[1, 0]])
+    q0, q = scene["quaternions"][:, :1], scene["quaternions"][:, 1:]
+    product = np.concatenate([w * q0 - q @ v[:, None], w * q + q0 * v + np.cross(v, q)], axis=1)
+    moved = dict(scene, means=scene["means"] @ turn.T + motion[:, 3], quaternions=product)
+    still, after = render(to_surfels(scene), to_camera()), render(to_surfels(moved), to_camera(motion))
+    np.testing.assert_allclose(after.pop("normal"), still.pop("normal") @ turn.T, atol=1e-4)
+    for name in still:
+        np.testing.assert_allclose(after[name], still[name], atol=1e-4)
+
+
+def facing_discs(z, scale, opacity_logit):
+    """`COUNT` discs that face the camera on its axis."""
+    scene = random_scene(0)
+    scene["means"] = np.stack([0 * z, 0 * z, z], axis=1).astype(np.float32).astype(np.float64)
+    scene["log_scales"] = np.full((COUNT, 2), np.log(scale))
+    scene["quaternions"] = np.tile([1.0, 0, 0, 0], (COUNT, 1))
+    scene["opacity_logits"] = np.full(COUNT, opacity_logit)
+    return scene
+
+
+def test_one_disc_facing_the_camera_is_a_gaussian():
+    scene = facing_discs(np.full(COUNT, 2.0), 0.25, 0.0)
+    only = jnp.arange(COUNT) == 3
+    images = render(to_surfels(scene), to_camera(), only)
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    squared = ((x - 14.5) * 2 / 30 / 0.25) ** 2 + ((y - 13) * 2 / 34 / 0.25) ** 2
+    expected = 0.5 * np.exp(-squared / 2)
+    expected = np.where(expected < 1 / 255, 0, expected)
+    np.testing.assert_allclose(images["alpha"], expected, atol=1e-6)
+    np.testing.assert_allclose(images["depth"], np.where(expected > 0, 2, 0), atol=1e-6)
+    np.testing.assert_allclose(images["normal"], expected[..., None] * [0, 0, -1], atol=1e-6)
+    assert np.all(images["distortion"] == 0)
+
+
+def test_tilted_plane_has_its_own_depth():
+    scene = facing_discs(np.full(COUNT, 2.0), 40.0, 0.0)
+    tilt = np.array([np.cos(0.5), np.sin(0.5) * 0.6, np.sin(0.5) * 0.8, 0])
+    scene["quaternions"][:] = tilt
+    images = render(to_surfels(scene), to_camera())
+    normal = reference.rotation_of(tilt)[:, 2]
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    rays = np.stack([(x - 14.5) / 30, (y - 13) / 34, np.ones_like(x)], axis=-1)
+    expected = 2 * normal[2] / (rays @ normal)
+    seen = np.asarray(images["alpha"] > 0)
+    assert seen.mean() > 0.5
+    for name in ("depth", "median_depth"):
+        np.testing.assert_allclose(images[name][seen], expected[seen], rtol=2e-6)
+
+
+def test_distortion_keeps_its_digits_on_a_converged_surface():
+    z = 2 * (1 + 1e-3 * np.random.default_rng(0).uniform(-1, 1, COUNT))
+    scene = facing_discs(z, 0.5, -1.5)
+    images, expected = render(to_surfels(scene), to_camera()), oracle(scene)
+    np.testing.assert_allclose(images["distortion"], expected["distortion"], rtol=5e-3, atol=1e-11)
+
+
+def test_discs_behind_are_not_there_and_both_sides_are_seen():
+    scene = random_scene(8)
+    turned = dict(scene)
+    w, x, y, z = scene["quaternions"].T
+    turned["quaternions"] = np.stack([-x, w, z, -y], axis=1)  # half a turn about the first tangent
+    front, back = render(to_surfels(scene), to_camera()), render(to_surfels(turned), to_camera())
+    for name in OUTPUTS:
+        np.testing.assert_allclose(back[name], front[name], atol=2e-6)
+    assert front["normal"][front["alpha"] > 0.9].sum(0)[2] < 0
+    scene["means"][:, 2] *= -1
+    scene["log_scales"][:] = -3
+    assert np.all(render(to_surfels(scene), to_camera())["alpha"] == 0)
+
+
+def test_cameras_batch():
+    poses = np.stack([IDENTITY, pose(np.array([0.05, -0.1, 0.2, 0.1, 0.0, -0.2]))])
+    surfels = to_surfels(SCENES["in front"])
+    cameras = to_camera().replace(
+        camtoworld=jnp.asarray(poses, jnp.float32),
+        intrinsics=jnp.tile(jnp.asarray(INTRINSICS, jnp.float32), (2, 1)),
+    )
+
+    def loss(surfels, camera):
+        images = render(surfels, camera)
+        return sum(jnp.sum(jnp.sin(3 * images[name])) for name in OUTPUTS)
+
+    gradient = jax.value_and_grad(loss)
+    batched = jax.jit(jax.vmap(gradient, in_axes=(None, 0)))(surfels, cameras)
+    single = jax.jit(gradient)
+    for i in range(2):
+        expected = single(surfels, jax.tree.map(lambda leaf, i=i: leaf[i], cameras))
+        actual = jax.tree.map(lambda leaf, i=i: leaf[i], batched)
+        jax.tree.map(
+            lambda a, e: np.testing.assert_allclose(a, e, rtol=1e-4, atol=1e-3), actual, expected
+        )
+
+
+def test_extreme_parameters_have_finite_images_and_gradients():
+    scene = random_scene(9)
+    scene["opacity_logits"][:4] = [100, -100, -30, 30]
+    scene["log_scales"][4:8] = [[-18, -18], [-60, 2], [60, 60], [0, -18]]
+    scene["quaternions"][8] = 0
+    scene["means"][9] = 0  # at the camera's centre
+    scene["means"][10:12] = scene["means"][12]
+    scene["means"][13] = [1e10, 0, 1e10]
+    scene["means"][14] = [0, 0, NEAR]
+    scene["sh"][15] = 1e6
+    cotangents = {
+        name: jnp.ones((HEIGHT, WIDTH, 3) if name in ("rgb", "normal") else (HEIGHT, WIDTH))
+        for name in OUTPUTS
+    }
+    surfels, intrinsics = to_surfels(scene), jnp.asarray(INTRINSICS, jnp.float32)
+    gradient = pullback(surfels, jnp.zeros(6), intrinsics, cotangents)
+    for leaf in jax.tree.leaves((render(surfels, to_camera()), gradient)):
+        assert np.all(np.isfinite(leaf))
+
+
+def test_overflow_is_counted():
+    surfels = to_surfels(SCENES["in front"])
+    dropped = [
+        int(render(surfels, to_camera(), config=RasterizeConfig(capacity, NEAR, 8, 4, 4))["overflow"])
+        for capacity in (16, 40)
+    ]
+    assert dropped[0] - dropped[1] == 24 and dropped[1] > 0
+    assert render(surfels, to_camera())["overflow"] == 0
+
+
+def test_volumetric_gaussians_share_the_kernel():
+    """3-D Gaussians, projected as ellipses here, are footprints of constant inverse depth."""
+    rng = np.random.default_rng(4)
+    mean = np.concatenate([rng.uniform(-0.5, 0.5, (COUNT, 2)), rng.uniform(1, 3, (COUNT, 1))], 1)
+    half = rng.normal(size=(COUNT, 3, 3)) * 0.15
+    covariance = half @ half.swapaxes(1, 2)
+    fx, fy, cx, cy = INTRINSICS
+    x, y, z = mean.T
+    zero = np.zeros(COUNT)
+    local = np.stack(
+        [np.stack([fx / z, zero, -fx * x / z**2], -1), np.stack([zero, fy / z, -fy * y / z**2], -1)],
+        axis=1,
+    )
+    ellipse = local @ covariance @ local.swapaxes(1, 2) + 0.3 * np.eye(2)
+    centre = np.stack([fx * x / z + cx, fy * y / z + cy], axis=-1)
+    opacity, colour = rng.uniform(0.2, 1, COUNT), rng.uniform(0, 1, (COUNT, 3))
+
+    root = np.linalg.cholesky(np.linalg.inv(ellipse)).swapaxes(1, 2)
+    rows = np.zeros((COUNT, 3, 3))
+    rows[:, :2, 1:] = root / z[:, None, None]
+    rows[:, 2, 0] = 1 / z
+    reach = 3.34 * np.sqrt(np.diagonal(ellipse, axis1=1, axis2=2))
+    footprints = Footprints(
+        anchor=centre,
+        rows=rows,
+        opacity=opacity,
+        low_pass=np.full(COUNT, 1e9),
+        inverse_depth=np.tile([0.0, np.inf], (COUNT, 1)),
+        payload=colour,
+        order=z,
+        box=np.concatenate([centre - reach, centre + reach], axis=1),
+    )
+    footprints = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), footprints)
+    image = jax.jit(lambda f: rasterize(f, CONFIG, height=HEIGHT, width=WIDTH))(footprints)
+
+    gx, gy = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    offset = np.stack([gx.ravel(), gy.ravel()], -1)[None] - centre[:, None]
+    rho = np.einsum("npi,nij,npj->np", offset, np.linalg.inv(ellipse), offset)
+    alpha = np.minimum(opacity[:, None] * np.exp(-rho / 2), 0.99)
+    alpha[alpha < 1 / 255] = 0
+    nearest = np.argsort(z)
+    depth = np.broadcast_to(z[:, None], alpha.shape)
+    sums, total, expected_depth, median, _ = reference.composite(
+        alpha[nearest], depth[nearest], colour[nearest]
+    )
+    np.testing.assert_allclose(image.payload, sums.reshape(HEIGHT, WIDTH, 3), atol=2e-5)
+    np.testing.assert_allclose(image.alpha, total.reshape(HEIGHT, WIDTH), atol=2e-5)
+    np.testing.assert_allclose(image.depth, expected_depth.reshape(HEIGHT, WIDTH), atol=2e-5)
+    np.testing.assert_allclose(image.median_depth, median.reshape(HEIGHT, WIDTH), atol=2e-5)
