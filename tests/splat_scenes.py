@@ -48,10 +48,14 @@ def to_camera(camtoworld=IDENTITY, intrinsics=INTRINSICS, size=(HEIGHT, WIDTH), 
     return Camera(jnp.asarray(camtoworld, dtype), jnp.asarray(intrinsics, dtype), *size)
 
 
-@functools.partial(jax.jit, static_argnames="config")
 def render(surfels, camera, alive=None, config=CONFIG):
     """All images of `render_surfels` by name, over `BACKGROUND`."""
     alive = jnp.ones(surfels.means.shape[0], bool) if alive is None else alive
+    return _render(surfels, camera, alive, config)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _render(surfels, camera, alive, config):
     background = jnp.asarray(BACKGROUND, surfels.means.dtype)
     image = render_surfels(surfels, alive, camera, config, background=background)
     aux = image.aux._asdict()

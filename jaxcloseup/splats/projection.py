@@ -1,9 +1,9 @@
 """Surfels to planar homographies and exact boxes, for one camera.
 
-A disc with centre mu, unit tangents t_u, t_v, normal n = t_u x t_v and radii s_u, s_v meets the ray r
-(r_z = 1) of a pixel at depth z with local coordinates (u, v). All of
+A disc with centre mu, unit tangents t_u, t_v, normal n = t_u x t_v and radii s_u, s_v meets the ray
+r (r_z = 1) of a pixel at depth z with local coordinates (u, v). All of
 
-    u / z = r . (t_v x mu) / (s_u n.mu),   v / z = r . (mu x t_u) / (s_v n.mu),   1 / z = r . n / n.mu
+    u / z = r.(t_v x mu) / (s_u n.mu),    v / z = r.(mu x t_u) / (s_v n.mu),    1 / z = r.n / n.mu
 
 are affine in the pixel: they are the rows of `Footprints`, taken about the projected centre, where
 they are (0, 0, 1 / mu_z) without rounding.
@@ -75,7 +75,7 @@ def project_discs(
     centre = mu[:, :2] * inverse_depth[:, None] * focal + principal
 
     # A centre far outside the image, or behind the camera, is no good origin for numbers that are
-    # needed within it: any other pixel will do, as long as the low-pass about it stays out of sight.
+    # needed within it. Any other pixel will do, if the low-pass about it stays out of sight.
     margin = jnp.maximum(size, 16)
     within = jnp.all((centre > -margin) & (centre < size + margin), axis=-1, keepdims=True)
     centred = ahead[:, None] & within
@@ -121,8 +121,8 @@ def project_discs(
 def _disc_box(discs: Discs, cutoff: jax.Array, camera: Camera, near: float) -> jax.Array:
     """Exact bounds `[N, 4]` in pixels of the part with z >= near of discs of radius `cutoff`.
 
-    The visible part is convex, so its image is bounded by points of its rim: those where a coordinate
-    is stationary along the circle, and the ends of the chord in which the disc meets z = near.
+    The visible part is convex, so its image is bounded by points of its rim: those where a
+    coordinate is stationary along the circle, and the ends of the chord at which z = near.
     """
     # Rounding must not cost a pixel that just reaches the cutoff.
     radius = (1.001 * cutoff)[:, None, None]
@@ -155,7 +155,7 @@ def _disc_box(discs: Discs, cutoff: jax.Array, camera: Camera, near: float) -> j
 
 
 def _meet_circle(line: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The points (cos, sin, 1) `[N, 2, 3]` with line . point = 0, and whether they exist `[N, 2]`."""
+    """Points (cos, sin, 1) `[N, 2, 3]` with line . point = 0, and whether they exist `[N, 2]`."""
     line = line / jnp.maximum(jnp.max(jnp.abs(line), axis=-1, keepdims=True), 1e-30)
     a, b, c = (line[:, i] for i in range(3))
     squared = a * a + b * b

@@ -207,7 +207,7 @@ def _shade(splats: jax.Array, x: jax.Array, y: jax.Array, near: float) -> _Shade
 
 
 def _gather(table, lists: TileLists, tiles, position, chunk):
-    """Rows `[K, B, C]` of one chunk of each tile with anchors made local, and their splats `[K, B]`."""
+    """Rows `[K, B, C]` of a chunk of each tile, anchors made local, and their splats `[K, B]`."""
     starts, counts, origins = tiles
     place = position + jnp.arange(chunk, dtype=jnp.int32)[:, None]
     inside = place < counts[None]

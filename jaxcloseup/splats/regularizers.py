@@ -13,7 +13,7 @@ from jaxcloseup.numerics import safe_norm
 
 
 def depth_to_normal(camera: Camera, depth: jax.Array) -> jax.Array:
-    """World normals `[H, W, 3]` of a depth map `[H, W]`, towards the camera, by central differences.
+    """World normals `[H, W, 3]`, towards the camera, of depth `[H, W]` by central differences.
 
     Exact on planes. Zero, with zero gradient, at the border and beside pixels without depth.
     """
@@ -31,9 +31,7 @@ def depth_to_normal(camera: Camera, depth: jax.Array) -> jax.Array:
     return jnp.pad(normal, ((1, 1), (1, 1), (0, 0)))
 
 
-def normal_inconsistency(
-    normal: jax.Array, depth_normal: jax.Array, alpha: jax.Array
-) -> jax.Array:
+def normal_inconsistency(normal: jax.Array, depth_normal: jax.Array, alpha: jax.Array) -> jax.Array:
     """alpha (1 - <normal, depth_normal>) `[H, W]`, and 0 where there is no `depth_normal`.
 
     Args:
@@ -52,7 +50,7 @@ def scale_free_distortion(distortion: jax.Array, reference_depth: jax.Array | fl
 
     Args:
       distortion: as rendered, of inverse depths.
-      reference_depth: such as the median depth of the scene. The published mapping of z to normalised
-        device coordinates with planes n and f is that of n f / (f - n), 0.2004 by default there.
+      reference_depth: such as the median depth of the scene. The published mapping of z with planes
+        n = 0.2 and f = 100 is that of n f / (f - n) = 0.2004.
     """
     return reference_depth**2 * distortion

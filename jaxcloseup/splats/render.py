@@ -20,9 +20,9 @@ class SurfelAux(NamedTuple):
 
     Attributes:
       normal: `[H, W, 3]` sum of w_i n_i in the world's frame, towards the camera, not normalised.
-      median_depth: `[H, W]` z-depth at which half of the light is blocked; 0 where nothing is hit.
+      median_depth: `[H, W]` z-depth at which half of the light is lost; 0 where nothing is hit.
       distortion: `[H, W]` sum over pairs i < j of w_i w_j (1/z_i - 1/z_j)^2.
-      overflow: `[]` (tile, surfel) pairs that did not fit: not 0 means a wrong image, to be rendered
+      overflow: `[]` (tile, surfel) pairs that did not fit: if not 0 the image is wrong; render it
         again with a larger `RasterizeConfig.capacity`.
     """
 

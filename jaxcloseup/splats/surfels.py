@@ -1,7 +1,9 @@
 """Surfels: oriented discs with a Gaussian profile, the unknowns of 2-D Gaussian splatting.
 
-Parameters are stored before their activations (logarithms, logits), so that any real number is valid.
+Parameters are stored before their activations, as logarithms and logits: all numbers are valid.
 """
+
+import math
 
 import chex
 import jax
@@ -65,23 +67,20 @@ def surfels_from_points(
     alive = finite[chosen]
     points = jnp.where(alive[:, None], points[chosen], 0)
     gaps = neighbour_distance(points, alive)
-    missing = capacity - points.shape[0]
-    fill = (
-        lambda rows, value: jnp.pad(  # noqa: E731
-            rows, ((0, missing), *((0, 0) for _ in rows.shape[1:])), constant_values=value
-        )
-    )
-    alive = fill(alive, False)
     constant = rgb_to_sh(rgb[chosen])[:, None]
     higher = jnp.zeros((points.shape[0], (sh_degree + 1) ** 2 - 1, 3), points.dtype)
     surfels = Surfels(
-        means=fill(points, 0),
-        log_scales=jnp.tile(fill(jnp.log(gaps), 0)[:, None], (1, 2)),
-        quaternions=jax.random.normal(key_rotation, (capacity, 4), points.dtype),
-        opacity_logits=jnp.full(capacity, jax.scipy.special.logit(opacity), points.dtype),
-        sh=fill(jnp.concatenate([constant, higher], axis=1), 0),
+        means=points,
+        log_scales=jnp.stack([jnp.log(gaps), jnp.log(gaps)], axis=-1),
+        quaternions=jax.random.normal(key_rotation, (points.shape[0], 4), points.dtype),
+        opacity_logits=jnp.full(points.shape[0], math.log(opacity / (1 - opacity)), points.dtype),
+        sh=jnp.concatenate([constant, higher], axis=1),
     )
-    return surfels, alive
+    return jax.tree.map(lambda leaf: _pad_rows(leaf, capacity), (surfels, alive))
+
+
+def _pad_rows(array: jax.Array, rows: int) -> jax.Array:
+    return jnp.pad(array, ((0, rows - array.shape[0]), *((0, 0) for _ in array.shape[1:])))
 
 
 def neighbour_distance(points: jax.Array, valid: jax.Array, *, rows: int = 256) -> jax.Array:
@@ -118,6 +117,5 @@ def neighbour_distance(points: jax.Array, valid: jax.Array, *, rows: int = 256) 
 
     starts = jnp.arange(0, padded.shape[0], rows)
     squared = lax.map(nearest, starts).reshape(-1, 3)[:count]
-    known = jnp.isfinite(squared)
-    mean = jnp.sum(jnp.where(known, squared, 0), axis=-1) / jnp.maximum(jnp.sum(known, axis=-1), 1)
-    return jnp.sqrt(jnp.maximum(mean, 1e-7))
+    mean = jnp.mean(squared, axis=-1, where=jnp.isfinite(squared))
+    return jnp.sqrt(jnp.maximum(jnp.where(jnp.isfinite(mean), mean, 0), 1e-7))

@@ -1,6 +1,6 @@
 """Which splats touch which tile, nearest first: a fixed number of sorted (tile, splat) pairs.
 
-Tiles are squares of pixels in row-major order. Shapes are static: pairs that do not fit are counted.
+Tiles are squares of pixels in row-major order. Shapes are static; what does not fit is counted.
 """
 
 import chex
@@ -91,7 +91,7 @@ def tile_lists(
 
 
 def _tile_range(box: jax.Array, size: jax.Array, tile: int) -> tuple[jax.Array, jax.Array]:
-    """First and last tile `[N, 2]` (x, y) whose pixel centres lie in the box; last < first: none."""
+    """First and last tile `[N, 2]` (x, y) with pixel centres in the box; last < first: none."""
     # Clip before the cast: a box may reach to the horizon, and integers do not.
     edge = (size - 1).astype(box.dtype)[None]
     first = jnp.clip(jnp.ceil(box[:, :2] - 0.5), 0, edge + 1).astype(jnp.int32)

@@ -1,0 +1,91 @@
+"""Boxes of discs against the pixels that a ray sees them in."""
+
+import jax
+import numpy as np
+import pytest
+import reference_splats as reference
+from splat_scenes import IDENTITY, NEAR, random_scene, to_surfels
+from splat_scenes import to_camera as make_camera
+
+from jaxcloseup.splats.projection import project_discs, to_camera
+
+
+SIZE, INTRINSICS = (48, 64), np.array([50.0, 56.0, 29.5, 27.0])
+DISCS = 500
+
+
+@jax.jit
+def project(surfels, camera):
+    discs, normals = to_camera(surfels, camera)
+    opacity = jax.nn.sigmoid(surfels.opacity_logits)
+    footprints = project_discs(discs, opacity, normals, camera, near=NEAR)
+    return footprints.box, footprints.opacity, footprints.anchor, footprints.rows
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        dict(depth=(-0.5, 1.5), log_scale=(-4.0, 0.0)),
+        dict(depth=(0.2, 0.6), log_scale=(-3.0, -0.5)),
+        dict(depth=(1.0, 5.0), log_scale=(-6.0, -1.0)),
+    ],
+    ids=["through the camera", "near", "in front"],
+)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_no_visible_pixel_is_outside_its_box(kwargs, seed):
+    scene = random_scene(seed, count=DISCS, **kwargs)
+    x, y = np.meshgrid(np.arange(SIZE[1]) + 0.5, np.arange(SIZE[0]) + 0.5)
+    pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
+    alpha, _ = reference.intersect(scene, IDENTITY, INTRINSICS, pixels, near=NEAR)
+    box, opacity, *_ = project(to_surfels(scene), make_camera(intrinsics=INTRINSICS, size=SIZE))
+    box = np.asarray(box, np.float64)[:, None]
+    inside = np.all((pixels >= box[..., :2]) & (pixels <= box[..., 2:]), axis=-1)
+    assert (alpha > 0).any(1).sum() > DISCS // 10
+    assert np.all(inside[alpha > 0])
+    assert np.all(opacity[(alpha > 0).any(1)] > 0)
+
+
+def test_boxes_are_no_larger_than_the_rim():
+    scene = random_scene(4, depth=(0.3, 4.0), log_scale=(-5.0, -1.5), count=DISCS)
+    reach = reference.depth_reach(scene, IDENTITY)
+    box, *_ = project(to_surfels(scene), make_camera(intrinsics=INTRINSICS, size=SIZE))
+    theta = np.linspace(0, 2 * np.pi, 2000)[:, None]
+    cutoff = np.sqrt(2 * np.log(255 / (1 + np.exp(-scene["opacity_logits"]))))
+    checked = 0
+    for i in np.flatnonzero(scene["means"][:, 2] - reach > NEAR):
+        tangent_u, tangent_v, _ = reference.rotation_of(scene["quaternions"][i]).T
+        scale = cutoff[i] * np.exp(scene["log_scales"][i])
+        offset = scale[0] * np.cos(theta) * tangent_u + scale[1] * np.sin(theta) * tangent_v
+        rim = scene["means"][i] + offset
+        rim = rim[:, :2] / rim[:, 2:] * INTRINSICS[:2] + INTRINSICS[2:]
+        centre = scene["means"][i, :2] / scene["means"][i, 2] * INTRINSICS[:2] + INTRINSICS[2:]
+        floor = cutoff[i] / np.sqrt(2)
+        low = np.minimum(rim.min(0), centre - floor)
+        high = np.maximum(rim.max(0), centre + floor)
+        slack = 0.05 + 0.01 * (high - low)
+        assert np.all(low - box[i, :2] < slack) and np.all(box[i, 2:] - high < slack)
+        assert np.all(box[i, :2] <= low) and np.all(box[i, 2:] >= high)
+        checked += 1
+    assert checked > DISCS // 2
+
+
+def test_rays_see_what_the_rows_say():
+    """u, v and 1/z of the homography against the intersection, wherever the anchor lies."""
+    scene = random_scene(3, depth=(-1.0, 2.0), log_scale=(-1.0, 1.0), count=DISCS)
+    camera = make_camera(intrinsics=INTRINSICS, size=SIZE)
+    _, opacity, anchor, rows = map(np.asarray, project(to_surfels(scene), camera))
+    pixel = np.array([40.3, 11.7])
+    d = np.concatenate([np.ones((DISCS, 1)), pixel - anchor.astype(np.float64)], axis=1)
+    u, v, inverse = np.einsum("nij,nj->in", rows.astype(np.float64), d)
+    ray = np.array([*((pixel - INTRINSICS[2:]) / INTRINSICS[:2]), 1])
+    checked = 0
+    for i in np.flatnonzero(opacity > 0):
+        tangent_u, tangent_v, normal = reference.rotation_of(scene["quaternions"][i]).T
+        z = normal @ scene["means"][i] / (normal @ ray)
+        if abs(normal @ ray) > 0.1 and abs(z) < 20:
+            offset = (z * ray - scene["means"][i]) / np.exp(scene["log_scales"][i])[:, None]
+            actual = [1 / inverse[i], u[i] / inverse[i], v[i] / inverse[i]]
+            expected = [z, offset[0] @ tangent_u, offset[1] @ tangent_v]
+            np.testing.assert_allclose(actual, expected, rtol=2e-4, atol=2e-4)
+            checked += 1
+    assert checked > 100

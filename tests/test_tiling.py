@@ -1,0 +1,73 @@
+"""Tile lists against lists made one tile and one splat at a time."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxcloseup.splats.tiling import _sort_pairs, tile_lists
+
+
+HEIGHT, WIDTH, TILE, BLOCK = 24, 37, 8, 4
+
+
+def random_boxes(count=40):
+    rng = np.random.default_rng(0)
+    centre = rng.uniform(-10, 50, (count, 2))
+    half = rng.exponential(4, (count, 2)) - 0.3  # some are empty
+    box = np.concatenate([centre - half, centre + half], axis=1).astype(np.float32)
+    box[0] = [-np.inf, -1e30, np.inf, 1e30]
+    return box, rng.integers(1, 6, count).astype(np.float32)  # many ties
+
+
+def expected_lists(box, order):
+    lists = []
+    for top in range(0, HEIGHT, TILE):
+        for left in range(0, WIDTH, TILE):
+            x = np.arange(left, min(left + TILE, WIDTH)) + 0.5
+            y = np.arange(top, min(top + TILE, HEIGHT)) + 0.5
+            touched = [
+                i
+                for i in np.argsort(order, kind="stable")
+                if any((box[i, 0] <= x) & (x <= box[i, 2]))
+                and any((box[i, 1] <= y) & (y <= box[i, 3]))
+            ]
+            lists.append(touched)
+    return lists
+
+
+@pytest.mark.parametrize("capacity", [512, 60])
+def test_lists_hold_what_touches_a_tile_nearest_first(capacity):
+    box, order = random_boxes()
+    make = functools.partial(tile_lists, height=HEIGHT, width=WIDTH, tile=TILE, block=BLOCK)
+    make = jax.jit(functools.partial(make, capacity=capacity))
+    lists = jax.tree.map(np.asarray, make(jnp.asarray(box), jnp.asarray(order)))
+    expected = expected_lists(box, order)
+    total = sum(map(len, expected))
+    assert lists.overflow == max(total - capacity, 0)
+    if lists.overflow > 0:  # what is missing is what lies farthest
+        pairs = sorted((order[i], i, t) for t, found in enumerate(expected) for i in found)
+        kept = {(t, i) for _, i, t in pairs[:capacity]}
+        expected = [[i for i in found if (t, i) in kept] for t, found in enumerate(expected)]
+    starts, counts = np.ravel(lists.starts), np.ravel(lists.counts)
+    for t, found in enumerate(expected):
+        slot = lists.slot[t]
+        assert np.ravel(lists.tile)[slot] == t
+        assert tuple(lists.origins.reshape(-1, 2)[slot]) == (t % 5 * TILE, t // 5 * TILE)
+        listed = lists.splats[starts[slot] : starts[slot] + counts[slot]]
+        np.testing.assert_array_equal(listed, found)
+    assert counts.sum() == min(total, capacity)
+    assert np.all(np.diff(counts[: len(expected)]) <= 0)
+
+
+@pytest.mark.parametrize("ranks", [1000, 2**20])
+def test_pairs_sort_alike_packed_or_not(ranks):
+    rng = np.random.default_rng(1)
+    tiles = 2**13
+    tile, rank = rng.integers(0, tiles, 300), rng.integers(0, ranks, 300)
+    found = _sort_pairs(jnp.asarray(tile, jnp.int32), jnp.asarray(rank, jnp.int32), tiles, ranks)
+    order = np.lexsort([rank, tile])
+    np.testing.assert_array_equal(found[0], tile[order])
+    np.testing.assert_array_equal(found[1], rank[order])
