@@ -4,7 +4,7 @@ A label can at best be what its source photograph resolves, so it is compared wi
 blurred to the footprint that the source's pixels have there.
 """
 
-from typing import Any
+from collections.abc import Callable
 
 import cv2
 import jax
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcloseup.batch import camera_at
-from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_points, points_to_pixels
+from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points, points_to_pixels
 from jaxcloseup.geometry.masks import depth_consistent, in_bounds
 from jaxcloseup.geometry.warp import backward_warp
 from jaxcloseup.pseudo import PseudoSettings, make_label, sample_virtual_camera
@@ -44,21 +44,21 @@ def blur_to_footprint(image: np.ndarray, footprint: np.ndarray) -> np.ndarray:
 
 def audit_labels(
     key: jax.Array,
+    exact_depths: jax.Array,
+    *,
     scene: Scene,
     settings: PseudoSettings,
-    exact_depths: jax.Array,
     depths: jax.Array,
-    render_depth: Any,
-    *,
+    render_depth: Callable[[Camera], jax.Array],
     count: int = 16,
 ) -> dict[str, float]:
     """Label error and yield over random virtual close-ups of a procedural scene.
 
     Args:
       key: random key.
+      exact_depths: `[V, H, W]` exact depths of the training views, which decide what is visible.
       scene: a scene with `surface`.
       settings: of the labels.
-      exact_depths: `[V, H, W]` exact depths of the training views, which decide what is visible.
       depths: `[V, H, W]` the depths that labels are made with.
       render_depth: `camera -> [H, W]`, the virtual depth that labels are made with.
       count: virtual cameras.

@@ -21,14 +21,13 @@ def run_stage(
     state: TrainState,
     *data: Any,
     steps: int,
-    chunk: int,
-    report: Callable[[str], None] = print,
 ) -> tuple[TrainState, list[dict[str, float]]]:
-    """Take `steps` steps, reporting after each chunk.
+    """Take `steps` steps, reporting ten times or at least every 500 steps.
 
     Returns:
       The state, and for each chunk its metrics with `step`, counted within the stage.
     """
+    chunk = max(1, min(-(-steps // 10), 500))
     history = []
     start = time.perf_counter()
     done = 0
@@ -41,8 +40,9 @@ def run_stage(
         seconds = time.perf_counter() - start
         left = seconds / done * (steps - done)
         shown = "  ".join(f"{key} {value:.4g}" for key, value in values.items())
-        report(
+        print(
             f"{name:>9} {done:>{len(str(steps))}}/{steps}  {done / seconds:6.1f} steps/s  "
-            f"{int(left // 60)}:{int(left % 60):02d} left  {shown}"
+            f"{int(left // 60)}:{int(left % 60):02d} left  {shown}",
+            flush=True,
         )
     return state, history

@@ -43,19 +43,20 @@ def comparisons(
             panels = [truth, *images, error]
             labels = ["truth", *stages, f"error of {stages[-1]}"]
             image = side_by_side(panels, labels=labels)
-            write_png(folder / f"{target.name}.png", image)
+            write_png(folder / f"{split}_{target.name}.png", image)
             pictures.append(Picture(SPLIT_TITLES[split], target.name, image))
     return pictures
 
 
 def label_pictures(
-    folder: pathlib.Path,
     key: jax.Array,
+    targets: Sequence[Target],
+    folder: pathlib.Path,
+    *,
     scene: Scene,
     settings: PseudoSettings,
     depths: jax.Array,
-    targets: Sequence[Target],
-    render: Callable[[Camera], Rendering],
+    render_depth: Callable[[Camera], jax.Array],
 ) -> list[Picture]:
     """Write pictures of labels: of random virtual views, and of the held-out close-ups."""
     label_image = jax.jit(make_label)
@@ -72,7 +73,7 @@ def label_pictures(
     pictures = []
     for name, camera, index, truth in shots:
         pixels = pixel_grid(camera.height, camera.width)
-        depth = render(camera).depth
+        depth = render_depth(camera)
         label = label_image(camera, pixels, depth, index, scene.train, depths, settings)
         kept = np.where(label.weight[..., None] > 0, label.rgb, 0)
         panels = {"backward warp": label.backward, "forward warp": label.forward, "kept": kept}

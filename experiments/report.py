@@ -87,7 +87,7 @@ def write_report(
         *("<tr>" + "".join(f"<td>{html.escape(cell)}" for cell in row) for row in body),
         "</table></div>",
     ]
-    if "labels" in results:
+    if results["labels"]:
         parts.append(_labels_table(results["labels"]))
     section = None
     for picture in pictures:

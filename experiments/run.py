@@ -6,6 +6,7 @@ Stages: `baseline` trains on the photographs; `control` and `closeup` both go on
 same number of steps, without and with pseudo-labels. The scene is a built-in one or a folder.
 """
 
+import contextlib
 import dataclasses
 import datetime
 import functools
@@ -14,6 +15,7 @@ import pathlib
 import platform
 import sys
 import time
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -77,8 +79,9 @@ def main(argv: list[str]) -> None:
     set_up_compilation_cache(FLAGS.compilation_cache)
     preset = preset_from_flags()
     try:
+        output_dir = choose_output_dir(FLAGS.output_dir, FLAGS.scene, FLAGS.method)
         scene = load_scene(FLAGS.scene, downscale=preset.downscale, half_pixel=FLAGS.half_pixel)
-        output_dir = claim_output_dir(FLAGS.output_dir, scene.name, FLAGS.method)
+        output_dir.mkdir(parents=True, exist_ok=True)
     except (SceneError, OSError) as error:
         sys.exit(f"experiments.run: {error}")
     results = run(scene, preset, FLAGS.seed, output_dir, preset_name=FLAGS.preset)
@@ -108,17 +111,16 @@ def set_up_compilation_cache(folder: str | None) -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
-def claim_output_dir(folder: str | None, scene: str, method: str) -> pathlib.Path:
-    """Make the output folder, before any work is spent; never one that holds something."""
+def choose_output_dir(folder: str | None, scene: str, method: str) -> pathlib.Path:
+    """The output folder; never one that holds something."""
     if folder is None:
         stamp = datetime.datetime.now().strftime("%Y-%m-%d_%H%M%S")
-        folder = os.path.join("outputs", scene, method, stamp)
+        folder = os.path.join("outputs", pathlib.Path(scene).name, method, stamp)
     path = pathlib.Path(folder)
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise FileExistsError(
             f"--output_dir={folder} already holds something: name a new folder, or remove it first"
         )
-    path.mkdir(parents=True, exist_ok=True)
     return path
 
 
@@ -128,114 +130,99 @@ def run(
     """All stages on one scene; writes everything under `output_dir` and returns the results."""
     key_init, key_audit, key_pictures = jax.random.split(jax.random.key(seed), 3)
     scene = dataclasses.replace(scene, train=jax.device_put(scene.train))
-    views = scene.train
+    views, size = scene.train, scene.train.cameras
     print(
-        f"{scene.name}: {len(views)} training photographs of {views.cameras.width} x "
-        f"{views.cameras.height}, depth {scene.near:.3g} to {scene.far:.3g}"
+        f"{scene.name}: {len(views)} training photographs of {size.width} x {size.height}, "
+        f"depth {scene.near:.3g} to {scene.far:.3g}"
     )
     field, optimizer = make_field(preset, scene), make_optimizer(preset)
     bound = {"field": field, "optimizer": optimizer, "config": preset.train}
+    settings = pseudo_settings(preset)
     render = jax.jit(
         lambda state, camera: field.render(state.params, state.buffers, camera, None, None)
     )
-    seconds, stages, pictures, renderings, history = {}, {}, [], {}, {}
-    targets = {}
+    seconds: dict[str, float] = {}
+    history, stages, renderings, targets = {}, {}, {}, {}
 
-    def train_stage(name, runner, state, *data, steps):
-        start = time.perf_counter()
-        state, history[name] = run_stage(
-            name, runner, state, *data, steps=steps, chunk=max(1, min(steps // 10, 500))
-        )
-        seconds[name] = time.perf_counter() - start
+    def train(stage, step, state, *data, steps):
+        with timed(seconds, stage):
+            state, history[stage] = run_stage(stage, make_runner(step), state, *data, steps=steps)
         return state
 
-    def evaluate_stage(name, state):
-        start = time.perf_counter()
-        stages[name] = {}
-        for split, views_of_split in targets.items():
-            stages[name][split], renderings[name, split] = evaluate(
-                functools.partial(render, state), views_of_split
-            )
-            write_renders(output_dir / "renders" / name / split, renderings[name, split], scene)
-            print(f"{name:>9} {split}: PSNR {stages[name][split]['psnr']:.2f} dB")
-        seconds[f"{name}_evaluation"] = time.perf_counter() - start
+    def score(stage, state):
+        with timed(seconds, f"{stage}_evaluation"):
+            stages[stage] = {}
+            for split, of_split in targets.items():
+                rendered = functools.partial(render, state)
+                stages[stage][split], renderings[stage, split] = evaluate(rendered, of_split)
+                folder = output_dir / "renders" / stage / split
+                write_renders(folder, renderings[stage, split], scene)
+                print(f"{stage:>9} {split}: PSNR {stages[stage][split]['psnr']:.2f} dB", flush=True)
+
+    on_photographs = functools.partial(train_step, **bound)
+
+    def on_labels(state, views, depths, settings, sources):
+        return pseudo_step(state, views, depths, settings, sources=sources, **bound)
 
     state = init_state(key_init, scene.points, scene.rgb, field=field, optimizer=optimizer)
-    photographs_only = make_runner(functools.partial(train_step, **bound))
-    baseline = train_stage("baseline", photographs_only, state, views, steps=preset.baseline_steps)
-
-    start = time.perf_counter()
-    depths = jax.jit(
-        lambda state: render_depths(
-            field, state.params, state.buffers, views.cameras, near=scene.near, far=scene.far
+    baseline = train("baseline", on_photographs, state, views, steps=preset.baseline_steps)
+    with timed(seconds, "depths"):
+        depths = jax.jit(functools.partial(render_depths, field, near=scene.near, far=scene.far))(
+            baseline.params, baseline.buffers, views.cameras
         )
-    )(baseline).block_until_ready()
-    seconds["depths"] = time.perf_counter() - start
-    exact = exact_depths(scene, views.cameras) if scene.surface else None
-    for split in ("test", "test_far"):
-        if getattr(scene, split) is not None:
-            seen_from = depths if exact is None else exact
-            targets[split] = make_targets(
-                scene, split, seen_from, functools.partial(render, baseline)
-            )
-    evaluate_stage("baseline", baseline)
+        sources = jax.jit(block_sources)(views.cameras, depths, views.weight)
+        exact = exact_depths(scene, views.cameras) if scene.surface else None
+        for split in scene.names:
+            if split != "train":
+                seen_from = depths if exact is None else exact
+                rendered = functools.partial(render, baseline)
+                targets[split] = make_targets(scene, split, seen_from, rendered)
+    score("baseline", baseline)
+    control = train("control", on_photographs, baseline, views, steps=preset.closeup_steps)
+    score("control", control)
+    data = views, depths, settings, sources
+    closeup = train("closeup", on_labels, baseline, *data, steps=preset.closeup_steps)
+    score("closeup", closeup)
 
-    control = train_stage("control", photographs_only, baseline, views, steps=preset.closeup_steps)
-    evaluate_stage("control", control)
-
-    settings = pseudo_settings(preset)
-    sources = block_sources(views.cameras, depths, views.weight)
-    with_labels = make_runner(
-        lambda state, views, depths, settings, sources: pseudo_step(
-            state, views, depths, settings, sources=sources, **bound
-        )
-    )
-    closeup = train_stage(
-        "closeup",
-        with_labels,
-        baseline,
-        views,
-        depths,
-        settings,
-        sources,
-        steps=preset.closeup_steps,
-    )
-    evaluate_stage("closeup", closeup)
-
-    pictures += comparisons(output_dir / "compare", targets, renderings)
-    pictures += label_pictures(
-        output_dir / "labels",
-        key_pictures,
-        scene,
-        settings,
-        depths,
-        targets.get("test", []),
-        functools.partial(render, baseline),
-    )
+    with timed(seconds, "report"):
+        labels = {
+            "scene": scene,
+            "settings": settings,
+            "depths": depths,
+            "render_depth": lambda camera: render(baseline, camera).depth,
+        }
+        pictures = comparisons(output_dir / "compare", targets, renderings)
+        shown = targets.get("test", [])
+        pictures += label_pictures(key_pictures, shown, output_dir / "labels", **labels)
+        audit = {}
+        if exact is not None:
+            truth = {"depths": exact, "render_depth": lambda camera: scene.surface(camera).depth}
+            audit["exact_depth"] = audit_labels(key_audit, exact, **labels | truth)
+            audit["trained_depth"] = audit_labels(key_audit, exact, **labels)
     results = {
         "scene": scene.name,
         "method": "nerf",
         "preset": preset_name,
         "seed": seed,
-        "resolution": [views.cameras.width, views.cameras.height],
+        "resolution": [size.width, size.height],
         "stages": stages,
+        "labels": audit,
         "seconds": seconds,
         "history": history,
         "config": jsonable(preset),
         "versions": versions(),
     }
-    if scene.surface is not None:
-        results["labels"] = {
-            "exact_depth": audit_labels(
-                key_audit, scene, settings, exact, exact, lambda c: scene.surface(c).depth
-            ),
-            "trained_depth": audit_labels(
-                key_audit, scene, settings, exact, depths, lambda c: render(baseline, c).depth
-            ),
-        }
     write_json(output_dir / "results.json", results)
     write_report(output_dir / "report.html", results, pictures)
     return results
+
+
+@contextlib.contextmanager
+def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
+    """Record under `name` how long the body takes."""
+    start = time.perf_counter()
+    yield
+    seconds[name] = time.perf_counter() - start
 
 
 def jsonable(preset: Preset) -> dict[str, Any]:

@@ -1,0 +1,235 @@
+"""Surfels rendered and differentiated, against a plain scan and against arithmetic.
+
+The plain scan is what one would write first, given the same projection and the same tile lists: all
+tiles step through their lists together and `jax.grad` does the rest. The bound is the arithmetic of
+all (pixel, splat) evaluations at the rate at which this machine multiplies matrices.
+"""
+
+import contextlib
+import functools
+import os
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from experiments.benchmarks.timing import interleaved_medians
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.numerics import safe_divide, safe_norm
+from jaxcloseup.splats import RasterizeConfig, Surfels, render_surfels
+from jaxcloseup.splats.projection import project_discs, to_camera
+from jaxcloseup.splats.rasterize import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from jaxcloseup.splats.spherical_harmonics import rgb_to_sh, sh_to_rgb
+from jaxcloseup.splats.tiling import tile_lists
+
+
+COUNTS = (5_000, 20_000, 100_000)
+SIZES = ((135, 240), (270, 480), (540, 960))
+# Additions, multiplications, comparisons and selections of one evaluation; exp and 1/x count once.
+FORWARD_OPERATIONS, BACKWARD_OPERATIONS = 76, 136
+SCAN_BYTES = 6e9  # the scan is skipped where its stored steps would need more
+
+
+def run() -> None:
+    """Print a table of milliseconds, ratios, memory and compile time."""
+    rate = _matmul_rate()
+    print(f"matrix product {rate / 1e9:.0f} GFLOP/s; milliseconds, forward+backward beside forward")
+    print(
+        "splats     image   pairs/px  forward    both  one core  cores  scan both  ratio"
+        "  bound  MiB  (scan)  compile s"
+    )
+    for count in COUNTS:
+        for size in SIZES:
+            _report(count, size, rate)
+
+
+def _report(count, size, rate):
+    surfels, camera = _surfels(count), _camera(*size)
+    # What a first guess counts as overflow says how much is needed.
+    pairs, _ = _count(surfels, camera, RasterizeConfig(capacity=2**16))
+    config = RasterizeConfig(capacity=-(-pairs // 2**14) * 2**14)
+    _, longest = _count(surfels, camera, config)
+
+    loss = functools.partial(_loss, functools.partial(_render, config=config))
+    forward, both = jax.jit(loss), jax.jit(jax.grad(loss, argnums=(0, 1)))
+    start = time.perf_counter()
+    compiled = both.lower(surfels, camera).compile()
+    compile_seconds = time.perf_counter() - start
+    memory = compiled.memory_analysis().temp_size_in_bytes
+
+    pixels = -(-size[0] // config.tile) * -(-size[1] // config.tile) * config.tile**2
+    calls = {
+        "forward": lambda: forward(surfels, camera),
+        "both": lambda: compiled(surfels, camera),
+    }
+    scan_memory = None
+    if pixels * longest * 80 < SCAN_BYTES:
+        loss = functools.partial(
+            _loss, functools.partial(_render_by_scan, config=config, longest=longest)
+        )
+        plain = jax.jit(jax.grad(loss, argnums=(0, 1))).lower(surfels, camera).compile()
+        scan_memory = plain.memory_analysis().temp_size_in_bytes
+        calls["scan"] = lambda: plain(surfels, camera)
+        _check(compiled(surfels, camera), plain(surfels, camera))
+    seconds = interleaved_medians(calls, 5)
+    with _one_core():
+        alone = interleaved_medians({"both": calls["both"]}, 3)["both"]
+
+    operations = FORWARD_OPERATIONS + BACKWARD_OPERATIONS
+    bound = pairs * config.tile**2 * operations / rate
+    scan, ratio, scan_mib = (
+        (
+            f"{1e3 * seconds['scan']:.0f}",
+            f"{seconds['scan'] / seconds['both']:.1f}",
+            f"{scan_memory / 2**20:.0f}",
+        )
+        if "scan" in calls
+        else ("-", "-", "-")
+    )
+    print(
+        f"{count:>6}  {size[1]:>4}x{size[0]:<4} {pairs * config.tile**2 / pixels:>8.1f}"
+        f"  {1e3 * seconds['forward']:>7.0f} {1e3 * seconds['both']:>7.0f}  {1e3 * alone:>8.0f}"
+        f"  {alone / seconds['both']:>5.2f}  {scan:>9}  {ratio:>5}  {1e3 * bound:>5.0f}"
+        f"  {memory / 2**20:>3.0f}  {scan_mib:>6}  {compile_seconds:>9.1f}",
+        flush=True,
+    )
+
+
+def _surfels(count):
+    """Surfels on a wavy surface that fills the view, smaller the more there are."""
+    rng = np.random.default_rng(0)
+    a, b = rng.uniform(-1, 1, (2, count))
+    z = 3.5 + 0.8 * np.sin(3 * a) * np.cos(2 * b) + 0.25 * rng.normal(size=count)
+    size = 0.56 * np.exp(0.4 * rng.normal(size=(count, 2))) * z[:, None] / np.sqrt(count)
+    quaternions = 0.35 * rng.normal(size=(count, 4)) + [1, 0, 0, 0]
+    leaves = (
+        np.stack([0.55 * a * z, 0.32 * b * z, z], axis=-1),
+        np.log(size),
+        quaternions,
+        1.5 * rng.normal(size=count),
+        rgb_to_sh(rng.uniform(size=(count, 1, 3))),
+    )
+    return Surfels(*(jnp.asarray(leaf, jnp.float32) for leaf in leaves))
+
+
+def _camera(height, width):
+    intrinsics = jnp.array([0.95 * width, 0.95 * width, width / 2, height / 2])
+    return Camera(jnp.eye(4)[:3], intrinsics, height, width)
+
+
+def _loss(render, surfels, camera):
+    """Every output counts, as when training with all regularisers."""
+    rgb, depth, normal, distortion = render(surfels, camera)
+    loss = jnp.mean((rgb - 0.4) ** 2) + 0.05 * jnp.mean((depth - 3) ** 2)
+    return loss + 0.05 * jnp.mean(normal[..., 2]) + 0.1 * jnp.mean(distortion)
+
+
+def _render(surfels, camera, config):
+    alive = jnp.ones(surfels.means.shape[0], bool)
+    image = render_surfels(surfels, alive, camera, config)
+    return image.rgb, image.depth, image.aux.normal, image.aux.distortion
+
+
+def _footprints(surfels, camera, config):
+    discs, normals = to_camera(surfels, camera)
+    offset = surfels.means - camera.position[None]
+    colours = sh_to_rgb(surfels.sh, offset / safe_norm(offset, keepdims=True))
+    payload = jnp.concatenate([colours, normals], axis=-1)
+    opacity = jax.nn.sigmoid(surfels.opacity_logits)
+    return project_discs(discs, opacity, payload, camera, near=config.near)
+
+
+def _lists(footprints, camera, config):
+    return tile_lists(
+        lax.stop_gradient(footprints.box),
+        lax.stop_gradient(footprints.order),
+        height=camera.height,
+        width=camera.width,
+        tile=config.tile,
+        block=1,
+        capacity=config.capacity,
+    )
+
+
+def _count(surfels, camera, config):
+    """How many (tile, surfel) pairs there are, and how many of those that fit one tile has."""
+    lists = jax.jit(lambda s, c: _lists(_footprints(s, c, config), c, config))(surfels, camera)
+    return int(lists.counts.sum() + lists.overflow), int(lists.counts.max())
+
+
+def _render_by_scan(surfels, camera, config, longest):
+    """Composite all tiles in step, one splat of each at a time."""
+    splats = _footprints(surfels, camera, config)
+    lists = _lists(splats, camera, config)
+    starts, counts, origins = (a[:, 0] for a in (lists.starts, lists.counts, lists.origins))
+    inner = jnp.arange(config.tile) + 0.5
+    inner = jnp.stack(jnp.meshgrid(inner, inner), axis=-1).reshape(-1, 2)
+    pixels = origins[:, None] + inner[None]  # [T, P, 2]
+
+    def step(carry, place):
+        transmittance, sums = carry
+        index = lists.splats[jnp.where(place < counts, starts + place, 0)]
+        splat = jax.tree.map(lambda leaf: leaf[index][:, None], splats)
+        d = pixels - splat.anchor
+        u, v, w = (
+            splat.rows[..., i, 0] + jnp.sum(splat.rows[..., i, 1:] * d, axis=-1) for i in range(3)
+        )
+        floor = splat.low_pass * jnp.sum(d * d, axis=-1)
+        on_plane = (w > 0) & (u * u + v * v <= floor * w * w)
+        z = 1 / jnp.where(on_plane, w, jnp.clip(w, *jnp.moveaxis(splat.inverse_depth, -1, 0)))
+        rho = jnp.where(on_plane, (u * u + v * v) * z * z, floor)
+        alpha = jnp.minimum(splat.opacity * jnp.exp(-rho / 2), ALPHA_MAX)
+        drawn = (alpha >= ALPHA_MIN) & (w * config.near <= 1) & (place < counts)[:, None]
+        alpha = jnp.where(drawn, alpha, 0)
+        after = transmittance * (1 - alpha)
+        weight = jnp.where(after >= TRANSMITTANCE_MIN, alpha * transmittance, 0)[..., None]
+        inverse = 1 / z[..., None]
+        values = [jnp.broadcast_to(splat.payload, (*z.shape, 6)), z[..., None]]
+        values += [jnp.ones_like(inverse), inverse, inverse**2]
+        return (after, sums + weight * jnp.concatenate(values, axis=-1)), None
+
+    start = jnp.ones(pixels.shape[:2]), jnp.zeros((*pixels.shape[:2], 10))
+    (_, sums), _ = lax.scan(step, start, jnp.arange(longest, dtype=jnp.int32))
+    down, across = -(-camera.height // config.tile), -(-camera.width // config.tile)
+    image = sums[lists.slot].reshape(down, across, config.tile, config.tile, 10).swapaxes(1, 2)
+    image = image.reshape(down * config.tile, across * config.tile, 10)
+    image = image[: camera.height, : camera.width]
+    depth, alpha, first, second = (image[..., i] for i in range(6, 10))
+    distortion = alpha * second - first * first
+    return image[..., :3], safe_divide(depth, alpha), image[..., 3:6], distortion
+
+
+def _check(gradient, expected):
+    """Both must have the same derivative, up to rounding."""
+    for a, b in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected), strict=True):
+        if float(jnp.max(jnp.abs(a - b))) > 1e-2 * float(jnp.max(jnp.abs(b))):
+            raise AssertionError("the splatter and the scan disagree on a derivative")
+
+
+def _matmul_rate():
+    """Operations per second of a large product of matrices."""
+    side = 2048
+    matrix = jax.random.normal(jax.random.key(0), (side, side))
+    product = jax.jit(lambda a: a @ a)
+    return 2 * side**3 / interleaved_medians({"product": lambda: product(matrix)})["product"]
+
+
+@contextlib.contextmanager
+def _one_core():
+    """Keep all threads of this process on one core, where the system allows it."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    allowed = os.sched_getaffinity(0)
+    try:
+        _pin(set(sorted(allowed)[:1]))
+        yield
+    finally:
+        _pin(allowed)
+
+
+def _pin(cores):
+    for thread in os.listdir("/proc/self/task"):
+        os.sched_setaffinity(int(thread), cores)

@@ -1,0 +1,180 @@
+import dataclasses
+import json
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import plane
+import pytest
+from absl import flags
+from absl.testing import flagsaver
+
+from experiments import run as program
+from experiments.audit import blur_to_footprint
+from experiments.evaluation import Target, score, summarise
+from experiments.presets import PRESETS, QUICK
+from jaxcloseup.field import Rendering
+from jaxcloseup.scenes import load_scene
+from jaxcloseup.train import TrainConfig
+from jaxcloseup.volume.nerf import NerfConfig
+
+
+TINY = dataclasses.replace(
+    QUICK,
+    nerf=NerfConfig(
+        depth=2, width=16, skip_after=0, direction_width=8, num_coarse=8, num_fine=8, chunk=512
+    ),
+    train=TrainConfig(num_rays=64, num_label_rays=64),
+    baseline_steps=30,
+    closeup_steps=3,
+    downscale=1,
+)
+OPENGL = np.diag([1.0, -1, -1])
+
+
+@pytest.fixture(scope="session")
+def capture_folder(tmp_path_factory):
+    """The plane as photographs in the paper's layout."""
+    folder = tmp_path_factory.mktemp("plane")
+    splits = {
+        "train": [plane.camera_above(x, 0.1 * x, 4.0, tilt=0.1 * x) for x in (-1, -0.5, 0, 0.5, 1)],
+        "test": [plane.camera_above(0.2, 0.1, 1.5, tilt=0.3)],
+        "test_far": [plane.camera_above(0.3, 0.0, 4.0)],
+    }
+    for split, cameras in splits.items():
+        (folder / split).mkdir()
+        frames = []
+        for i, camera in enumerate(cameras):
+            rgb, _, _ = plane.photograph(camera)
+            name = f"{split}/{i}.png"
+            cv2.imwrite(str(folder / name), np.rint(rgb[..., ::-1] * 255).astype(np.uint8))
+            pose = np.eye(4)
+            pose[:3] = camera.camtoworld
+            pose[:3, :3] = pose[:3, :3] @ OPENGL
+            fx, fy, cx, cy = map(float, camera.intrinsics)
+            intrinsics = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
+            frames.append({"file_path": name, "transform_matrix": pose.tolist()} | intrinsics)
+        text = json.dumps({"near": 1.0, "far": 8.0, "frames": frames})
+        (folder / f"transforms_{split}.json").write_text(text)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def finished(capture_folder, tmp_path_factory):
+    """The results and the folder of one tiny run."""
+    output_dir = tmp_path_factory.mktemp("run")
+    return run_tiny(capture_folder, output_dir), output_dir
+
+
+def run_tiny(capture_folder, output_dir):
+    # Libraries under a run (optax's schedules) mix integers and floats.
+    with jax.numpy_dtype_promotion("standard"):
+        scene = load_scene(str(capture_folder))
+        return program.run(scene, TINY, 0, output_dir, preset_name="tiny")
+
+
+def test_a_run_scores_every_stage_on_every_split(finished):
+    results, output_dir = finished
+    assert json.loads((output_dir / "results.json").read_text()) == results
+    assert results["resolution"] == [plane.WIDTH, plane.HEIGHT]
+    for stage in ("baseline", "control", "closeup"):
+        for split in ("test", "test_far"):
+            scores = results["stages"][stage][split]
+            assert scores["psnr"] == pytest.approx(scores["views"]["0"]["psnr"])
+            assert scores["ssim"] is not None
+            assert scores["lpips_vgg"] is None
+            assert scores["lpips_vgg_reason"]
+        assert results["seconds"][stage] > 0
+    assert results["stages"]["control"] != results["stages"]["closeup"]
+
+
+def test_a_saved_render_reproduces_its_score(finished, capture_folder):
+    results, output_dir = finished
+    image = cv2.imread(str(output_dir / "renders" / "closeup" / "test" / "rgb" / "0.png"))
+    truth = cv2.imread(str(capture_folder / "test" / "0.png"))
+    expected = results["stages"]["closeup"]["test"]["psnr"]
+    np.testing.assert_allclose(cv2.PSNR(image, truth), expected, atol=1e-3)
+
+
+def test_a_run_leaves_pictures_and_a_page_without_links(finished):
+    _, output_dir = finished
+    for picture in ("compare/test_0.png", "compare/test_far_0.png", "labels/virtual_0.png"):
+        assert cv2.imread(str(output_dir / picture)) is not None
+    depth = cv2.imread(str(output_dir / "renders" / "baseline" / "test" / "depth" / "0.png"))
+    assert depth.shape == (plane.HEIGHT, plane.WIDTH, 3)
+    page = (output_dir / "report.html").read_text()
+    assert "src='data:image/png" in page
+    assert "http" not in page
+
+
+def test_the_same_seed_gives_the_same_metrics(finished, capture_folder, tmp_path):
+    results, _ = finished
+    again = run_tiny(capture_folder, tmp_path)
+    assert again["stages"] == results["stages"]
+
+
+@pytest.fixture
+def parsed_flags():
+    flags.FLAGS(["run"])
+    with flagsaver.flagsaver(compilation_cache=""):
+        yield
+
+
+def test_an_unknown_scene_is_one_sentence(parsed_flags, tmp_path):
+    with (
+        flagsaver.flagsaver(scene="tabel", output_dir=str(tmp_path / "out")),
+        pytest.raises(SystemExit, match="tabel"),
+    ):
+        program.main(["run"])
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_holds_something_is_refused_before_any_work(parsed_flags, tmp_path):
+    (tmp_path / "results.json").write_text("{}")
+    with (
+        flagsaver.flagsaver(scene="table", output_dir=str(tmp_path)),
+        pytest.raises(SystemExit, match="already holds something"),
+    ):
+        program.main(["run"])
+    assert (tmp_path / "results.json").read_text() == "{}"
+
+
+def test_flags_override_the_preset(parsed_flags):
+    with flagsaver.flagsaver(preset="paper", closeup_steps=7, compute_dtype="bfloat16"):
+        preset = program.preset_from_flags()
+    assert preset.closeup_steps == 7
+    assert preset.nerf.compute_dtype == "bfloat16"
+    assert preset.baseline_steps == PRESETS["paper"].baseline_steps == 200_000
+    assert "inf" in json.dumps(program.jsonable(preset), allow_nan=False)
+
+
+def test_scores_ignore_padding_and_say_what_is_missing():
+    rgb = jax.random.uniform(jax.random.key(0), (24, 32, 3))
+    weight = jnp.ones((24, 32)).at[:, 20:].set(0)
+    spoilt = jnp.where(weight[..., None] > 0, rgb, 1 - rgb)
+    seen = jnp.zeros((24, 32), jnp.int32).at[:, :5].set(2)
+    target = Target("0", None, rgb, weight, seen, None)
+    noisy = jnp.clip(spoilt + 0.1, 0, 1)
+    result = score(Rendering(noisy, seen, seen), target)
+    expected = cv2.PSNR(*(np.asarray(x[:, :20] * 255).round() for x in (noisy, rgb)), 255)
+    np.testing.assert_allclose(result["psnr"], expected, atol=1e-3)
+    assert result["coverage_seen1"] == pytest.approx(0.25)
+    assert result["psnr_seen3"] is None
+    assert result["psnr_seen3_reason"]
+    summary = summarise({"0": result})
+    assert summary["psnr_seen3"] is None
+    assert summary["psnr_seen3_reason"] == result["psnr_seen3_reason"]
+
+
+@pytest.mark.parametrize("footprint", [2.0, 5.0])
+def test_blur_has_the_variance_of_the_source_pixel(footprint):
+    image = np.zeros((61, 61, 3), np.float32)
+    image[30, 30] = 1
+    blurred = blur_to_footprint(image, np.full((61, 61), footprint))[..., 0]
+    offset = np.arange(61) - 30
+    assert blurred.sum() == pytest.approx(1, abs=1e-3)
+    variance = (blurred.sum(axis=0) * offset**2).sum()
+    # A box of the pixel's width and a tent of twice that, less the image's own pixel.
+    expected = footprint**2 / 12 + footprint**2 / 6 - 1 / 12
+    assert variance == pytest.approx(expected, rel=0.15)
