@@ -118,6 +118,25 @@ def test_every_derivative_is_a_finite_difference(jacobian, precision):
             assert error <= (1e-3 if precision == "float32" else 1e-6) * scale, (output, name)
 
 
+def test_float32_keeps_the_digits_of_small_splats():
+    """Of splats about a pixel wide, whose gradients are small differences of large sums."""
+    scene = random_scene(10, depth=(1.0, 2.0), log_scale=(-3.5, -2.2))
+    rng = np.random.default_rng(0)
+    cotangents = {
+        name: rng.normal(size=(HEIGHT, WIDTH, 3) if name in VECTORS else (HEIGHT, WIDTH))
+        for name in OUTPUTS
+    }
+    found = []
+    for precision in ("float32", "float64"):
+        with jax.enable_x64(precision == "float64"):
+            arguments = (np.zeros(6), INTRINSICS, cotangents)
+            arguments = jax.tree.map(lambda a, p=precision: jnp.asarray(a, p), arguments)
+            gradient = pullback(to_surfels(scene, precision), *arguments)
+            found.append(jax.tree.map(np.asarray, gradient))
+    for single, double in zip(*map(jax.tree.leaves, found), strict=True):
+        np.testing.assert_allclose(single, double, atol=1e-4 * np.abs(double).max(), rtol=0)
+
+
 def test_tiles_do_not_matter():
     scene = random_scene(5, depth=(0.1, 2.0), log_scale=(-4.0, 0.0))
     images = [

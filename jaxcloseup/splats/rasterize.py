@@ -181,6 +181,8 @@ class _Shade(NamedTuple):
     alpha: jax.Array  # 0 where not drawn
     inverse_depth: jax.Array
     z: jax.Array
+    u_numerator: jax.Array
+    v_numerator: jax.Array
     rho: jax.Array
     on_plane: jax.Array  # where the disc, not the low-pass, gives rho
     clipped: jax.Array  # where the low-pass does and the disc's plane leaves the disc's depths
@@ -203,7 +205,7 @@ def _shade(splats: jax.Array, x: jax.Array, y: jax.Array, near: float) -> _Shade
     rho = jnp.where(on_plane, squared * (z * z), low_pass)
     alpha = jnp.minimum(column(_OPACITY) * jnp.exp(-0.5 * rho), ALPHA_MAX)
     alpha = jnp.where((alpha >= ALPHA_MIN) & (w * near <= 1), alpha, 0)
-    return _Shade(alpha, inverse, z, rho, on_plane, ~on_plane & ((w < low) | (w > high)))
+    return _Shade(alpha, inverse, z, u, v, rho, on_plane, ~on_plane & ((w < low) | (w > high)))
 
 
 def _gather(table, lists: TileLists, tiles, position, chunk):
@@ -295,8 +297,10 @@ def _composite_backward(config, residuals, cotangents):
     columns = table.shape[1]
     features = columns - _PAYLOAD
     x, y = _pixels(config.tile, table.dtype)
-    linear = jnp.stack([jnp.ones_like(x), x, y], axis=1)
-    quadratic = jnp.concatenate([linear, jnp.stack([x * x, x * y, y * y], axis=1)], axis=1)
+    # About the middle of a tile, where sums over its pixels keep most digits.
+    middle = config.tile / 2
+    basis = jnp.stack([jnp.ones_like(x), x - middle, y - middle], axis=1)
+    moments = lambda values: jnp.einsum("kbp,pm->mkb", values, basis, precision=_EXACT)  # noqa: E731
     cotangents = tuple(bar[lists.tile] for bar in cotangents)
 
     def recede(carry, splat):
@@ -345,9 +349,11 @@ def _composite_backward(config, residuals, cotangents):
             plane = jnp.where(shade.on_plane, scaled * shade.z, 0)
             update = _assemble(
                 rows,
-                plane=_reduce(-plane * shade.z, quadratic),
-                w=_reduce(jnp.where(shade.clipped, 0, inverse_bar) + plane * shade.rho, linear),
-                low_pass=_reduce(jnp.where(shade.on_plane, 0, scaled), linear),
+                middle,
+                u=moments(-plane * shade.z * shade.u_numerator),
+                v=moments(-plane * shade.z * shade.v_numerator),
+                w=moments(jnp.where(shade.clipped, 0, inverse_bar) + plane * shade.rho),
+                low_pass=moments(jnp.where(shade.on_plane, 0, scaled)),
                 clip=jnp.where(shade.clipped, inverse_bar * shade.inverse_depth**2, 0).sum(-1),
                 scaled=scaled.sum(-1),
                 payload=jnp.einsum(
@@ -366,35 +372,25 @@ def _composite_backward(config, residuals, cotangents):
     return lax.scan(block, jnp.zeros_like(table), tiles)[0], None
 
 
-def _reduce(values: jax.Array, basis: jax.Array) -> jax.Array:
-    return jnp.einsum("kbp,pm->kbm", values, basis, precision=_EXACT)
+def _assemble(rows, middle, *, u, v, w, low_pass, clip, scaled, payload):
+    """Cotangents `[K, B, C]` of gathered rows from sums over the tile's pixels.
 
-
-def _assemble(rows, *, plane, w, low_pass, clip, scaled, payload):
-    """Cotangents `[K, B, C]` of gathered rows from sums over the tile's pixels."""
-    ax, ay = rows[..., 0], rows[..., 1]
-    u, v, inverse = (jnp.moveaxis(rows[..., i : i + 3], -1, 0) for i in (2, 5, 8))
-    one, x, y, xx, xy, yy = jnp.moveaxis(plane, -1, 0)
-    moments = ((one, x, y), (x, xx, xy), (y, xy, yy))
-    rows_bar = []
-    for row in (u, v):
-        corner = (row[0] - row[1] * ax - row[2] * ay, row[1], row[2])
-        rows_bar.append([sum(c * m for c, m in zip(corner, ms, strict=True)) for ms in moments])
-    rows_bar.append(jnp.moveaxis(w, -1, 0))
-    # From pixels about the tile's corner to pixels about the anchor.
-    about = lambda m: [m[0], m[1] - ax * m[0], m[2] - ay * m[0]]  # noqa: E731
-    rows_bar = [about(row_bar) for row_bar in rows_bar]
-    drift = about(jnp.moveaxis(low_pass, -1, 0))
+    u, v, w (of the rows) and low_pass are moments `[3, K, B]`: sums of 1, x and y about `middle`.
+    """
+    ax, ay = rows[..., 0] - middle, rows[..., 1] - middle
+    about_anchor = lambda m: (m[0], m[1] - ax * m[0], m[2] - ay * m[0])  # noqa: E731
+    u, v, w, low_pass = map(about_anchor, (u, v, w, low_pass))
+    slopes = rows[..., _ROWS:_OPACITY].reshape(*rows.shape[:2], 3, 3)[..., 1:]
     anchor_bar = [
-        rows[..., _LOW_PASS] * drift[axis]
-        - sum(bar[0] * row[axis] for bar, row in zip(rows_bar, (u, v, inverse), strict=True))
-        for axis in (1, 2)
+        rows[..., _LOW_PASS] * low_pass[1 + axis]
+        - sum(bar[0] * slopes[..., i, axis] for i, bar in enumerate((u, v, w)))
+        for axis in range(2)
     ]
-    # A clipped depth moves with the depth of the anchor, 1 / inverse[0].
-    rows_bar[2][0] = rows_bar[2][0] + safe_divide(clip, inverse[0] ** 2)
+    # A clipped depth moves with the depth of the anchor, 1 / rows[2, 0].
+    constant_bar = w[0] + safe_divide(clip, rows[..., _ROWS + 6] ** 2)
     opacity_bar = safe_divide(scaled, rows[..., _OPACITY])
     constants = [jnp.zeros_like(ax)] * (_PAYLOAD - _LOW_PASS)
-    columns = [*anchor_bar, *rows_bar[0], *rows_bar[1], *rows_bar[2], opacity_bar, *constants]
+    columns = [*anchor_bar, *u, *v, constant_bar, *w[1:], opacity_bar, *constants]
     return jnp.concatenate([jnp.stack(columns, axis=-1), payload], axis=-1)
 
 
