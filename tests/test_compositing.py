@@ -18,16 +18,17 @@ def grey(density, depth, length=1.0):
     )
 
 
-@pytest.mark.parametrize("shape", [(), (5,), (2, 3)])
+@pytest.mark.parametrize("shape", [(), (2, 3)])
 def test_against_the_loop(key, shape):
     key_rgb, key_density, key_depth, key_length = jax.random.split(key, 4)
     rgb = jax.random.uniform(key_rgb, (*shape, 9, 3))
     density = jnp.maximum(3 * jax.random.normal(key_density, (*shape, 9)), 0)
     depth = 1 + jnp.cumsum(jax.random.uniform(key_depth, (*shape, 9)), axis=-1)
     length = 1 + jax.random.uniform(key_length, shape)
-    seen = composite(rgb, density, depth, length)
+    samples = jax.tree.map(np.asarray, (rgb, density, depth, length))
+    seen = jax.tree.map(np.asarray, composite(*samples))
     for ray in np.ndindex(shape):
-        expected = reference.composite_ray(rgb[ray], density[ray], depth[ray], length[ray])
+        expected = reference.composite_ray(*(x[ray] for x in samples))
         for ours, theirs in zip(seen, expected, strict=True):
             np.testing.assert_allclose(ours[ray], theirs, rtol=1e-5, atol=1e-6)
 

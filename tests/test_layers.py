@@ -14,11 +14,12 @@ MAY_IMPORT = {
     "geometry": {"numerics"},
     "field": set(),
     "batch": {"geometry"},
+    "rendered_loss": {"numerics", "field", "batch"},
     "metrics": {"numerics"},
     "volume": {"numerics", "geometry", "field"},
     "splats": {"numerics", "geometry", "field"},
     "pseudo": {"geometry", "field", "batch"},
-    "train": {"geometry", "field", "batch", "pseudo"},
+    "train": {"geometry", "field", "batch", "pseudo", "rendered_loss"},
     "scenes": {"numerics", "geometry", "batch"},
     "artifacts": {"geometry", "batch"},
 }

@@ -40,7 +40,7 @@ def test_importance_quantiles_are_the_oracles(key):
     weights = jax.random.uniform(key_weights, (5, 12)) ** 4
     edges = 1 + jnp.cumsum(jax.random.uniform(key_edges, (5, 13)) + 0.01, axis=-1)
     samples = importance(None, edges, weights, 33)
-    for ours, e, w in zip(samples, edges, weights, strict=True):
+    for ours, e, w in zip(*map(np.asarray, (samples, edges, weights)), strict=True):
         expected = reference.invert_cdf(e, w, np.linspace(0, 1, 33))
         np.testing.assert_allclose(ours, expected, rtol=2e-5)
 

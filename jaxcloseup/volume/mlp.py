@@ -1,73 +1,27 @@
 """The network of a NeRF, features first: activations are `[features, samples]`.
 
-Samples are the long axis of every product, and being last they are contiguous, forward and
-backward. A layer may have several inputs: it holds one matrix for each instead of concatenating.
+Samples are the long axis of every product and, being last, contiguous: that is what a CPU wants in
+the backward pass. A layer may have several inputs: one matrix for each, nothing is concatenated.
 """
 
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
+from jax.experimental.layout import Layout, with_layout_constraint
 
 
 Params = Any
 
 
-class Features(NamedTuple):
-    """What the network says of samples, before activation: density `[M]`, rgb `[3, M]`."""
+class Raw(NamedTuple):
+    """What the network says of M samples, before activation: density `[M]` and rgb `[3, M]`."""
 
     density: jax.Array
     rgb: jax.Array
-
-
-def init_dense(key: jax.Array, fan_ins: Sequence[int], fan_out: int) -> Params:
-    """A layer with Glorot-uniform weights `[fan_out, fan_in]` for each input, and zero bias."""
-    limit = (6 / (sum(fan_ins) + fan_out)) ** 0.5
-    keys = jax.random.split(key, len(fan_ins))
-    weights = tuple(
-        jax.random.uniform(k, (fan_out, fan_in), minval=-limit, maxval=limit)
-        for k, fan_in in zip(keys, fan_ins, strict=True)
-    )
-    return {"weights": weights, "bias": jnp.zeros(fan_out)}
-
-
-def dense(layer: Params, *inputs: jax.Array) -> jax.Array:
-    """`sum_i W_i x_i + b`, in the parameters' dtype whatever the inputs' dtype."""
-    return sum(map(matmul, layer["weights"], inputs)) + layer["bias"][:, None]
-
-
-@jax.custom_vjp
-def matmul(weights: jax.Array, x: jax.Array) -> jax.Array:
-    """`weights[O, I] x[I, M]`: multiplied in the dtype of `x`, summed in that of `weights`.
-
-    `jax.grad` of the plain product would mix float32 cotangents with bfloat16 operands, which no
-    machine has a fast product for; here every product has operands of the dtype of `x`.
-    """
-    return _dot(weights.astype(x.dtype), x, weights.dtype)
-
-
-def _matmul_forward(weights, x):
-    return matmul(weights, x), (weights, x)
-
-
-def _matmul_backward(residuals, cotangent):
-    weights, x = residuals
-    cotangent = cotangent.astype(x.dtype)
-    # Transposed before the cast: a real copy, where a transpose alone would be folded into a
-    # product that contracts leading axes, which CPUs are slow at.
-    d_x = _dot(weights.T.astype(x.dtype), cotangent, weights.dtype).astype(x.dtype)
-    d_weights = jax.lax.dot_general(
-        cotangent, x, (((1,), (1,)), ((), ())), preferred_element_type=weights.dtype
-    )
-    return d_weights, d_x
-
-
-matmul.defvjp(_matmul_forward, _matmul_backward)
-
-
-def _dot(a, b, dtype):
-    return jax.lax.dot(a, b, preferred_element_type=dtype)
 
 
 def init_network(
@@ -80,42 +34,115 @@ def init_network(
     direction_features: int,
     direction_width: int,
 ) -> Params:
-    """Parameters of NeRF's network (NeRF, fig. 7); see `apply_network` for what its parts do."""
-    keys = iter(jax.random.split(key, depth + 4))
-    trunk = []
-    for i in range(depth):
-        fan_ins = (position_features,) if i == 0 else (width,)
-        if i == skip_after + 1:
-            fan_ins = (width, position_features)
-        trunk.append(init_dense(next(keys), fan_ins, width))
+    """Parameters of NeRF's network (NeRF, fig. 7), Glorot-uniform; `key` is consumed.
+
+    Args:
+      key: random key.
+      depth: layers of the trunk.
+      width: their width.
+      skip_after: positions enter again after the trunk's layer of this index.
+      position_features: features of an encoded position.
+      direction_features: features of an encoded direction.
+      direction_width: width of the layer that sees directions.
+    """
+    fan_ins = [(position_features,)] + [(width,)] * (depth - 1)
+    if skip_after + 1 < depth:
+        fan_ins[skip_after + 1] = (width, position_features)
+    keys = jax.random.split(key, depth + 4)
     return {
-        "trunk": trunk,
-        "density": init_dense(next(keys), (width,), 1),
-        "feature": init_dense(next(keys), (width,), width),
-        "view": init_dense(next(keys), (width, direction_features), direction_width),
-        "rgb": init_dense(next(keys), (direction_width,), 3),
+        "trunk": [_init_layer(k, i, width) for k, i in zip(keys[:depth], fan_ins, strict=True)],
+        "density": _init_layer(keys[-4], (width,), 1),
+        "feature": _init_layer(keys[-3], (width,), width),
+        "view": _init_layer(keys[-2], (width, direction_features), direction_width),
+        "rgb": _init_layer(keys[-1], (direction_width,), 3),
     }
 
 
-def apply_network(network: Params, positions: jax.Array, directions: jax.Array) -> Features:
+def apply_network(network: Params, positions: jax.Array, directions: jax.Array) -> Raw:
     """Evaluate the network on R rays of S samples each, all in one flat batch.
 
     Args:
       network: from `init_network`.
-      positions: `[I, R * S]` encoded, the samples of a ray side by side. Products are computed in
-        this dtype.
-      directions: `[J, R]` encoded.
+      positions: `[I, R * S]` encoded, the samples of a ray side by side.
+      directions: `[J, R]` encoded, of the same dtype, which products are computed in.
     """
     h = positions
     for layer in network["trunk"]:
         inputs = (h, positions)[: len(layer["weights"])]
-        h = jax.nn.relu(dense(layer, *inputs)).astype(positions.dtype)
+        h = dense(layer["weights"], layer["bias"][:, None], inputs, True)
+    density, feature, view, rgb = (network[k] for k in ("density", "feature", "view", "rgb"))
     # The feature layer is linear and feeds a linear one: their product is one smaller layer.
-    feature, view = network["feature"], network["view"]
-    from_feature, from_directions = view["weights"]
+    # What the direction adds is the same for all samples of a ray: a bias.
+    from_feature, from_direction = view["weights"]
     from_h = from_feature @ feature["weights"][0]
-    bias = view["bias"] + from_feature @ feature["bias"]
-    by_ray = matmul(from_directions, directions) + bias[:, None]
-    by_sample = matmul(from_h, h).reshape(*by_ray.shape, -1) + by_ray[..., None]
-    seen = jax.nn.relu(by_sample).astype(positions.dtype).reshape(by_ray.shape[0], -1)
-    return Features(dense(network["density"], h)[0], dense(network["rgb"], seen))
+    bias = (view["bias"] + from_feature @ feature["bias"])[:, None]
+    by_ray = dense((from_direction,), bias, (directions,), False)
+    seen = dense((from_h,), by_ray, (h,), True)
+    return Raw(
+        density=dense(density["weights"], density["bias"][:, None], (h,), False)[0],
+        rgb=dense(rgb["weights"], rgb["bias"][:, None], (seen,), False),
+    )
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3,))
+def dense(
+    weights: Sequence[jax.Array], bias: jax.Array, inputs: Sequence[jax.Array], relu: bool
+) -> jax.Array:
+    """`sum_i W_i x_i + b`, or its positive part.
+
+    Products are in the dtype of the inputs, sums in that of the weights. Plain differentiation
+    would multiply float32 cotangents with bfloat16 operands, keep values from before the activation
+    and contract leading axes, all of which cost time.
+
+    Args:
+      weights: `[O, I_i]` for each input.
+      bias: `[O, G]`, a column for each of G groups of consecutive samples, equal in size.
+      inputs: `[I_i, M]`, all of one dtype.
+      relu: whether negative values become 0. Such a result has the dtype of the inputs.
+
+    Returns:
+      `[O, M]`.
+    """
+    chex.assert_rank([*weights, bias, *inputs], 2)
+    dtype = inputs[0].dtype
+    out = sum(_dot(w.astype(dtype), x, w.dtype) for w, x in zip(weights, inputs, strict=True))
+    out = (out.reshape(*bias.shape, -1) + bias[..., None]).reshape(out.shape)
+    return jax.nn.relu(out).astype(dtype) if relu else out
+
+
+def _dense_forward(weights, bias, inputs, relu):
+    out = dense(weights, bias, inputs, relu)
+    return out, (weights, bias, inputs, out if relu else None)
+
+
+def _dense_backward(relu, residuals, cotangent):
+    weights, bias, inputs, out = residuals
+    dtype = inputs[0].dtype
+    cotangent = cotangent.astype(dtype)
+    if relu:
+        cotangent = jnp.where(out > 0, cotangent, 0)
+    d_weights, d_inputs = [], []
+    for w, x in zip(weights, inputs, strict=True):
+        d_weights.append(_dot(cotangent, x.T, w.dtype))
+        # A real copy: a CPU's product is slow if it has to contract the leading axis of W.
+        transposed = with_layout_constraint(w.astype(dtype).T, Layout((0, 1)))
+        d_inputs.append(_dot(transposed, cotangent, w.dtype).astype(dtype))
+    d_bias = jnp.sum(cotangent.reshape(*bias.shape, -1), axis=-1, dtype=bias.dtype)
+    return tuple(d_weights), d_bias, tuple(d_inputs)
+
+
+dense.defvjp(_dense_forward, _dense_backward)
+
+
+def _dot(a: jax.Array, b: jax.Array, dtype: jnp.dtype) -> jax.Array:
+    return jax.lax.dot(a, b, preferred_element_type=dtype)
+
+
+def _init_layer(key: jax.Array, fan_ins: Sequence[int], fan_out: int) -> Params:
+    limit = (6 / (sum(fan_ins) + fan_out)) ** 0.5
+    keys = jax.random.split(key, len(fan_ins))
+    weights = tuple(
+        jax.random.uniform(k, (fan_out, fan_in), minval=-limit, maxval=limit)
+        for k, fan_in in zip(keys, fan_ins, strict=True)
+    )
+    return {"weights": weights, "bias": jnp.zeros(fan_out)}

@@ -1,8 +1,7 @@
 """NeRF: a coarse and a fine network, volume rendered (Mildenhall et al., ECCV 2020).
 
 Rays are `[R]`, their samples `[R, S]`. Rays go through in chunks, one after another, in training as
-for whole images, so that the working set stays in the cache, and backward passes recompute a chunk
-instead of remembering all of them: that is faster than reading activations back from memory.
+for whole images: the working set stays in the cache, and memory does not grow with their number.
 """
 
 import dataclasses
@@ -36,9 +35,7 @@ class NerfConfig:
       num_fine: importance samples; the fine network sees these and the coarse ones.
       density_noise: standard deviation of noise on raw densities, where a key is given.
       background: grey level in [0, 1] behind the scene; None adds nothing, which is black.
-      chunk: rays rendered at once. Rendering takes about `chunk * (num_coarse + num_fine) * width`
-        activations of memory a few times over, times `depth` in training, whatever the number of
-        rays: 25 and 100 MB with the defaults.
+      chunk: rays rendered at once; None for as many as `rays_at_once` says.
       compute_dtype: "float32" or "bfloat16" for the operands of the network's products.
     """
 
@@ -52,8 +49,20 @@ class NerfConfig:
     num_fine: int = 64
     density_noise: float = 1.0
     background: float | None = None
-    chunk: int = 64
+    chunk: int | None = None
     compute_dtype: str = "float32"
+
+    @property
+    def rays_at_once(self) -> int:
+        """Rays to render, or to differentiate, at once: what keeps one layer's activations small.
+
+        Small is 2 MB on a CPU, the size of a core's cache, and 512 MB elsewhere. The rest follows:
+        whole images need about 5 times as much memory, training `2 depth + 5` times.
+        """
+        if self.chunk is not None:
+            return self.chunk
+        activations = 2**19 if jax.default_backend() == "cpu" else 2**27
+        return max(1, activations // ((self.num_coarse + self.num_fine) * self.width))
 
 
 class NerfAux(NamedTuple):
@@ -125,7 +134,7 @@ def nerf(
 
         shape = pixels.shape[:-1]
         rays = origins.reshape(-1, 3), directions.reshape(-1, 3)
-        rendering = _map_chunks(render_rays, key, rays, config.chunk)
+        rendering = _map_chunks(render_rays, key, rays, config.rays_at_once)
         return jax.tree.map(lambda x: x.reshape((*shape, *x.shape[1:])), rendering)
 
     return RadianceField(init=init, render=render, loss=loss)
@@ -176,7 +185,10 @@ def _rays(camera: Camera, pixels: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _map_chunks(fn, key, rays, chunk):
-    """`fn((key, *rays))` on chunks of the rays' leading axis `[R]`, in fixed memory."""
+    """`fn((key, *rays))` on chunks of the rays' leading axis `[R]`, in fixed memory.
+
+    A backward pass computes each chunk again: remembering all of them takes as long, and gigabytes.
+    """
     (num_rays,) = {x.shape[0] for x in rays}
     if num_rays <= chunk:
         return fn((key, *rays))

@@ -1,0 +1,100 @@
+"""The loss of a rendering, with its gradient taken chunk by chunk."""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxcloseup.batch import Batch
+from jaxcloseup.field import RadianceField
+from jaxcloseup.numerics import safe_divide
+
+
+Loss = tuple[jax.Array, dict[str, jax.Array]]
+
+
+def rendered_loss(
+    params: Any,
+    buffers: Any,
+    batch: Batch,
+    key: jax.Array | None,
+    *,
+    field: RadianceField,
+    chunk: int | None = None,
+) -> Loss:
+    """`field.loss` of what `field` renders at a batch's pixels, differentiable in `params` alone.
+
+    With `chunk`, differentiation takes the gradient of so many pixels as soon as they are rendered
+    and adds it up, so that nothing is kept for a backward pass and nothing computed twice. The sum
+    is exact, for a field's loss is a weighted mean over pixels; random numbers are others than
+    without `chunk`. Renderers of whole images have nothing to gain.
+
+    Args:
+      params: differentiated.
+      buffers: of the field.
+      batch: pixels and their colours.
+      key: consumed by the rendering; None renders deterministically.
+      field: static; renders and judges.
+      chunk: static; pixels differentiated at once, None for all of them.
+
+    Returns:
+      The loss and its metrics.
+    """
+    if chunk is None or batch.pixels is None or len(batch.pixels) <= chunk:
+        return _plain(field, params, buffers, batch, key)
+    return _chunked(field, chunk, params, buffers, batch, key)
+
+
+def _plain(field, params, buffers, batch, key):
+    rendering = field.render(params, buffers, batch.cameras, batch.pixels, key)
+    return field.loss(rendering, batch.rgb, batch.weight)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+def _chunked(field, chunk, params, buffers, batch, key):
+    del chunk
+    return _plain(field, params, buffers, batch, key)
+
+
+def _chunked_forward(field, chunk, params, buffers, batch, key):
+    total = jnp.sum(batch.weight)
+
+    def add_gradient(gradients, piece):
+        piece, key = piece
+
+        def share_of_loss(params):
+            rendering = field.render(params, buffers, piece.cameras, piece.pixels, key)
+            loss, _ = field.loss(rendering, piece.rgb, piece.weight)
+            return loss * safe_divide(jnp.sum(piece.weight), total), rendering
+
+        gradient, rendering = jax.grad(share_of_loss, has_aux=True)(params)
+        return jax.tree.map(jnp.add, gradients, gradient), rendering
+
+    pieces = _split(batch, chunk)
+    keys = None if key is None else jax.random.split(key, len(pieces.pixels))
+    zeros = jax.tree.map(jnp.zeros_like, params)
+    gradients, renderings = jax.lax.scan(add_gradient, zeros, (pieces, keys))
+    rendering = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: len(batch.pixels)], renderings)
+    return field.loss(rendering, batch.rgb, batch.weight), gradients
+
+
+def _chunked_backward(field, chunk, gradients, cotangent):
+    del field, chunk
+    return jax.tree.map(lambda x: cotangent[0] * x, gradients), None, None, None
+
+
+_chunked.defvjp(_chunked_forward, _chunked_backward)
+
+
+def _split(batch: Batch, chunk: int) -> Batch:
+    """Pieces of `chunk` pixels on a new leading axis; pixels of no weight fill the last one up."""
+    count = len(batch.pixels)
+    fill = -count % chunk
+    cameras = batch.cameras
+    if cameras.intrinsics.ndim == 1:
+        cameras = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), cameras)
+    batch = batch._replace(cameras=cameras)
+    padded = jax.tree.map(lambda x: jnp.concatenate([x, x[:1].repeat(fill, 0)]), batch)
+    padded = padded._replace(weight=jnp.pad(batch.weight, (0, fill)))
+    return jax.tree.map(lambda x: x.reshape(-1, chunk, *x.shape[1:]), padded)
