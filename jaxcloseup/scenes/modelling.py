@@ -3,6 +3,8 @@
 The world is in metres with z up. Sizes are full extents (diameters, not radii).
 """
 
+import concurrent.futures
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -10,22 +12,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcloseup.scenes import shading
-from jaxcloseup.scenes.materials import DETAILS, detail, material
-from jaxcloseup.scenes.prints import PRINTS, printed
+from jaxcloseup.scenes.lighting import Ambience, Lamp, bake_light
 from jaxcloseup.scenes.raycast import BOX, CYLINDER, FACES_OF, PLANE, SPHERE, make_solids
+from jaxcloseup.scenes.textures import draw_texture
 
 
 # Scenes padded alike share compilations.
-_PAD_SOLIDS, _PAD_FACES, _PAD_LIGHT, _PAD_TEXTURES = 64, 256, 1 << 15, 8
+_PAD_SOLIDS, _PAD_FACES, _PAD_LIGHT, _PAD_TEXTURES = 192, 1024, 3 << 15, 24
 
 
 class Finish(NamedTuple):
     """What a face is made of.
 
     Attributes:
-      texture: a name of `materials` or `prints`.
+      texture: name of a colour texture.
       size: metres a repeat of the texture; None stretches `region` once over the face.
-      detail: a name of `materials` for fine structure.
+      detail: name of a texture of fine structure.
       detail_size: metres a repeat of the detail.
       tint: factor on the colour.
       gloss: strength of the highlight.
@@ -57,28 +59,31 @@ class Solid(NamedTuple):
     texel: float
 
 
-class Lamp(NamedTuple):
-    """A spherical lamp: `power` is the irradiance at one metre."""
+class Rig(NamedTuple):
+    """Where the far photographs are taken from, and what deserves a close look.
 
-    position: tuple[float, float, float]
-    radius: float
-    power: tuple[float, float, float]
+    Attributes:
+      target: `[3]` what the far cameras look at.
+      distance: (lo, hi) metres from it.
+      azimuth: (lo, hi) degrees about z, 0 straight in front (from -y).
+      elevation: (lo, hi) degrees above the horizon.
+      interests: (x, y, z, radius) balls in which close-up views find their subjects.
+    """
+
+    target: tuple[float, float, float]
+    distance: tuple[float, float]
+    azimuth: tuple[float, float]
+    elevation: tuple[float, float]
+    interests: tuple[tuple[float, float, float, float], ...]
 
 
 class Model(NamedTuple):
-    """A scene before rendering.
-
-    Attributes:
-      solids: what is there.
-      lamps: what lights it; the first one makes the highlight.
-      ambient: irradiance of an unoccluded point.
-      reach: metres over which obstacles stop ambient light.
-    """
+    """A scene before rendering: what is there, what lights it, and how it is photographed."""
 
     solids: list[Solid]
-    lamps: list[Lamp]
-    ambient: tuple[float, float, float]
-    reach: float
+    lamps: list[Lamp]  # the first one makes the highlight
+    ambience: Ambience
+    rig: Rig
 
 
 def turn(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> np.ndarray:
@@ -119,7 +124,7 @@ def sphere(centre, size, finish, *, rotation=None, texel=0.03) -> Solid:
 
 
 def cylinder(base, height, bottom, top, finish, *, rotation=None, texel=0.03, faces=None) -> Solid:
-    """A round solid standing on `base`, of diameters `bottom` and `top`; faces side, bottom, top."""
+    """A round solid on `base`, of diameters `bottom` and `top`; its faces are side, bottom, top."""
     rotation = np.eye(3) if rotation is None else rotation
     centre = np.asarray(base, float) + rotation @ [0, 0, height / 2]
     size, taper = ((bottom + top) / 2, (bottom + top) / 2, height), (top - bottom) / (top + bottom)
@@ -147,9 +152,8 @@ def sheet(centre, size, finish, *, facing="+z", rotation=None, texel=0.03) -> So
     return _solid(PLANE, centre, (*size, 1.0), finish, frame, 0.0, texel, None)
 
 
-def assemble(model: Model) -> tuple[shading.World, np.ndarray, np.ndarray, shading.Lamps]:
-    """A world with no light yet, where its light is to be baked (positions, normals `[L, 3]`), and
-    by which lamps."""
+def build_world(model: Model, bake: Callable[..., np.ndarray] = bake_light) -> shading.World:
+    """The model, ready to render; `bake` makes its light, or finds what was made before."""
     solids = sorted(model.solids, key=lambda solid: solid.kind)
     to_world = np.stack([np.column_stack([s.rotation * (s.size / 2), s.centre]) for s in solids])
     names: list[str] = []
@@ -183,18 +187,9 @@ def assemble(model: Model) -> tuple[shading.World, np.ndarray, np.ndarray, shadi
         padding = [(0, -len(rows) % _PAD_FACES)] + [(0, 0)] * (values.ndim - 1)
         return jnp.asarray(np.pad(values, padding, mode="edge").astype(kind))
 
-    texels = [shading.pack_pyramid(_texture(name)) for name in names]
+    with concurrent.futures.ThreadPoolExecutor() as pool:
+        texels = list(pool.map(_pyramid, names))
     texels += [np.zeros_like(texels[0])] * (-len(names) % _PAD_TEXTURES)
-    padding = [(0, -start % _PAD_LIGHT), (0, 0)]
-    positions = np.pad(np.concatenate(positions), padding, mode="edge").astype(np.float32)
-    normals = np.pad(np.concatenate(normals), padding, mode="edge").astype(np.float32)
-    lamps = shading.Lamps(
-        position=jnp.asarray([lamp.position for lamp in model.lamps], jnp.float32),
-        radius=jnp.asarray([lamp.radius for lamp in model.lamps], jnp.float32),
-        power=jnp.asarray([lamp.power for lamp in model.lamps], jnp.float32),
-        ambient=jnp.asarray(model.ambient, jnp.float32),
-        reach=jnp.float32(model.reach),
-    )
     world = shading.World(
         solids=make_solids(
             np.array([s.kind for s in solids]), to_world, np.array([s.taper for s in solids]),
@@ -202,36 +197,17 @@ def assemble(model: Model) -> tuple[shading.World, np.ndarray, np.ndarray, shadi
         ),
         faces=shading.Faces(**{key: column(key) for key in rows[0]}),
         texels=jnp.asarray(np.stack(texels)),
-        light=jnp.zeros((len(positions), 4)),
-        lamp=lamps.position[0],
+        light=jnp.zeros((0, 4)),
+        lamp=jnp.asarray(model.lamps[0].position, jnp.float32),
     )  # fmt: skip
-    return world, positions, normals, lamps
-
-
-def light_world(
-    world: shading.World, positions: np.ndarray, normals: np.ndarray, lamps: shading.Lamps
-) -> shading.World:
-    """The same world with its light baked, smoothed within each tile, and encoded."""
-    light = np.array(_bake(world, lamps, jnp.asarray(positions), jnp.asarray(normals)))
-    tiles = np.column_stack([world.faces.tile, np.asarray(world.faces.wraps, np.int32)])
-    for start, width, height, wrap in np.unique(tiles, axis=0):
-        tile = light[start : start + width * height].reshape(height, width, 4)
-        padded = np.pad(tile, [(0, 0), (1, 1), (0, 0)], mode="wrap" if wrap else "edge")
-        tile = (padded[:, :-2] + 2 * tile + padded[:, 2:]) / 4
-        padded = np.pad(tile, [(1, 1), (0, 0), (0, 0)], mode="edge")
-        tile = (padded[:-2] + 2 * tile + padded[2:]) / 4
-        light[start : start + width * height] = tile.reshape(-1, 4)
-    light[:, :3] = np.maximum(light[:, :3], 0) ** shading.GAMMA
+    places = np.concatenate(positions), np.concatenate(normals)
+    light = bake(world, model.lamps, model.ambience, *places)
+    light = np.pad(light, [(0, -start % _PAD_LIGHT), (0, 0)])
     return world.replace(light=jnp.asarray(light))
 
 
-_bake = jax.jit(shading.bake_light)
-
-
-def _texture(name: str) -> np.ndarray:
-    if name in PRINTS:
-        return printed(name)
-    return detail(name) if name in DETAILS else material(name)
+def _pyramid(name: str) -> np.ndarray:
+    return shading.pack_pyramid(draw_texture(name))
 
 
 def _is_round(solid: Solid, side: int) -> bool:

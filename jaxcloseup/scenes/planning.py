@@ -6,16 +6,13 @@ OpenCV axes; a view is a pose with the one full-size pinhole of all built-in cap
 
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
-from jaxcloseup.scenes.builtin import Rig
-from jaxcloseup.scenes.modelling import turn
-from jaxcloseup.scenes.raycast import Hit, Solids, cast_ray, map_rays
+from jaxcloseup.scenes.modelling import Rig, turn
+from jaxcloseup.scenes.raycast import Solids, cast_rays
 
 
 WIDTH, HEIGHT, FOCAL = 960, 540, 800.0
-_RAYS = 1 << 14  # rays cast at a time: one compilation serves all questions
 _CANDIDATES = 48
 
 
@@ -45,26 +42,6 @@ def pose_looking_at(
     return np.column_stack([rotation, position])
 
 
-def cast(solids: Solids, origins: np.ndarray, directions: np.ndarray) -> Hit:
-    """First hits of rays `[..., 3]`, as NumPy arrays `[...]`."""
-    shape = np.broadcast_shapes(origins.shape, directions.shape)[:-1]
-    rays = [np.broadcast_to(r, (*shape, 3)).reshape(-1, 3) for r in (origins, directions)]
-    count = len(rays[0])
-    rays = [np.pad(r, [(0, -count % _RAYS), (0, 0)], mode="edge").astype(np.float32) for r in rays]
-    parts = [
-        jax.device_get(_cast(solids, rays[0][i : i + _RAYS], rays[1][i : i + _RAYS]))
-        for i in range(0, len(rays[0]), _RAYS)
-    ]
-    return jax.tree.map(
-        lambda *leaf: np.concatenate(leaf)[:count].reshape(*shape, *leaf[0].shape[1:]), *parts
-    )
-
-
-@jax.jit
-def _cast(solids: Solids, origins: jax.Array, directions: jax.Array) -> Hit:
-    return map_rays(lambda o, d: cast_ray(solids, o, d), origins, directions)
-
-
 def grid_rays(poses: np.ndarray, columns: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
     """Origins `[V, 1, 3]` and directions `[V, rows * columns, 3]` evenly over each view."""
     x = ((np.arange(columns) + 0.5) / columns - 0.5) * WIDTH / FOCAL
@@ -86,29 +63,27 @@ def seen_by(solids: Solids, points: np.ndarray, poses: np.ndarray) -> np.ndarray
     count = np.zeros(len(points), int)
     which, view = np.nonzero(inside)
     if len(which):
-        hit = cast(solids, poses[view, :, 3], away[which, view])
+        hit = cast_rays(solids, poses[view, :, 3], away[which, view])
         np.add.at(count, which, np.abs(hit.depth - 1) < 2e-3)
     return count
 
 
 def plan_far(solids: Solids, rig: Rig, rng: np.random.Generator, count: int) -> np.ndarray:
     """`count` far poses `[count, 3, 4]` in order of azimuth, none with anything just before it."""
-    i = np.arange(count)
-    heights = (0.5 + i * 0.618034) % 1
     poses = []
     for k in range(count):
-        azimuth = rig.azimuth[0] + (rig.azimuth[1] - rig.azimuth[0]) * (k + 0.5) / count
-        elevation = rig.elevation[0] + (rig.elevation[1] - rig.elevation[0]) * heights[k]
-        a, e = np.deg2rad([azimuth, elevation])
-        away = np.array([np.sin(a) * np.cos(e), -np.cos(a) * np.cos(e), np.sin(e)])
+        azimuth = np.interp(k + 0.5, [0, count], rig.azimuth)
+        height = (0.5 + 0.618034 * k) % 1
         while True:
+            a, e = np.deg2rad([azimuth, np.interp(height, [0, 1], rig.elevation)])
+            away = np.array([np.sin(a) * np.cos(e), -np.cos(a) * np.cos(e), np.sin(e)])
             position = np.array(rig.target) + rng.uniform(*rig.distance) * away
             target = np.array(rig.target) + rng.normal(0, 0.06, 3)
             pose = pose_looking_at(position, target, (0.0, 0.0, rng.normal(0, 0.02)))
-            if cast(solids, *grid_rays(pose[None], 32, 18)).depth.min() > 0.4 * rig.distance[0]:
+            depth = cast_rays(solids, *grid_rays(pose[None], 32, 18)).depth
+            if depth.min() > 0.4 * rig.distance[0] and np.isfinite(depth).all():
                 break
-            away = away + rng.normal(0, 0.05, 3)
-            away /= np.linalg.norm(away)
+            height = rng.uniform()
         poses.append(pose)
     return np.stack(poses)
 
@@ -118,8 +93,8 @@ def plan_closeups(
 ) -> Closeups:
     """`count` close-ups: each 2 to 8 times nearer to a subject than the nearest training view.
 
-    The camera goes to the side of the subject by 12 to 45 degrees as seen from a training view, and
-    does not point straight at it. It is taken only if free space joins it to its subject, nothing is
+    The camera goes round its subject by 12 to 45 degrees from the line of a training view, and does
+    not point straight at it. It is kept only if free space joins it to its subject, nothing is
     just before it, and training views see the subject and most of the rest of its image.
     """
     chosen = []
@@ -147,7 +122,7 @@ def _closeup(
     """The first good one of a handful of random candidates, if any."""
     views = train[rng.integers(len(train), size=_CANDIDATES), :, 3]
     aims = interest[:3] + interest[3] * _in_ball(rng, _CANDIDATES)
-    hit = cast(solids, views, aims - views)
+    hit = cast_rays(solids, views, aims - views)
     depth = np.where(np.isfinite(hit.depth), hit.depth, 0)
     subjects = views + depth[:, None] * (aims - views)
     on_subject = np.linalg.norm(subjects - interest[:3], axis=-1) < 1.3 * interest[3]
@@ -166,11 +141,11 @@ def _closeup(
     )
 
     facing = np.sum(hit.normal * direction, axis=-1) > 0.4
-    back = cast(solids, subjects + 1e-3 * hit.normal, positions - subjects).depth > 1
-    clear = cast(solids, *grid_rays(poses, 32, 18)).depth.min(1) > np.maximum(0.07, 0.4 * own)
+    back = cast_rays(solids, subjects + 1e-3 * hit.normal, positions - subjects).depth > 1
+    clear = cast_rays(solids, *grid_rays(poses, 32, 18)).depth.min(1) > np.maximum(0.07, 0.4 * own)
     for i in np.flatnonzero(on_subject & facing & back & clear):
         origins, directions = grid_rays(poses[i : i + 1], 16, 9)
-        depths = cast(solids, origins, directions).depth[..., None]
+        depths = cast_rays(solids, origins, directions).depth[..., None]
         shown = (origins + depths * directions)[0]
         views_of = seen_by(solids, np.concatenate([subjects[i : i + 1], shown]), train)
         if views_of[0] >= 3 and np.mean(views_of[1:] >= 3) > 0.75:

@@ -5,6 +5,7 @@ seeds, at full size, and only then scaled. Photographs are kept on disk, since a
 takes minutes; the key covers the source files that draw them.
 """
 
+import concurrent.futures
 import functools
 import hashlib
 import os
@@ -13,6 +14,8 @@ import tempfile
 import warnings
 import zipfile
 import zlib
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,24 +23,29 @@ import numpy as np
 
 from jaxcloseup.batch import Views, camera_at
 from jaxcloseup.geometry.cameras import Camera
-from jaxcloseup.scenes import modelling, shading
+from jaxcloseup.scenes import shading
 from jaxcloseup.scenes.builtin import SCENES
+from jaxcloseup.scenes.lighting import bake_light
+from jaxcloseup.scenes.modelling import build_world, turn
 from jaxcloseup.scenes.planning import (
     FOCAL,
     HEIGHT,
     WIDTH,
-    cast,
     grid_rays,
     plan_closeups,
     plan_far,
 )
+from jaxcloseup.scenes.raycast import cast_rays
 from jaxcloseup.scenes.scene import Scene, Surface
 
 
 PROCEDURAL_SCENES: tuple[str, ...] = tuple(SCENES)
 NUM_TRAIN, NUM_TEST, NUM_FAR = 60, 12, 8
 _SAMPLES = 8  # rays a pixel
-_SOURCES = ("raycast", "shading", "materials", "prints", "modelling", "builtin", "planning")
+_SOURCES = (
+    *("raycast.py", "shading.py", "lighting.py", "modelling.py", "planning.py", "procedural.py"),
+    *("builtin/*.py", "textures/*.py"),
+)
 
 
 def procedural_scene(
@@ -68,7 +76,7 @@ def procedural_scene(
     if downscale < 1 or downscale != int(downscale):
         raise ValueError(f"downscale must be a positive integer, not {downscale}")
     width, height = -(-WIDTH // downscale), -(-HEIGHT // downscale)
-    capture = _cached(name, width, height)
+    capture = _kept(f"{name}-{width}x{height}", lambda: _capture(name, width, height))
     splits = {}
     for split in ("train", "test", "test_far"):
         rgb = jnp.asarray(capture[f"{split}_rgb"])
@@ -108,8 +116,12 @@ _render_rgb = jax.jit(shading.render_rgb, static_argnames="samples")
 
 @functools.lru_cache(maxsize=2)
 def _world(name: str) -> shading.World:
-    model, _ = SCENES[name]()
-    return modelling.light_world(*modelling.assemble(model))
+    model = SCENES[name]()
+
+    def bake(*scene: Any) -> np.ndarray:
+        return _kept(f"{name}-light", lambda: {"light": bake_light(*scene)})["light"]
+
+    return build_world(model, bake)
 
 
 def _rng(name: str, stream: int) -> np.random.Generator:
@@ -127,47 +139,48 @@ def _cameras(poses: np.ndarray, width: int, height: int) -> Camera:
     )
 
 
-def _cached(name: str, width: int, height: int) -> dict[str, np.ndarray]:
-    """`_capture`, from disk where it has been made before.
+def _kept(stem: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """`make()`, from disk where it has been made before by these very sources.
 
     A cache that cannot be read or written costs time and a warning, never more.
     """
-    path = _cache_path(name, width, height)
+    root = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
+    path = pathlib.Path(root) / "jaxcloseup" / f"{stem}-{_sources_digest()}.npz"
     if path.exists():
         try:
             with np.load(path, allow_pickle=False) as stored:
                 return dict(stored)
         except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
-            warnings.warn(f"ignoring the unreadable cache {path}: {error}", stacklevel=3)
-    capture = _capture(name, width, height)
+            warnings.warn(f"ignoring the unreadable cache {path}: {error}", stacklevel=2)
+    made = make()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
             try:
-                np.savez(file, **capture)
+                np.savez(file, **made)
                 file.close()
                 os.replace(file.name, path)
             except BaseException:
                 os.unlink(file.name)
                 raise
     except OSError as error:
-        warnings.warn(f"cannot keep the capture in {path}: {error}", stacklevel=3)
-    return capture
+        warnings.warn(f"cannot keep {path}: {error}", stacklevel=2)
+    return made
 
 
-def _cache_path(name: str, width: int, height: int) -> pathlib.Path:
-    here = pathlib.Path(__file__)
+@functools.cache
+def _sources_digest() -> str:
     digest = hashlib.sha256()
-    for source in (*_SOURCES, here.stem):
-        digest.update(here.with_name(f"{source}.py").read_bytes())
-    root = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
-    file = f"{name}-{width}x{height}-{digest.hexdigest()[:16]}.npz"
-    return pathlib.Path(root) / "jaxcloseup" / file
+    folder = pathlib.Path(__file__).parent
+    for pattern in _SOURCES:
+        for source in sorted(folder.glob(pattern)):
+            digest.update(source.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def _capture(name: str, width: int, height: int) -> dict[str, np.ndarray]:
     """All that is kept of a capture, from scratch."""
-    world, (_, rig) = _world(name), SCENES[name]()
+    world, rig = _world(name), SCENES[name]().rig
     rng = _rng(name, 0)
     far = plan_far(world.solids, rig, rng, NUM_TRAIN + NUM_FAR)
     held_out = np.arange(len(far)) % ((NUM_TRAIN + NUM_FAR) // NUM_FAR + 1) == 4
@@ -175,7 +188,7 @@ def _capture(name: str, width: int, height: int) -> dict[str, np.ndarray]:
     closeups = plan_closeups(world.solids, rig, train, rng, NUM_TEST)
 
     every = np.concatenate([train, test_far, closeups.poses])
-    depths = cast(world.solids, *grid_rays(every, 64, 36)).depth
+    depths = cast_rays(world.solids, *grid_rays(every, 64, 36)).depth
     capture = {
         "train_poses": train,
         "test_far_poses": test_far,
@@ -187,9 +200,12 @@ def _capture(name: str, width: int, height: int) -> dict[str, np.ndarray]:
     }
     for split in ("train", "test", "test_far"):
         cameras = _cameras(capture[f"{split}_poses"], width, height)
-        capture[f"{split}_rgb"] = np.stack(
-            [_photograph(world, camera_at(cameras, i)) for i in range(len(cameras.camtoworld))]
-        )
+        # Two views at a time: one alone keeps a single core busy.
+        with concurrent.futures.ThreadPoolExecutor(2) as pool:
+            each = [camera_at(cameras, i) for i in range(len(cameras.camtoworld))]
+            capture[f"{split}_rgb"] = np.stack(
+                list(pool.map(lambda camera: _photograph(world, camera), each))
+            )
     capture["points"], capture["colours"] = _sparse_points(
         world, train, capture["train_rgb"], _rng(name, 1)
     )
@@ -212,7 +228,7 @@ def _sparse_points(
     xy = np.stack([((x + 0.5) / width - 0.5) * WIDTH, ((y + 0.5) / height - 0.5) * HEIGHT], -1)
     in_camera = np.column_stack([xy / FOCAL, np.ones(count)])
     directions = np.einsum("pj,pij->pi", in_camera, poses[view, :, :3])
-    depth = cast(world.solids, poses[view, :, 3], directions).depth
+    depth = cast_rays(world.solids, poses[view, :, 3], directions).depth
     found = np.isfinite(depth)
     points = poses[view, :, 3] + np.where(found, depth, 0)[:, None] * directions
     return points[found].astype(np.float32), rgb[view, y, x][found].astype(np.float32) / 255
@@ -228,7 +244,7 @@ def _degrade(
     rgb = rgb + np.float32(noise) * rng.standard_normal(rgb.shape, np.float32)
     for pose in poses:
         turns = pose_noise * rng.normal(size=3)
-        pose[:, :3] = pose[:, :3] @ modelling.turn(*np.rad2deg(turns))
+        pose[:, :3] = pose[:, :3] @ turn(*np.rad2deg(turns))
         pose[:, 3] += pose_noise * rng.normal(size=3)
     return views.replace(
         cameras=views.cameras.replace(camtoworld=jnp.asarray(poses, jnp.float32)),

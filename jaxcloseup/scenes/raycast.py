@@ -7,11 +7,11 @@ into that frame, so bricks, slats, plates, ellipsoids and flower pots need no co
 A point on a solid has a *face* (an integer, counted through all solids) and a *chart* coordinate
 (two numbers in [0, 1]^2 on that face), which is where textures and baked light are looked up.
 
-Functions take one ray; batch them with `jax.vmap`, or `map_rays` where memory matters.
+`cast_ray` takes one ray, to be batched with `jax.vmap`; `cast_rays` serves host code.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import chex
 import jax
@@ -135,15 +135,37 @@ def in_pyramid(solids: Solids, apex: jax.Array, corners: jax.Array) -> jax.Array
     return jnp.all(towards + reach > -1e-5 * jnp.abs(towards), axis=0)
 
 
-def map_rays(fn: Callable[..., Any], *rays: jax.Array, chunk: int = 1 << 15) -> Any:
-    """`jax.vmap(fn)` over the leading axis of `rays`, at most `chunk` at a time."""
-    count = rays[0].shape[0]
-    chunk = min(chunk, count)
-    padding = -count % chunk
-    padded = [jnp.pad(r, [(0, padding)] + [(0, 0)] * (r.ndim - 1), mode="edge") for r in rays]
-    split = [r.reshape(-1, chunk, *r.shape[1:]) for r in padded]
-    out = jax.lax.map(lambda part: jax.vmap(fn)(*part), split)
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], out)
+def cast_rays(
+    solids: Solids,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    *,
+    wanted: np.ndarray | None = None,
+) -> Hit:
+    """First hits of many rays `[..., 3]` as NumPy arrays `[...]`, trying `wanted[N]` solids only.
+
+    Rays are cast 4096 at a time, whatever their number: one compilation answers every question.
+    """
+    shape = np.broadcast_shapes(origins.shape, directions.shape)[:-1]
+    count, chunk = int(np.prod(shape)), 4096
+    rays = [np.broadcast_to(r, (*shape, 3)).reshape(-1, 3) for r in (origins, directions)]
+    rays = [np.pad(r, [(0, -count % chunk), (0, 0)], mode="edge").astype(np.float32) for r in rays]
+    wanted = np.ones(solids.kind.shape, bool) if wanted is None else wanted
+    parts = [
+        jax.device_get(_cast(solids, wanted, *(r[i : i + chunk] for r in rays)))
+        for i in range(0, len(rays[0]), chunk)
+    ]
+    return jax.tree.map(
+        lambda *leaf: np.concatenate(leaf)[:count].reshape(*shape, *leaf[0].shape[1:]), *parts
+    )
+
+
+@jax.jit
+def _cast(solids: Solids, wanted: jax.Array, origins: jax.Array, directions: jax.Array) -> Hit:
+    kept = keep_solids(solids, wanted)
+    return jax.vmap(lambda origin, direction: cast_ray(kept, origin, direction))(
+        origins, directions
+    )
 
 
 def _apply(affine: jax.Array, x: jax.Array, y: jax.Array, z: jax.Array, w: float) -> list:

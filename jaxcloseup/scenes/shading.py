@@ -9,14 +9,14 @@ sample's footprint on the surface: far views resolve what they should, close-ups
 from collections.abc import Callable
 from typing import Any
 
-import chex
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_rays
-from jaxcloseup.scenes.raycast import Hit, Solids, cast_ray, in_pyramid, keep_solids, map_rays
+from jaxcloseup.scenes.raycast import Hit, Solids, cast_ray, in_pyramid, keep_solids
 from jaxcloseup.scenes.scene import Surface
 
 
@@ -75,33 +75,16 @@ class World:
     lamp: jax.Array
 
 
-@struct.dataclass
-class Lamps:
-    """What lights a scene: spherical lamps, and light from everywhere.
-
-    Attributes:
-      position: `[K, 3]` centres.
-      radius: `[K]` radii: the softness of shadows.
-      power: `[K, 3]` irradiance at one unit of distance.
-      ambient: `[3]` irradiance of an unoccluded point.
-      reach: `[]` distance over which an obstacle stops ambient light.
-    """
-
-    position: jax.Array
-    radius: jax.Array
-    power: jax.Array
-    ambient: jax.Array
-    reach: jax.Array
-
-
 def pack_pyramid(image: np.ndarray) -> np.ndarray:
     """A square texture `[S, S, 3]` in [0, 1] and its halvings, `[M]` uint32."""
+    image = np.clip(image, 0, 1).astype(np.float32)
     levels = []
-    for _ in range(LEVELS):
-        byte = np.round(np.clip(image, 0, 1) * 255).astype(np.uint32)
-        levels.append((byte[..., 0] | byte[..., 1] << 8 | byte[..., 2] << 16).ravel())
-        if len(image) > 1:
-            image = image.reshape(len(image) // 2, 2, -1, 2, 3).mean((1, 3))
+    for level in range(LEVELS):
+        side = TEXTURE_SIZE >> level
+        image = cv2.resize(image, (side, side), interpolation=cv2.INTER_AREA) if level else image
+        bytes_ = np.full((side, side, 4), 0, np.uint8)
+        bytes_[..., :3] = np.round(image * 255)
+        levels.append(bytes_.view(np.dtype("<u4")).ravel())
     return np.concatenate(levels)
 
 
@@ -111,49 +94,35 @@ def sample_texture(
     """Colour `[3]` of periodic pyramid `texels[texture]` at `uv[2]` repeats, between levels."""
     level = jnp.clip(level, 0, LEVELS - 1)
     fine = jnp.minimum(jnp.floor(level), LEVELS - 2).astype(jnp.int32)
-    uv = uv - jnp.floor(uv)
+    levels = fine + jnp.arange(2)
     blend = level - fine.astype(jnp.float32)
-    sharp, soft = (_bilinear(texels, texture, uv, fine + i) for i in range(2))
-    return (1 - blend) * sharp + blend * soft
+    size = TEXTURE_SIZE >> levels
+    first = (4 * (TEXTURE_SIZE**2 - size * size)) // 3  # texels in all finer levels
+    xy = (uv - jnp.floor(uv))[None] * size[:, None].astype(jnp.float32) - 0.5
+    corner, weight = _corners(xy)  # [2, 4, 2], [2, 4]
+    corner = corner & (size - 1)[:, None, None]
+    index = first[:, None] + corner[..., 1] * size[:, None] + corner[..., 0]
+    weight = weight * jnp.stack([1 - blend, blend])[:, None]
+    return jnp.sum(_unpack(texels[texture, index]) * weight[None], axis=(1, 2))
 
 
-def _bilinear(texels: jax.Array, texture: jax.Array, uv: jax.Array, level: jax.Array) -> jax.Array:
-    size = TEXTURE_SIZE >> level
-    first = (4 * (TEXTURE_SIZE**2 - size * size)) // 3  # entries in all finer levels
-    xy = uv * size.astype(jnp.float32) - 0.5
-    corner = jnp.floor(xy)
-    weight = xy - corner
-    corner = corner.astype(jnp.int32)
-
-    def texel(dx: int, dy: int) -> jax.Array:
-        x, y = (corner[0] + dx) & (size - 1), (corner[1] + dy) & (size - 1)
-        packed = texels[texture, first + y * size + x]
-        return _unpack(packed)
-
-    top = (1 - weight[0]) * texel(0, 0) + weight[0] * texel(1, 0)
-    bottom = (1 - weight[0]) * texel(0, 1) + weight[0] * texel(1, 1)
-    return (1 - weight[1]) * top + weight[1] * bottom
+def _corners(xy: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The four integer neighbours `[..., 4, 2]` of points `[..., 2]`, and bilinear weights."""
+    low = jnp.floor(xy)
+    part = (xy - low)[..., None, :]
+    far = jnp.array([[0, 0], [1, 0], [0, 1], [1, 1]]).reshape((1,) * (xy.ndim - 1) + (4, 2))
+    weight = jnp.where(far == 1, part, 1 - part).prod(-1)
+    return low.astype(jnp.int32)[..., None, :] + far, weight
 
 
 def sample_light(light: jax.Array, faces: Faces, hit: Hit) -> jax.Array:
     """Baked light `[C]` at a hit, bilinear in the tile of its face."""
     first, width, height = faces.tile[hit.face]
-    xy = hit.chart * jnp.stack([width, height]).astype(jnp.float32) - 0.5
-    corner = jnp.floor(xy)
-    weight = xy - corner
-    corner = corner.astype(jnp.int32)
-
-    def entry(dx: int, dy: int) -> jax.Array:
-        x = jnp.where(
-            faces.wraps[hit.face] > 0,
-            (corner[0] + dx) % width,
-            jnp.clip(corner[0] + dx, 0, width - 1),
-        )
-        return light[first + jnp.clip(corner[1] + dy, 0, height - 1) * width + x]
-
-    top = (1 - weight[0]) * entry(0, 0) + weight[0] * entry(1, 0)
-    bottom = (1 - weight[0]) * entry(0, 1) + weight[0] * entry(1, 1)
-    return (1 - weight[1]) * top + weight[1] * bottom
+    corner, weight = _corners(hit.chart * jnp.stack([width, height]).astype(jnp.float32) - 0.5)
+    x, y = corner.T
+    x = jnp.where(faces.wraps[hit.face] > 0, x % width, jnp.clip(x, 0, width - 1))
+    entries = light[first + jnp.clip(y, 0, height - 1) * width + x]
+    return jnp.sum(entries * weight[:, None], axis=0)
 
 
 def surface_colour(world: World, hit: Hit, footprint: jax.Array) -> jax.Array:
@@ -250,70 +219,15 @@ def lattice(count: int) -> jax.Array:
     return jnp.asarray(xy - xy.mean(0), jnp.float32)
 
 
-def bake_light(
-    world: World, lamps: Lamps, positions: jax.Array, normals: jax.Array, *, samples: int = 48
-) -> jax.Array:
-    """Light `[L, 4]` arriving at `positions[L, 3]`, not yet encoded: lamps, ambient, one bounce.
-
-    The last channel is the visible part of the first lamp. Rays leave from just above the surface.
-    """
-    chex.assert_equal_shape([positions, normals])
-    starts = positions + 5e-4 * normals
-    turns = jnp.asarray(np.random.default_rng(0).uniform(size=(len(positions), 2)), jnp.float32)
-
-    def direct(start: jax.Array, normal: jax.Array, turn: jax.Array) -> jax.Array:
-        def lamp(position: jax.Array, radius: jax.Array, power: jax.Array) -> jax.Array:
-            def one(i: jax.Array, total: jax.Array) -> jax.Array:
-                to_lamp = position + radius * _on_sphere(_point(i, samples // 2, turn)) - start
-                hit = cast_ray(world.solids, start, to_lamp)
-                blocked = (hit.depth < 1) & (world.faces.emission[hit.face] == 0)
-                return total + jnp.where(blocked, 0.0, 1.0)
-
-            visible = jax.lax.fori_loop(0, samples // 2, one, jnp.float32(0)) / (samples // 2)
-            away = position - start
-            squared = jnp.sum(away * away)
-            cosine = jnp.maximum(jnp.sum(away * normal), 0) / jnp.sqrt(squared)
-            return jnp.append(power * (visible * cosine / squared), visible)
-
-        each = jax.vmap(lamp)(lamps.position, lamps.radius, lamps.power)
-        return jnp.append(each[:, :3].sum(0), each[0, 3])
-
-    first = map_rays(direct, starts, normals, turns)
-    mean_colours = _unpack(world.texels[:, -1]).T
-    albedo = (world.faces.tint * mean_colours[world.faces.texture]) ** (1 / GAMMA)
-
-    def gather(start: jax.Array, normal: jax.Array, turn: jax.Array) -> jax.Array:
-        def one(i: jax.Array, total: jax.Array) -> jax.Array:
-            direction = _unit(normal + 0.999 * _on_sphere(_point(i, samples, turn)))
-            hit = cast_ray(world.solids, start, direction)
-            ambient = lamps.ambient * (1 - jnp.exp(-hit.depth / lamps.reach))
-            bounce = albedo[hit.face] * sample_light(first, world.faces, hit)[:3]
-            # What shines by itself is seen as it is drawn; the rest returns lamp light.
-            glow = albedo[hit.face] * lamps.ambient
-            return total + jnp.where(world.faces.emission[hit.face] > 0, glow, ambient + bounce)
-
-        return jax.lax.fori_loop(0, samples, one, jnp.zeros(3)) / samples
-
-    return first.at[:, :3].add(map_rays(gather, starts, normals, turns))
+def mean_colours(texels: jax.Array) -> np.ndarray:
+    """Mean colour `[K, 3]` of each pyramid."""
+    return np.asarray(_unpack(texels[:, -1])).T
 
 
 def _unpack(packed: jax.Array) -> jax.Array:
     """RGB `[3, ...]` in [0, 1] of packed bytes."""
     rgb = [(packed >> shift) & 255 for shift in (0, 8, 16)]
     return jnp.stack(rgb).astype(jnp.float32) / 255
-
-
-def _point(i: jax.Array, count: int, turn: jax.Array) -> jax.Array:
-    """The i-th of `count` well-spread points of the unit square, shifted round by `turn[2]`."""
-    i = i.astype(jnp.float32)
-    point = jnp.stack([(i + 0.5) / count, i * 0.618034]) + turn
-    return point - jnp.floor(point)
-
-
-def _on_sphere(square: jax.Array) -> jax.Array:
-    z, angle = 2 * square[0] - 1, 2 * jnp.pi * square[1]
-    r = jnp.sqrt(jnp.maximum(1 - z * z, 0))
-    return jnp.stack([r * jnp.cos(angle), r * jnp.sin(angle), z])
 
 
 def _unit(v: jax.Array) -> jax.Array:

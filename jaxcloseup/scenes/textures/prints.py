@@ -1,7 +1,6 @@
 """Printed matter: textures with letters, from headlines down to small print of a few texels.
 
-Like `materials`, squares `[1024, 1024, 3]` in [0, 1]; a sheet that is not square is drawn in its own
-proportions and squeezed, so that letters look right on the face that carries it.
+Each function draws a sheet, uint8 and 1024 wide, in its own proportions.
 """
 
 from collections.abc import Callable
@@ -9,126 +8,36 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from jaxcloseup.scenes.materials import SIZE
-
-
-SERIF, SANS, BOLD, SCRIPT = (
-    cv2.FONT_HERSHEY_COMPLEX,
-    cv2.FONT_HERSHEY_SIMPLEX,
-    cv2.FONT_HERSHEY_TRIPLEX,
-    cv2.FONT_HERSHEY_SCRIPT_COMPLEX,
-)
-INK, RED, BLUE, GREEN, GOLD, CREAM, WHITE = (
-    (35, 32, 30), (176, 40, 34), (34, 66, 130), (42, 98, 58), (204, 152, 50), (244, 236, 216),
-    (250, 249, 246),
-)  # fmt: skip
-_WORDS = (
-    "the lamp stood near a window and its light fell over brick and oak while rain went on in the "
-    "yard a kettle began to sing so we cut bread and set plates along the table nobody had measured "
-    "how far the stairs were worn but every step kept the print of a shoe and the rail was smooth "
-    "look closer said the painter and you will find grain inside the grain small letters under large "
-    "ones and threads that cross where you only saw a colour"
-).split()
-
-
-def write(
-    image: np.ndarray, text: str, at: tuple, height: float, colour: tuple = INK, *,
-    font: int = SERIF, weight: int = 1, centred: bool = False,
-) -> None:  # fmt: skip
-    """Write `text` with its baseline at `at`, capitals `height` pixels tall, into a uint8 image."""
-    scale = height / cv2.getTextSize("H", font, 1, 1)[0][1]
-    x = at[0] - cv2.getTextSize(text, font, scale, weight)[0][0] / 2 if centred else at[0]
-    cv2.putText(image, text, (int(x), int(at[1])), font, scale, colour, weight, cv2.LINE_AA)
-
-
-def paragraph(
-    image: np.ndarray, box: tuple, height: float, rng: np.random.Generator, colour: tuple = INK
-) -> None:
-    """Fill `box` = (left, top, right, bottom) with running text."""
-    left, top, right, bottom = box
-    scale = height / cv2.getTextSize("H", SERIF, 1, 1)[0][1]
-    word = int(rng.integers(len(_WORDS)))
-    for y in np.arange(top + height, bottom, 1.75 * height):
-        line = ""
-        while True:
-            longer = f"{line} {_WORDS[word % len(_WORDS)]}".strip()
-            if cv2.getTextSize(longer, SERIF, scale, 1)[0][0] > right - left:
-                break
-            line, word = longer, word + 1
-        write(image, line, (left, y), height, colour)
-
-
-def _sheet(colour: tuple, aspect: float = 1.0) -> np.ndarray:
-    """An empty sheet, `aspect` times as tall as wide."""
-    return np.full((round(SIZE * aspect), SIZE, 3), colour, np.uint8)
-
-
-def _bars(image: np.ndarray, box: tuple, colour: tuple) -> None:
-    cv2.rectangle(image, tuple(map(int, box[:2])), tuple(map(int, box[2:])), colour, -1)
-
-
-def _landscape(image: np.ndarray, box: tuple, tones: tuple, rng: np.random.Generator) -> None:
-    """Hills under a sun, layer before layer."""
-    left, top, right, bottom = map(int, box)
-    view = image[top:bottom, left:right]
-    height, width = view.shape[:2]
-    view[:] = tones[0]
-    cv2.circle(view, (int(0.7 * width), int(0.3 * height)), height // 7, tones[1], -1, cv2.LINE_AA)
-    x = np.arange(width)
-    for i, tone in enumerate(tones[2:]):
-        waves = sum(
-            np.sin(x / width * 2 * np.pi * f + rng.uniform(0, 6)) / f for f in (0.7, 1.6, 3.3, 7.0)
-        )
-        level = height * (0.42 + 0.6 * i / len(tones[2:]) - 0.08 * waves)
-        hill = np.concatenate([np.stack([x, level], 1), [[width, height], [0, height]]])
-        cv2.fillPoly(view, [np.round(hill * 16).astype(np.int32)], tone, cv2.LINE_AA, 4)
-        for at in rng.integers(0, width, 14):
-            foot, tall = (int(at), int(level[at]) + 6), int(height * 0.012 * (i + 2))
-            crown = np.int32(
-                [
-                    [foot[0], foot[1] - 3 * tall],
-                    [foot[0] - tall, foot[1]],
-                    [foot[0] + tall, foot[1]],
-                ]
-            )
-            cv2.fillPoly(view, [crown], [int(0.72 * c) for c in tone], cv2.LINE_AA)
-    cv2.rectangle(image, (left, top), (right, bottom), INK, 2, cv2.LINE_AA)
-
-
-_DUSK = (
-    (238, 206, 160),
-    (214, 92, 52),
-    (170, 140, 140),
-    (110, 112, 124),
-    (70, 84, 92),
-    (40, 54, 58),
-)
-_DAY = (
-    (176, 208, 226),
-    (248, 226, 140),
-    (140, 172, 150),
-    (98, 140, 96),
-    (64, 104, 66),
-    (40, 70, 48),
-)
-_GREY = (
-    (206, 204, 198),
-    (240, 238, 232),
-    (150, 148, 144),
-    (112, 110, 106),
-    (76, 74, 72),
-    (44, 43, 42),
+from jaxcloseup.scenes.textures.lettering import (
+    BLUE,
+    BOLD,
+    CREAM,
+    DAY,
+    DUSK,
+    GOLD,
+    GREEN,
+    GREY,
+    INK,
+    RED,
+    SCRIPT,
+    SERIF,
+    WHITE,
+    bar,
+    blank,
+    landscape,
+    paragraph,
+    write,
 )
 
 
 def _newspaper(rng: np.random.Generator) -> np.ndarray:
-    page = _sheet((231, 226, 212), 1.4)
+    page = blank((231, 226, 212), 1.4)
     write(page, "The Evening Observer", (512, 105), 62, weight=4, font=BOLD, centred=True)
     write(page, "No. 4,812    CITY EDITION    PRICE TWO PENCE", (512, 145), 14, centred=True)
-    _bars(page, (40, 158, 984, 161), INK)
+    bar(page, (40, 158, 984, 161), INK)
     write(page, "A CLOSER LOOK", (512, 245), 58, weight=5, font=BOLD, centred=True)
     write(page, "what the far camera never saw", (512, 290), 22, centred=True)
-    _landscape(page, (275, 320, 748, 640), _GREY, rng)
+    landscape(page, (275, 320, 748, 640), GREY, rng)
     write(page, "The valley at noon, seen from the bridge.", (280, 660), 10)
     for column in range(4):
         left = 42 + column * 238
@@ -137,14 +46,14 @@ def _newspaper(rng: np.random.Generator) -> np.ndarray:
         write(page, ("LETTERS", "WEATHER", "TRADE", "CHESS")[column], (left, 975), 20, font=BOLD)
         paragraph(page, (left, 995, left + 222, 1395), 9, rng)
         if column:
-            _bars(page, (left - 9, 320 if column == 3 else 690, left - 8, 1395), (120, 116, 110))
+            bar(page, (left - 9, 320 if column == 3 else 690, left - 8, 1395), (120, 116, 110))
     return page
 
 
 def _recipe(rng: np.random.Generator) -> np.ndarray:
-    page = _sheet(CREAM, 1.35)
+    page = blank(CREAM, 1.35)
     write(page, "Country Bread", (512, 120), 58, RED, font=SCRIPT, weight=4, centred=True)
-    _landscape(page, (90, 170, 934, 520), _DAY, rng)
+    landscape(page, (90, 170, 934, 520), DAY, rng)
     items = ("500 g flour", "350 ml water", "10 g salt", "7 g yeast", "1 tsp honey", "2 tbsp oil")
     write(page, "You need", (90, 590), 26, GREEN, font=BOLD)
     for i, item in enumerate(items):
@@ -160,7 +69,7 @@ def _recipe(rng: np.random.Generator) -> np.ndarray:
 
 
 def _cereal(rng: np.random.Generator) -> np.ndarray:
-    box = _sheet((222, 150, 36), 1.45)
+    box = blank((222, 150, 36), 1.45)
     for i in range(24):
         ray = [
             [512, 640],
@@ -170,7 +79,7 @@ def _cereal(rng: np.random.Generator) -> np.ndarray:
             ],
         ]
         cv2.fillPoly(box, [np.int32(ray)], (234, 172, 60), cv2.LINE_AA)
-    _bars(box, (60, 90, 964, 400), (150, 30, 34))
+    bar(box, (60, 90, 964, 400), (150, 30, 34))
     write(box, "GOLDEN", (512, 230), 105, WHITE, font=BOLD, weight=12, centred=True)
     write(box, "OAT HOOPS", (512, 365), 88, (250, 214, 90), font=BOLD, weight=10, centred=True)
     write(box, "crisp whole grain cereal with honey", (512, 455), 24, INK, weight=2, centred=True)
@@ -182,7 +91,7 @@ def _cereal(rng: np.random.Generator) -> np.ndarray:
         at = (int(512 + 300 * r * np.cos(angle)), int(835 + 72 * r * np.sin(angle) - 30 * (1 - r)))
         cv2.circle(box, at, 17, (142, 90, 24), 11, cv2.LINE_AA)
         cv2.circle(box, at, 17, (206, 150, 62), 6, cv2.LINE_AA)
-    _bars(box, (640, 1160, 970, 1450), WHITE)
+    bar(box, (640, 1160, 970, 1450), WHITE)
     write(box, "Nutrition per 100 g", (652, 1190), 14, weight=2)
     facts = (
         "Energy 1590 kJ",
@@ -193,7 +102,7 @@ def _cereal(rng: np.random.Generator) -> np.ndarray:
         "Salt 0.6 g",
     )
     for i, fact in enumerate(facts):
-        _bars(box, (650, 1204 + 38 * i, 960, 1205 + 38 * i), INK)
+        bar(box, (650, 1204 + 38 * i, 960, 1205 + 38 * i), INK)
         write(box, fact, (655, 1232 + 38 * i), 13)
     write(box, "500 g e", (70, 1420), 44, INK, font=BOLD, weight=3)
     paragraph(box, (70, 1180, 600, 1340), 10, rng)
@@ -202,7 +111,7 @@ def _cereal(rng: np.random.Generator) -> np.ndarray:
 
 def _labels(rng: np.random.Generator) -> np.ndarray:
     """Four labels, one in each quarter, for tins, jars and bottles."""
-    sheet = _sheet(WHITE)
+    sheet = blank(WHITE)
     designs = (
         (RED, "TOMATOES", "peeled plum", (205, 52, 40)),
         (GREEN, "GARDEN PEAS", "in water", (96, 150, 60)),
@@ -210,9 +119,9 @@ def _labels(rng: np.random.Generator) -> np.ndarray:
         ((196, 120, 30), "Honey", "wild flower", (236, 176, 50)),
     )
     for i, (colour, name, kind, fruit) in enumerate(designs):
-        part = _sheet(CREAM if i > 1 else WHITE)
-        _bars(part, (0, 0, 1024, 150), colour)
-        _bars(part, (0, 900, 1024, 1024), colour)
+        part = blank(CREAM if i > 1 else WHITE)
+        bar(part, (0, 0, 1024, 150), colour)
+        bar(part, (0, 900, 1024, 1024), colour)
         for x in range(0, 1024, 64):
             cv2.circle(part, (x + 32, 150), 32, colour, -1, cv2.LINE_AA)
         for side in (256, 768):
@@ -265,14 +174,14 @@ def _spines(rng: np.random.Generator) -> np.ndarray:
         (176, 96, 40),
         (206, 196, 170),
     )
-    sheet = np.zeros((SIZE, SIZE, 3), np.uint8)
+    sheet = blank(INK)
     for i, (title, colour) in enumerate(zip(titles, colours, strict=True)):
-        spine = np.full((128, SIZE, 3), colour, np.uint8)
+        spine = blank(colour, 0.125)
         ink = INK if sum(colour) > 450 else (236, 208, 140)
         write(spine, title, (100, 84), 40, ink, font=BOLD if i % 2 else SERIF, weight=3)
         write(spine, ("H. Marlow", "A. Quill", "R. Stone", "E. Vane")[i % 4], (790, 76), 20, ink)
         for x in (40, 56, 950, 966):
-            _bars(spine, (x, 0, x + 4, 128), ink)
+            bar(spine, (x, 0, x + 4, 128), ink)
         noise = rng.normal(0, 5, spine.shape[:2])[..., None]
         spine = np.clip(spine + noise, 0, 255).astype(np.uint8)
         sheet[:, 128 * i : 128 * (i + 1)] = np.rot90(spine, -1)
@@ -281,7 +190,7 @@ def _spines(rng: np.random.Generator) -> np.ndarray:
 
 def _map(rng: np.random.Generator) -> np.ndarray:
     """A town map with named streets."""
-    sheet = _sheet((236, 230, 208), 0.75)
+    sheet = blank((236, 230, 208), 0.75)
     x = np.arange(-20, 1060, 10)
     river = np.stack([x, 420 + 90 * np.sin(x / 170) + 30 * np.sin(x / 60)], 1).astype(np.int32)
     for i in range(260):
@@ -289,7 +198,7 @@ def _map(rng: np.random.Generator) -> np.ndarray:
         if abs(at[1] - np.interp(at[0], river[:, 0], river[:, 1])) > 55:
             size = rng.integers(8, 26, 2)
             tone = [(214, 190, 160), (200, 208, 170), (222, 204, 186)][i % 3]
-            _bars(sheet, (*at, *(at + size)), tone)
+            bar(sheet, (*at, *(at + size)), tone)
             cv2.rectangle(sheet, at.tolist(), (at + size).tolist(), (150, 130, 110), 1, cv2.LINE_AA)
     cv2.polylines(sheet, [river], False, (120, 166, 196), 56, cv2.LINE_AA)
     names = ("Mill Lane", "High Street", "Station Road", "Abbey Walk", "Castle Hill", "Orchard Way")
@@ -309,14 +218,14 @@ def _map(rng: np.random.Generator) -> np.ndarray:
     ):
         cv2.circle(sheet, (at[0] - 12, at[1] - 6), 6, RED, -1, cv2.LINE_AA)
         write(sheet, text, at, 15, RED, font=BOLD)
-    _bars(sheet, (0, 0, 1024, 76), BLUE)
+    bar(sheet, (0, 0, 1024, 76), BLUE)
     write(sheet, "PLAN OF THE OLD TOWN", (512, 54), 34, CREAM, font=BOLD, weight=3, centred=True)
     return sheet
 
 
 def _chart(rng: np.random.Generator) -> np.ndarray:
     """An optician's chart: rows of letters, each smaller than the one above."""
-    sheet = _sheet(WHITE, 1.4)
+    sheet = blank(WHITE, 1.4)
     y, height = 0.0, 150.0
     while height > 5:
         y += 1.9 * height if y else 1.35 * height
@@ -338,8 +247,8 @@ def _chart(rng: np.random.Generator) -> np.ndarray:
 
 def _picture(tones: tuple, title: str) -> Callable[[np.random.Generator], np.ndarray]:
     def draw(rng: np.random.Generator) -> np.ndarray:
-        sheet = _sheet(WHITE, 1.25)
-        _landscape(sheet, (90, 90, 934, 1060), tones, rng)
+        sheet = blank(WHITE, 1.25)
+        landscape(sheet, (90, 90, 934, 1060), tones, rng)
         write(sheet, title, (512, 1150), 34, INK, font=SCRIPT, weight=2, centred=True)
         write(sheet, "lithograph, 12 / 80", (512, 1200), 13, (110, 106, 100), centred=True)
         return sheet
@@ -348,7 +257,7 @@ def _picture(tones: tuple, title: str) -> Callable[[np.random.Generator], np.nda
 
 
 def _plaque(rng: np.random.Generator) -> np.ndarray:
-    sheet = _sheet((186, 150, 78), 0.45)
+    sheet = blank((186, 150, 78), 0.45)
     cv2.rectangle(sheet, (18, 18), (1005, 442), (92, 68, 30), 5, cv2.LINE_AA)
     write(sheet, "IN MEMORY OF", (512, 98), 26, (60, 42, 18), weight=2, centred=True)
     write(sheet, "EDITH MARLOW", (512, 190), 58, (60, 42, 18), font=BOLD, weight=4, centred=True)
@@ -371,7 +280,7 @@ def _plaque(rng: np.random.Generator) -> np.ndarray:
 
 
 def _doormat(rng: np.random.Generator) -> np.ndarray:
-    sheet = _sheet((150, 112, 68), 0.6)
+    sheet = blank((150, 112, 68), 0.6)
     cv2.rectangle(sheet, (40, 40), (984, 574), (50, 36, 24), 14, cv2.LINE_AA)
     write(sheet, "WELCOME", (512, 350), 120, (50, 36, 24), font=BOLD, weight=22, centred=True)
     write(sheet, "mind the step", (512, 470), 44, (50, 36, 24), font=SCRIPT, weight=6, centred=True)
@@ -379,7 +288,7 @@ def _doormat(rng: np.random.Generator) -> np.ndarray:
 
 
 def _menu(rng: np.random.Generator) -> np.ndarray:
-    sheet = _sheet(CREAM, 1.4)
+    sheet = blank(CREAM, 1.4)
     cv2.rectangle(sheet, (40, 40), (984, 1394), GOLD, 6, cv2.LINE_AA)
     cv2.rectangle(sheet, (58, 58), (966, 1376), GOLD, 2, cv2.LINE_AA)
     write(sheet, "Menu", (512, 210), 90, BLUE, font=SCRIPT, weight=6, centred=True)
@@ -405,8 +314,8 @@ def _menu(rng: np.random.Generator) -> np.ndarray:
 
 
 def _plate(rng: np.random.Generator) -> np.ndarray:
-    """Glazed china seen from above: rim bands, a ring of leaves, a bird-less sprig in the middle."""
-    sheet = _sheet((240, 239, 234))
+    """Glazed china seen from above: rim bands, a ring of leaves, a flower."""
+    sheet = blank((240, 239, 234))
     for radius, width, colour in (
         (505, 10, BLUE),
         (480, 3, BLUE),
@@ -455,7 +364,7 @@ def _plate(rng: np.random.Generator) -> np.ndarray:
 
 
 def _clock(rng: np.random.Generator) -> np.ndarray:
-    sheet = _sheet(CREAM)
+    sheet = blank(CREAM)
     cv2.circle(sheet, (512, 512), 500, (60, 44, 32), 22, cv2.LINE_AA)
     for i in range(60):
         direction = np.array([np.sin(i * np.pi / 30), -np.cos(i * np.pi / 30)])
@@ -491,14 +400,7 @@ def _clock(rng: np.random.Generator) -> np.ndarray:
 
 PRINTS: dict[str, Callable[[np.random.Generator], np.ndarray]] = {
     "newspaper": _newspaper, "recipe": _recipe, "cereal": _cereal, "labels": _labels,
-    "spines": _spines, "map": _map, "chart": _chart, "dusk": _picture(_DUSK, "The Valley at Dusk"),
-    "day": _picture(_DAY, "Early Summer"), "grey": _picture(_GREY, "Winter, from the Pass"),
+    "spines": _spines, "map": _map, "chart": _chart, "dusk": _picture(DUSK, "The Valley at Dusk"),
+    "day": _picture(DAY, "Early Summer"), "grey": _picture(GREY, "Winter, from the Pass"),
     "plaque": _plaque, "doormat": _doormat, "menu": _menu, "plate": _plate, "clock": _clock,
 }  # fmt: skip
-
-
-def printed(name: str) -> np.ndarray:
-    """Colour texture `[S, S, 3]` in [0, 1] of a printed sheet."""
-    sheet = PRINTS[name](np.random.default_rng(sum(map(ord, name))))
-    square = cv2.resize(sheet, (SIZE, SIZE), interpolation=cv2.INTER_AREA)
-    return square.astype(np.float32) / 255

@@ -1,0 +1,149 @@
+"""Baked light: soft shadows of lamps, ambient occlusion and one bounce, for every face's tile.
+
+Host code in NumPy around `cast_rays`. Entries of light are taken in blocks of neighbours, each with
+only the solids that matter to it, and blocks in threads.
+"""
+
+import concurrent.futures
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxcloseup.scenes.raycast import Hit, Solids, cast_rays
+from jaxcloseup.scenes.shading import GAMMA, World, mean_colours, sample_light
+
+
+_BLOCK, _SAMPLES = 256, 16
+_ROUNDS = 2  # times _SAMPLES directions around each entry
+
+
+class Lamp(NamedTuple):
+    """A spherical lamp: `power` is the irradiance at one metre."""
+
+    position: tuple[float, float, float]
+    radius: float
+    power: tuple[float, float, float]
+
+
+class Ambience(NamedTuple):
+    """Light from everywhere.
+
+    Attributes:
+      irradiance: what an unoccluded point receives.
+      reach: metres over which an obstacle stops it.
+    """
+
+    irradiance: tuple[float, float, float]
+    reach: float
+
+
+def bake_light(
+    world: World, lamps: list[Lamp], ambience: Ambience, positions: np.ndarray, normals: np.ndarray
+) -> np.ndarray:
+    """Light `[L, 4]` at surface points `positions[L, 3]`, encoded as images are.
+
+    The last channel is the visible part of the first lamp, not encoded. Neighbours in the list
+    should be neighbours in space.
+    """
+    starts = positions + 5e-4 * normals  # just above the surface
+    turns = np.random.default_rng(0).uniform(size=(len(starts), 1, 2))
+    shines = np.asarray(world.faces.emission) > 0
+    light = np.zeros((len(starts), 4), np.float32)
+
+    for number, lamp in enumerate(lamps):
+        ends = lamp.position + lamp.radius * _on_sphere(_spread(_SAMPLES, turns))
+        hits = _cast_blocks(
+            world.solids, starts, normals, ends - starts[:, None], lamp.position, lamp.radius
+        )
+        visible = np.mean((hits.depth >= 1) | shines[hits.face], axis=1)
+        away = np.array(lamp.position) - starts
+        squared = np.sum(away**2, axis=-1)
+        cosine = np.maximum(np.sum(away * normals, axis=-1), 0) / np.sqrt(squared)
+        light[:, :3] += (visible * cosine / squared)[:, None] * np.array(lamp.power)
+        if number == 0:
+            light[:, 3] = visible
+
+    albedo = np.asarray(world.faces.tint) * mean_colours(world.texels)[world.faces.texture]
+    albedo **= 1 / GAMMA
+    irradiance, around = np.array(ambience.irradiance), np.zeros((len(starts), 3))
+    for number in range(_ROUNDS):
+        square = _spread(_SAMPLES, turns, number / _ROUNDS / _SAMPLES)
+        directions = normals[:, None] + 0.999 * _on_sphere(square)
+        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+        hits = _cast_blocks(world.solids, starts, normals, directions, None, 3 * ambience.reach)
+        # What shines by itself is as bright as it looks; the rest returns lamp light.
+        returned = np.asarray(_look_up(light, world, hits))[..., :3]
+        returned = np.where(np.isfinite(hits.depth)[..., None], returned, 0) * albedo[hits.face]
+        returned += irradiance * (1 - np.exp(-hits.depth / ambience.reach))[..., None]
+        glow = albedo[hits.face] * irradiance
+        around += np.mean(np.where(shines[hits.face][..., None], glow, returned), 1) / _ROUNDS
+
+    light[:, :3] += around
+    light = _smooth(light, world)
+    light[:, :3] **= GAMMA
+    return light
+
+
+@jax.jit
+def _look_up(light: jax.Array, world: World, hits: Hit) -> jax.Array:
+    return jax.vmap(jax.vmap(lambda hit: sample_light(light, world.faces, hit)))(hits)
+
+
+def _cast_blocks(
+    solids: Solids, starts: np.ndarray, normals: np.ndarray, directions: np.ndarray,
+    end: tuple | None, radius: float,
+) -> Hit:  # fmt: skip
+    """Hits `[L, S]` of rays `directions[L, S, 3]`, towards a ball at `end` or all around."""
+
+    def block(first: int) -> Hit:
+        part = slice(first, first + _BLOCK)
+        goal = starts[part].mean(0) if end is None else np.array(end)
+        wanted = _within(solids, starts[part], normals[part], goal, radius)
+        return cast_rays(solids, starts[part, None], directions[part], wanted=wanted)
+
+    with concurrent.futures.ThreadPoolExecutor() as pool:
+        hits = list(pool.map(block, range(0, len(starts), _BLOCK)))
+    return Hit(*(np.concatenate(leaf) for leaf in zip(*hits, strict=True)))
+
+
+def _within(
+    solids: Solids, points: np.ndarray, normals: np.ndarray, end: np.ndarray, radius: float
+) -> np.ndarray:
+    """Which solids `[N]` are above a block's horizon and near the way from it to a ball."""
+    start = points.mean(0)
+    radius = max(radius, np.linalg.norm(points - start, axis=-1).max())
+    half, centre = np.asarray(solids.bound)[..., :3], np.asarray(solids.bound)[..., 3]
+    way = end - start
+    along = np.clip((centre - start) @ way / max(way @ way, 1e-9), 0, 1)
+    away = np.linalg.norm(centre - start - along[:, None] * way, axis=-1)
+    size = np.linalg.norm(half, axis=(1, 2))
+    height = normals @ centre.T - np.sum(normals * points, axis=-1, keepdims=True)
+    return (away < radius + size) & (height.max(0) + size > 0)
+
+
+def _smooth(light: np.ndarray, world: World) -> np.ndarray:
+    """Binomial smoothing within each tile, for the noise of few rays."""
+    light = light.copy()
+    tiles = np.column_stack([world.faces.tile, np.asarray(world.faces.wraps, np.int32)])
+    for start, width, height, wraps in np.unique(tiles, axis=0):
+        tile = light[start : start + width * height].reshape(height, width, 4)
+        for axis, mode in ((1, "wrap" if wraps else "edge"), (0, "edge")):
+            padding = [(1, 1) if i == axis else (0, 0) for i in range(3)]
+            padded = np.moveaxis(np.pad(tile, padding, mode=mode), axis, 0)
+            tile = np.moveaxis((padded[:-2] + 2 * padded[1:-1] + padded[2:]) / 4, 0, axis)
+        light[start : start + width * height] = tile.reshape(-1, 4)
+    return light
+
+
+def _spread(count: int, turns: np.ndarray, offset: float = 0.0) -> np.ndarray:
+    """`[L, count, 2]` well-spread points of the unit square, shifted round by `turns[L, 1, 2]`."""
+    i = np.arange(count)
+    lattice = np.stack([(i + 0.5) / count + offset, i * 0.618034 + 7 * offset], -1)
+    return (lattice + turns) % 1
+
+
+def _on_sphere(square: np.ndarray) -> np.ndarray:
+    z, angle = 2 * square[..., 0] - 1, 2 * np.pi * square[..., 1]
+    r = np.sqrt(np.maximum(1 - z * z, 0))
+    return np.stack([r * np.cos(angle), r * np.sin(angle), z], -1)
