@@ -300,7 +300,11 @@ def _composite_backward(config, residuals, cotangents):
     # About the middle of a tile, where sums over its pixels keep most digits.
     middle = config.tile / 2
     basis = jnp.stack([jnp.ones_like(x), x - middle, y - middle], axis=1)
-    moments = lambda values: jnp.einsum("kbp,pm->mkb", values, basis, precision=_EXACT)  # noqa: E731
+
+    def moments(values):
+        sums = jnp.einsum("kbp,pm->kbm", values, basis, precision=_EXACT)
+        return jnp.moveaxis(sums, -1, 0)
+
     cotangents = tuple(bar[lists.tile] for bar in cotangents)
 
     def recede(carry, splat):
