@@ -83,7 +83,9 @@ def score(rendering: Rendering, target: Target) -> dict[str, float | str | None]
     for least in SEEN_BY:
         values |= {
             f"{key}_seen{least}": value
-            for key, value in _masked_metrics(image, truth, np.where(seen >= least, weight, 0)).items()
+            for key, value in _masked_metrics(
+                image, truth, np.where(seen >= least, weight, 0)
+            ).items()
         }
     if target.depth is not None:
         values |= _depth_error(rendering.depth, target.depth)

@@ -32,8 +32,11 @@ def comparisons(
     targets: Mapping[str, Sequence[Target]],
     renderings: Mapping[tuple[str, str], Mapping[str, Rendering]],
 ) -> list[Picture]:
-    """Write `<name>.png`: truth, every stage, error of the last; returns them for the report."""
-    pictures = []
+    """Write `<name>.png`: truth, every stage, error of the last; returns them for the report.
+
+    A name that an earlier split has taken is prefixed with its split.
+    """
+    pictures, written = [], set()
     for split, views in targets.items():
         stages = [stage for stage, of_split in renderings if of_split == split]
         for target in views:
@@ -42,10 +45,19 @@ def comparisons(
             error = colorize_error(np.abs(images[-1] - truth).mean(axis=-1))
             panels = [truth, *images, error]
             labels = ["truth", *stages, f"error of {stages[-1]}"]
-            image = side_by_side(panels, labels=labels)
-            write_png(folder / f"{split}_{target.name}.png", image)
+            image = side_by_side(map(enlarge, panels), labels=labels)
+            name = f"{split}_{target.name}" if target.name in written else target.name
+            written.add(name)
+            write_png(folder / f"{name}.png", image)
             pictures.append(Picture(SPLIT_TITLES[split], target.name, image))
     return pictures
+
+
+def enlarge(image: np.ndarray | jax.Array) -> np.ndarray:
+    """A small image with its pixels repeated, to be at least 240 wide."""
+    image = np.asarray(image)
+    factor = -(-240 // image.shape[1])
+    return image.repeat(factor, axis=0).repeat(factor, axis=1)
 
 
 def label_pictures(
@@ -81,7 +93,7 @@ def label_pictures(
         panels["rendered depth"] = colorize_depth(depth, near=scene.near, far=scene.far)
         if truth is not None:
             panels["truth"] = np.asarray(truth)
-        image = side_by_side([np.asarray(p) for p in panels.values()], labels=list(panels))
+        image = side_by_side(map(enlarge, panels.values()), labels=list(panels))
         write_png(folder / f"{name}.png", image)
         source = scene.names["train"][int(index)]
         pictures.append(Picture("Pseudo-labels", f"{name}, from {source}", image))

@@ -27,7 +27,14 @@ from experiments.audit import audit_labels
 from experiments.evaluation import evaluate, exact_depths, make_targets
 from experiments.loop import make_runner, run_stage
 from experiments.pictures import comparisons, label_pictures, write_renders
-from experiments.presets import PRESETS, Preset, make_field, make_optimizer, pseudo_settings
+from experiments.presets import (
+    PRESETS,
+    Preset,
+    make_field,
+    make_optimizer,
+    make_train_config,
+    pseudo_settings,
+)
 from experiments.report import print_table, write_json, write_report
 from jaxcloseup.geometry.union_warp import block_sources
 from jaxcloseup.scenes import Scene, SceneError, load_scene
@@ -136,7 +143,7 @@ def run(
         f"depth {scene.near:.3g} to {scene.far:.3g}"
     )
     field, optimizer = make_field(preset, scene), make_optimizer(preset)
-    bound = {"field": field, "optimizer": optimizer, "config": preset.train}
+    bound = {"field": field, "optimizer": optimizer, "config": make_train_config(preset)}
     settings = pseudo_settings(preset)
     render = jax.jit(
         lambda state, camera: field.render(state.params, state.buffers, camera, None, None)

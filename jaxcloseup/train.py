@@ -4,6 +4,7 @@
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -17,6 +18,7 @@ from jaxcloseup.field import RadianceField
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.geometry.union_warp import SourceBlocks
 from jaxcloseup.pseudo import PseudoSettings, make_label, sample_virtual_camera
+from jaxcloseup.rendered_loss import rendered_loss
 
 
 Metrics = dict[str, jax.Array]
@@ -50,7 +52,9 @@ class TrainConfig:
       num_label_rays: pseudo-labelled pixels of a step; None takes the whole virtual image.
       perturbed_depth: render virtual depth with sampling noise, as released, not without (paper).
       undivided_depth: use depth not divided by alpha, as released, for labels.
-      pooled_loss: one mean over all valid pixels, as released, not half of each mean (paper).
+      pooled_loss: one mean over all valid pixels, as released, not half of each mean (paper);
+        for fields that render single pixels.
+      gradient_chunk: pixels differentiated at once, see `rendered_loss`; None for all.
     """
 
     num_rays: int | None = 1024
@@ -58,6 +62,7 @@ class TrainConfig:
     perturbed_depth: bool = False
     undivided_depth: bool = False
     pooled_loss: bool = False
+    gradient_chunk: int | None = None
 
 
 def init_state(
@@ -94,10 +99,10 @@ def train_step(
     key_step = jax.random.fold_in(state.key, state.step)
     key_batch, key_render, key_adapt, _ = jax.random.split(key_step, 4)
     batch = _sample_batch(key_batch, views, config)
+    loss_of = functools.partial(rendered_loss, field=field, chunk=config.gradient_chunk)
 
     def loss(params):
-        rendering = _render(field, params, state.buffers, batch, key_render)
-        return field.loss(rendering, batch.rgb, batch.weight)
+        return loss_of(params, state.buffers, batch, key_render)
 
     return _update(state, loss, key_adapt, field, optimizer)
 
@@ -152,15 +157,13 @@ def pseudo_step(
     )
     virtual = Batch(camera, pixels, label.rgb, label.weight)
 
+    loss_of = functools.partial(rendered_loss, field=field, chunk=config.gradient_chunk)
+
     def loss(params):
-        of_batch = _render(field, params, state.buffers, batch, key_render)
-        of_virtual = _render(field, params, state.buffers, virtual, key_virtual_render)
         if config.pooled_loss:
-            both = jax.tree.map(lambda *x: jnp.concatenate(x), of_batch, of_virtual)
-            rgb = jnp.concatenate([batch.rgb, virtual.rgb])
-            return field.loss(both, rgb, jnp.concatenate([batch.weight, virtual.weight]))
-        batch_loss, metrics = field.loss(of_batch, batch.rgb, batch.weight)
-        virtual_loss, _ = field.loss(of_virtual, virtual.rgb, virtual.weight)
+            return loss_of(params, state.buffers, _pool(batch, virtual), key_render)
+        batch_loss, metrics = loss_of(params, state.buffers, batch, key_render)
+        virtual_loss, _ = loss_of(params, state.buffers, virtual, key_virtual_render)
         return (batch_loss + virtual_loss) / 2, metrics
 
     state, metrics = _update(state, loss, key_adapt, field, optimizer)
@@ -205,15 +208,21 @@ def _sample_batch(key, views, config):
 
 
 def _sample_virtual_pixels(key, camera, count):
-    """Distinct pixels are not worth their cost: `[count, 2]` centres with replacement, or None."""
+    """Pixel centres `[count, 2]`, drawn with replacement, or None for all."""
     if count is None:
         return None
     size = jnp.array([[camera.width, camera.height]])
     return jax.random.randint(key, (count, 2), 0, size).astype(jnp.float32) + 0.5
 
 
-def _render(field, params, buffers, batch, key):
-    return field.render(params, buffers, batch.cameras, batch.pixels, key)
+def _pool(batch, virtual):
+    """One batch of the pixels of both; the second has one camera for all of its."""
+    cameras = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(leaf, (len(virtual.pixels), *leaf.shape)), virtual.cameras
+    )
+    return jax.tree.map(
+        lambda *leaves: jnp.concatenate(leaves), batch, virtual._replace(cameras=cameras)
+    )
 
 
 def _update(state, loss, key_adapt, field, optimizer):

@@ -99,7 +99,7 @@ def test_a_saved_render_reproduces_its_score(finished, capture_folder):
 
 def test_a_run_leaves_pictures_and_a_page_without_links(finished):
     _, output_dir = finished
-    for picture in ("compare/test_0.png", "compare/test_far_0.png", "labels/virtual_0.png"):
+    for picture in ("compare/0.png", "compare/test_far_0.png", "labels/virtual_0.png"):
         assert cv2.imread(str(output_dir / picture)) is not None
     depth = cv2.imread(str(output_dir / "renders" / "baseline" / "test" / "depth" / "0.png"))
     assert depth.shape == (plane.HEIGHT, plane.WIDTH, 3)

@@ -5,7 +5,7 @@ Images are `[H, W, 3]`, red first, or `[H, W]` grey; floats in [0, 1] or uint8; 
 
 import base64
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import cv2
 import jax
@@ -87,7 +87,7 @@ def colorize_error(error: Image, *, highest: float = 0.25) -> np.ndarray:
 
 
 def side_by_side(
-    images: Sequence[Image], *, labels: Sequence[str] | None = None, gap: int = 8
+    images: Iterable[Image], *, labels: Sequence[str] | None = None, gap: int = 8
 ) -> np.ndarray:
     """Panels in a row on white, uint8 `[H, W, 3]`, aligned at the top, each under its label."""
     panels = [to_uint8(image) for image in images]
