@@ -7,7 +7,7 @@ import reference_splats as reference
 from splat_scenes import IDENTITY, NEAR, random_scene, to_surfels
 from splat_scenes import to_camera as make_camera
 
-from jaxcloseup.splats.projection import project_discs, to_camera
+from jaxcloseup.splats.projection import Discs, project_discs, to_camera
 
 
 SIZE, INTRINSICS = (48, 64), np.array([50.0, 56.0, 29.5, 27.0])
@@ -89,3 +89,9 @@ def test_rays_see_what_the_rows_say():
             np.testing.assert_allclose(actual, expected, rtol=2e-4, atol=2e-4)
             checked += 1
     assert checked > 100
+
+
+def test_near_must_be_positive():
+    discs = Discs(np.zeros((2, 3)), np.zeros((2, 3, 3)), np.ones((2, 2)))
+    with pytest.raises(ValueError, match="near must be a positive depth"):
+        project_discs(discs, np.ones(2), np.ones((2, 3)), make_camera(), near=0.0)

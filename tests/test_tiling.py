@@ -71,3 +71,9 @@ def test_pairs_sort_alike_packed_or_not(ranks):
     order = np.lexsort([rank, tile])
     np.testing.assert_array_equal(found[0], tile[order])
     np.testing.assert_array_equal(found[1], rank[order])
+
+
+def test_countless_pairs_are_still_overflow():
+    box = jnp.tile(jnp.array([[0.0, 0.0, 4096.0, 4096.0]]), (9000, 1))
+    make = functools.partial(tile_lists, height=4096, width=4096, tile=8, block=64, capacity=64)
+    assert jax.jit(make)(box, jnp.ones(9000)).overflow == 2**31 - 1

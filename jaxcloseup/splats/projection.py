@@ -65,8 +65,10 @@ def project_discs(
       opacity: `[N]` in [0, 1].
       payload: `[N, F]`.
       camera: gives intrinsics and image size.
-      near: z-depth before which nothing is drawn; a disc may reach through it.
+      near: positive z-depth before which nothing is drawn; a disc may reach through it.
     """
+    if near <= 0:
+        raise ValueError(f"near must be a positive depth, not {near}")
     focal, principal = camera.intrinsics[None, :2], camera.intrinsics[None, 2:]
     size = jnp.array([[camera.width, camera.height]], focal.dtype)
     mu, depth = discs.centre, discs.centre[:, 2]
@@ -97,15 +99,16 @@ def project_discs(
     constants = jnp.where(centred, at_centre, at_anchor)
     rows = jnp.concatenate([constants[..., None], covectors[..., :2] / focal[:, None]], axis=-1)
 
-    cutoff = jnp.sqrt(2 * jnp.log(jnp.maximum(opacity / ALPHA_MIN, 1)))
+    # What is drawn where has no derivative.
+    discs, opacity_now, centre = lax.stop_gradient((discs, opacity, centre))
+    cutoff = jnp.sqrt(2 * jnp.log(jnp.maximum(opacity_now / ALPHA_MIN, 1)))
     reach = cutoff * safe_norm(discs.axes[:, 2, :2] * discs.scales)
-    drawn = ~edge_on & (opacity >= ALPHA_MIN) & (depth + reach >= near)
-    nearest, farthest = jnp.maximum(depth - reach, near), jnp.maximum(depth + reach, near)
-    box = jnp.where(
-        ahead[:, None],
-        _unite(_disc_box(discs, cutoff, camera, near), _low_pass_box(centre, cutoff)),
-        _disc_box(discs, cutoff, camera, near),
+    drawn = ~edge_on & (opacity_now >= ALPHA_MIN) & (depth + reach >= near)
+    nearest, farthest = (
+        lax.stop_gradient(jnp.maximum(limit, near)) for limit in (depth - reach, depth + reach)
     )
+    box = _disc_box(discs, cutoff, camera, near)
+    box = jnp.where(ahead[:, None], _unite(box, _low_pass_box(centre, cutoff)), box)
     return Footprints(
         anchor=anchor,
         rows=rows,
@@ -113,7 +116,7 @@ def project_discs(
         low_pass=jnp.where(ahead, LOW_PASS, 1e9),
         inverse_depth=jnp.stack([1 / farthest, 1 / nearest], axis=-1),
         payload=payload,
-        order=jnp.maximum(depth, near),
+        order=lax.stop_gradient(jnp.maximum(depth, near)),
         box=lax.stop_gradient(jnp.where(drawn[:, None], box, -1)),
     )
 

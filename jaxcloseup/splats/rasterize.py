@@ -34,7 +34,7 @@ class RasterizeConfig:
     Attributes:
       capacity: how many (tile, splat) pairs fit. What does not fit is counted in `overflow`, the
         farthest splats are left out, and the caller renders again with a larger capacity.
-      near: z-depth in world units before which nothing is drawn.
+      near: positive z-depth in world units before which nothing is drawn.
       tile: side of a tile in pixels.
       chunk: splats of a tile that are evaluated at once.
       block: tiles that are evaluated at once.

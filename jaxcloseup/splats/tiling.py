@@ -10,6 +10,9 @@ from flax import struct
 from jax import lax
 
 
+LARGEST = 2**31 - 1
+
+
 @struct.dataclass
 class TileLists:
     """The lists of all tiles, tiles of similar length side by side in blocks of `B`.
@@ -20,7 +23,7 @@ class TileLists:
       origins: `[blocks, B, 2]` x and y of a tile's first pixel.
       tile: `[blocks, B]` which tile of the image it is.
       slot: `[T]` where tile t is found in the flattened blocks.
-      overflow: `[]` pairs that did not fit; those of the farthest splats.
+      overflow: `[]` pairs that did not fit, those of the farthest splats; `LARGEST` if countless.
     """
 
     splats: jax.Array
@@ -62,6 +65,7 @@ def tile_lists(
     pairs, first, columns = pairs[by_depth], first[by_depth], jnp.maximum(extent[by_depth, 0], 1)
     ends = jnp.cumsum(pairs)
     total = ends[-1]
+    too_many = jnp.sum(pairs.astype(jnp.float32)) > LARGEST / 2  # int32 may have wrapped
     place = jnp.arange(capacity, dtype=jnp.int32)
     rank = jnp.repeat(jnp.arange(count, dtype=jnp.int32), pairs, total_repeat_length=capacity)
     within = place - (ends - pairs)[rank]
@@ -86,7 +90,7 @@ def tile_lists(
         origins=tile * jnp.stack([longest_first % across, longest_first // across], axis=-1),
         tile=longest_first,
         slot=slot,
-        overflow=jnp.maximum(total - capacity, 0),
+        overflow=jnp.where(too_many, LARGEST, jnp.maximum(total - capacity, 0)),
     )
 
 
