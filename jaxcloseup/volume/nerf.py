@@ -57,7 +57,7 @@ class NerfConfig:
         """Rays to render, or to differentiate, at once: what keeps one layer's activations small.
 
         Small is 2 MB on a CPU, the size of a core's cache, and 512 MB elsewhere. The rest follows:
-        whole images need about 5 times as much memory, training `2 depth + 5` times.
+        whole images need about 4 times as much memory, training `2 depth + 4` times.
         """
         if self.chunk is not None:
             return self.chunk
