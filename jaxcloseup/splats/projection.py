@@ -99,14 +99,12 @@ def project_discs(
     constants = jnp.where(centred, at_centre, at_anchor)
     rows = jnp.concatenate([constants[..., None], covectors[..., :2] / focal[:, None]], axis=-1)
 
-    # What is drawn where has no derivative.
+    # What is drawn where has no derivative, nor has a disc's extent in depth.
     discs, opacity_now, centre = lax.stop_gradient((discs, opacity, centre))
     cutoff = jnp.sqrt(2 * jnp.log(jnp.maximum(opacity_now / ALPHA_MIN, 1)))
     reach = cutoff * safe_norm(discs.axes[:, 2, :2] * discs.scales)
     drawn = ~edge_on & (opacity_now >= ALPHA_MIN) & (depth + reach >= near)
-    nearest, farthest = (
-        lax.stop_gradient(jnp.maximum(limit, near)) for limit in (depth - reach, depth + reach)
-    )
+    nearest, farthest = (jnp.maximum(limit, near) for limit in (depth - reach, depth + reach))
     box = _disc_box(discs, cutoff, camera, near)
     box = jnp.where(ahead[:, None], _unite(box, _low_pass_box(centre, cutoff)), box)
     return Footprints(
