@@ -93,3 +93,55 @@ def ssim_map(a, b):
         luminance = (2 * mean_p * mean_q + 0.01**2) / (mean_p**2 + mean_q**2 + 0.01**2)
         result[y, x, c] = luminance * (2 * covariance + 0.03**2) / (var_p + var_q + 0.03**2)
     return result
+
+
+def first_crossing(solids, origin, direction, nearest=1e-4):
+    """Depth, world normal and index of the nearest of `solids` = (kind, to_world, taper) on one ray.
+
+    Kinds are "plane", "box", "sphere", "cylinder": unit shapes under an affine map `[3, 4]`. Each
+    face is intersected by itself, in the unit frame. Also returned is the least distance, in the
+    unit frame, by which a candidate fell inside or outside its face: small for a grazing ray.
+    """
+    best, margin = (np.inf, np.zeros(3), -1), np.inf
+    for index, (kind, to_world, taper) in enumerate(solids):
+        to_world = np.asarray(to_world, np.float64)
+        inverse = np.linalg.inv(to_world[:, :3])
+        o, d = inverse @ (origin - to_world[:, 3]), inverse @ direction
+        candidates = []  # (depth, unit normal, how far inside the face)
+        if kind == "plane":
+            t = -o[2] / d[2]
+            candidates.append((t, [0, 0, 1], 1 - np.abs((o + t * d)[:2]).max()))
+        if kind == "box":
+            for axis in range(3):
+                for sign in (-1, 1):
+                    t = (sign - o[axis]) / d[axis]
+                    inside = 1 - np.abs(np.delete(o + t * d, axis)).max()
+                    candidates.append((t, sign * np.eye(3)[axis], inside))
+        if kind == "sphere":
+            roots = np.roots([d @ d, 2 * o @ d, o @ o - 1])
+            margin = min(margin, abs((o @ o - 1) * (d @ d) - (o @ d) ** 2) / (d @ d))
+            for t in roots[np.isreal(roots)].real:
+                candidates.append((t, o + t * d, 1.0))
+        if kind == "cylinder":
+            w, slope = 1 + taper * o[2], taper * d[2]
+            quadratic = [
+                d[0] ** 2 + d[1] ** 2 - slope**2,
+                2 * (o[0] * d[0] + o[1] * d[1] - w * slope),
+                o[0] ** 2 + o[1] ** 2 - w**2,
+            ]
+            margin = min(margin, abs(quadratic[1] ** 2 - 4 * quadratic[0] * quadratic[2]) / (d @ d))
+            roots = np.roots(quadratic)
+            for t in roots[np.isreal(roots)].real:
+                x, y, z = o + t * d
+                candidates.append((t, [x, y, -taper * (1 + taper * z)], 1 - abs(z)))
+            for end in (-1, 1):
+                t = (end - o[2]) / d[2]
+                x, y, _ = o + t * d
+                candidates.append((t, [0, 0, end], 1 + end * taper - np.hypot(x, y)))
+        for t, normal, inside in candidates:
+            margin = min(margin, abs(inside))
+            if inside >= 0 and nearest < t < best[0]:
+                world = inverse.T @ normal
+                world = world / np.linalg.norm(world)
+                best = (t, -np.sign(world @ direction) * world, index)
+    return (*best, margin)

@@ -228,7 +228,7 @@ def _cylinder(p: list, d: list, taper: jax.Array) -> list:
     q = -(b + jnp.where(b < 0, -1, 1) * jnp.sqrt(jnp.maximum(root, 0)))
     found = []
     for t in (q / _nonzero(a), c / _nonzero(q)):
-        found.append((t, (root >= 0) & (jnp.abs(p[2] + t * d[2]) <= 1)))
+        found.append((t, (root > 0) & (jnp.abs(p[2] + t * d[2]) <= 1)))
     for end in (-1, 1):
         t = (end - p[2]) / _nonzero(d[2])
         x, y = p[0] + t * d[0], p[1] + t * d[1]
@@ -245,37 +245,29 @@ def _describe(
     point = origin + jnp.where(is_hit, depth, 0) * direction
     to_local, taper, kind = solids.to_local[index], solids.taper[index], solids.kind[index]
     x, y, z = _apply(to_local, *point, 1.0)
-    local = jnp.stack([x, y, z])
-    square = jnp.stack([x, y])
-    angle = jnp.arctan2(y, x) / (2 * jnp.pi) + 0.5
+    local, square, up = jnp.stack([x, y, z]), jnp.stack([x, y]), jnp.array([0.0, 0.0, 1.0])
 
-    axis = jnp.argmax(jnp.abs(local))
+    axis = jnp.argmax(jnp.abs(local)).astype(jnp.int32)
     sign = jnp.where(local[axis] < 0, -1.0, 1.0)
-    box_chart = jnp.where(axis == 0, local[1:], jnp.where(axis == 1, local[::2], square))
-    on_cap = jnp.abs(z) - 1 > jnp.hypot(x, y) / (1 + taper * z) - 1
-    cap = jnp.where(z > 0, 1.0, -1.0)
-    radial = jnp.stack([x, y, -taper * (1 + taper * z)])
-    up = jnp.array([0.0, 0.0, 1.0])
+    box_normal = sign * jax.nn.one_hot(axis, 3)
+    box_face = 2 * axis + jnp.where(sign > 0, 1, 0)
+    box_chart = jnp.select([axis == 0, axis == 1], [local[1:], local[::2]], square)
 
-    is_kind = [kind == k for k in range(4)]
+    on_cap = jnp.abs(z) > jnp.hypot(x, y) / (1 + taper * z)
+    end = jnp.where(z > 0, 1.0, -1.0)
+    side_normal = jnp.stack([x, y, -taper * (1 + taper * z)])
+    cap_face = jnp.where(z > 0, 2, 1)
+    cap_chart = square / (1 + end * taper)  # in units of its own radius
+
+    is_plane, is_box = kind == PLANE, kind == BOX
+    is_cap = (kind == CYLINDER) & on_cap
+    is_side = (kind == CYLINDER) & ~on_cap
+    face = jnp.select([is_box, is_cap], [box_face, cap_face], 0)
     normal = jnp.select(
-        is_kind, [up, sign * jax.nn.one_hot(axis, 3), local, jnp.where(on_cap, cap * up, radial)]
+        [is_plane, is_box, is_cap, is_side], [up, box_normal, end * up, side_normal], local
     )
-    side = jnp.select(
-        is_kind,
-        [
-            jnp.int32(0),
-            (2 * axis + (sign > 0)).astype(jnp.int32),
-            jnp.int32(0),
-            jnp.where(on_cap, jnp.where(z > 0, 2, 1), 0).astype(jnp.int32),
-        ],
-    )
-    around = jnp.stack([angle, (z + 1) / 2])
-    # A tapered cap reaches past the unit square; its chart is in units of its own radius.
-    cap_chart = square / (1 + cap * taper)
-    flat = jnp.select(is_kind, [square, box_chart, square, cap_chart])
-    is_round = (kind == SPHERE) | ((kind == CYLINDER) & ~on_cap)
-    chart = jnp.where(is_round, around, (flat + 1) / 2)
+    around = jnp.stack([jnp.arctan2(y, x) / jnp.pi, z])
+    chart = jnp.select([is_plane, is_box, is_cap], [square, box_chart, cap_chart], around)
 
     # Normals go by the transpose of the map to the unit solid.
     normal = sum(to_local[i, :3] * normal[i] for i in range(3))
@@ -284,6 +276,6 @@ def _describe(
     return Hit(
         depth=jnp.where(is_hit, depth, jnp.inf),
         normal=jnp.where(is_hit, normal, 0),
-        face=jnp.where(is_hit, solids.first_face[index] + side, 0),
-        chart=jnp.clip(chart, 0, 1),
+        face=jnp.where(is_hit, solids.first_face[index] + face, 0),
+        chart=jnp.clip((chart + 1) / 2, 0, 1),
     )

@@ -9,8 +9,8 @@ OAK = Finish("oak", 0.5, "grain", 0.22, gloss=0.06, grain=True)
 WALNUT = Finish("walnut", 0.5, "grain", 0.2, gloss=0.08, grain=True)
 PINE = Finish("pine", 0.45, "grain", 0.2, gloss=0.03, grain=True)
 PLANKS = Finish("planks", 1.6, "grain", 0.3, gloss=0.05)
-FLOOR_TILES = Finish("floor_tiles", 1.2, "grit", 0.4, gloss=0.1)
-PLASTER = Finish("plaster", 0.8, "grit", 0.5)
+FLOOR_TILES = Finish("floor_tiles", 1.2, "scratches", 0.4, gloss=0.1)
+PLASTER = Finish("plaster", 0.8, "paper", 0.3)
 WALLPAPER = Finish("wallpaper", 0.9, "paper", 0.2)
 WHITE = Finish("white", 0.6, "paper", 0.15, gloss=0.05)
 CHINA = Finish("white", 0.5, gloss=0.25)
@@ -20,7 +20,7 @@ BRASS = STEEL._replace(tint=(1.15, 0.92, 0.50))
 BLACK = Finish("white", 0.5, "scratches", 0.3, tint=(0.10, 0.10, 0.11), gloss=0.3)
 IRON = Finish("iron", 0.35, "grit", 0.12, gloss=0.08)
 CLOTH = Finish("fabric", 0.28, "weave", 0.055)
-TERRACOTTA = Finish("brick", 0.9, "grit", 0.2, tint=(1.0, 0.9, 0.85))
+TERRACOTTA = Finish("plaster", 0.5, "grit", 0.3, tint=(0.92, 0.50, 0.33))
 LEAF = Finish("leaves", 0.4, "grain", 0.2, tint=(1.25, 1.28, 1.2))
 CRUST = Finish("bread", 0.24, "grit", 0.14)
 
@@ -35,7 +35,7 @@ def tinted(finish: Finish, *tint: float) -> Finish:
 
 def peel(*tint: float) -> Finish:
     """The skin of a fruit."""
-    return Finish("peel", 0.12, "grit", 0.12, tint=tint, gloss=0.15)
+    return Finish("peel", 0.12, "paper", 0.08, tint=tint, gloss=0.15)
 
 
 def print_of(name: str, part: tuple[int, int, int, int] = (0, 0, 1, 1), **options) -> Finish:
@@ -91,18 +91,13 @@ def framed(
 
 
 def book(centre: tuple, size: tuple, index: int, angle: float) -> list[Solid]:
-    """A book lying flat, turned by `angle` degrees, its back with the title to the left."""
+    """A book lying flat, its titled back towards -y turned by `angle` degrees."""
     rotation, cover = turn(z=angle), tinted(PAPER, *COVERS[index % len(COVERS)])
-    back = centre + rotation @ [-size[0] / 2 - 0.002, 0, 0]
+    (width, depth, height), title = size, {2: spine(2 * index + 1)}
+    back, lying = centre + rotation @ [0, -depth / 2 - 0.002, 0], rotation @ turn(y=-90)
     return [
         box(centre, size, tinted(PAPER, *PAGES), rotation=rotation, faces={4: cover, 5: cover}),
-        box(
-            back,
-            (size[2], 0.004, size[1]),
-            cover,
-            rotation=rotation @ turn(z=-90) @ turn(y=90),
-            faces={2: spine(2 * index + 1)},
-        ),
+        box(back, (height, 0.004, width), cover, rotation=lying, faces=title),
     ]
 
 

@@ -35,7 +35,7 @@ from jaxcloseup.scenes.modelling import (
 RUNNER = Finish("carpet", 0.42, "pile", 0.15)
 COIR = Finish("white", 0.3, "pile", 0.12, tint=(0.6, 0.45, 0.28))
 DOORMAT = Finish("doormat", None, "pile", 0.13)
-RUBBER = tinted(BLACK, 0.16, 0.34, 0.22)
+RUBBER = Finish("white", 0.5, "paper", 0.1, tint=(0.16, 0.34, 0.22), gloss=0.25)
 RISE, RUN, STEPS = 0.185, 0.27, 10
 
 

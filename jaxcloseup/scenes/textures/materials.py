@@ -130,7 +130,7 @@ def _white(rng: np.random.Generator) -> np.ndarray:
 
 def _steel(rng: np.random.Generator) -> np.ndarray:
     brush = noise(rng, octave=200, stretch=120, slope=1)
-    return np.float32([0.62, 0.63, 0.65]) * (1 + 0.07 * brush)[..., None]
+    return np.float32([0.62, 0.63, 0.65]) * (1 + 0.045 * brush)[..., None]
 
 
 def _iron(rng: np.random.Generator) -> np.ndarray:
@@ -315,7 +315,7 @@ def _paper(rng: np.random.Generator) -> np.ndarray:
 def _scratches(rng: np.random.Generator) -> np.ndarray:
     brush = noise(rng, octave=240, stretch=150, slope=0.8)
     cross = np.rot90(noise(rng, octave=120, stretch=100, slope=2))
-    return 0.045 * brush - 0.14 * step(cross, 2.6, 3.2)[..., 0]
+    return 0.03 * brush - 0.12 * step(cross, 2.6, 3.2)[..., 0]
 
 
 COLOURS = {
