@@ -43,7 +43,7 @@ class RasterizeConfig:
     capacity: int = 2**18
     near: float = 0.01
     tile: int = 8
-    chunk: int = 16
+    chunk: int = 8
     block: int = 64
 
 
