@@ -148,7 +148,7 @@ def _kept(stem: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.
     path = pathlib.Path(root) / "jaxcloseup" / f"{stem}-{_sources_digest()}.npz"
     if path.exists():
         try:
-            with np.load(path, allow_pickle=False) as stored:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
                 return dict(stored)
         except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
             warnings.warn(f"ignoring the unreadable cache {path}: {error}", stacklevel=2)

@@ -156,7 +156,7 @@ def cast_rays(
         for i in range(0, len(rays[0]), chunk)
     ]
     return jax.tree.map(
-        lambda *leaf: np.concatenate(leaf)[:count].reshape(*shape, *leaf[0].shape[1:]), *parts
+        lambda *leaf: np.concatenate(leaf)[:count].reshape(shape + leaf[0].shape[1:]), *parts
     )
 
 
