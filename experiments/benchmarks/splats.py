@@ -19,8 +19,8 @@ from experiments.benchmarks.timing import interleaved_medians
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.numerics import safe_divide, safe_norm
 from jaxcloseup.splats import RasterizeConfig, Surfels, render_surfels
+from jaxcloseup.splats.kernel import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from jaxcloseup.splats.projection import project_discs, to_camera
-from jaxcloseup.splats.rasterize import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from jaxcloseup.splats.spherical_harmonics import rgb_to_sh, sh_to_rgb
 from jaxcloseup.splats.tiling import tile_lists
 

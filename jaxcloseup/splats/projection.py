@@ -18,7 +18,8 @@ from jax import lax
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.geometry.rotations import quaternion_to_matrix
 from jaxcloseup.numerics import matmul, safe_norm
-from jaxcloseup.splats.rasterize import ALPHA_MIN, Footprints
+from jaxcloseup.splats.kernel import ALPHA_MIN
+from jaxcloseup.splats.rasterize import Footprints
 from jaxcloseup.splats.surfels import Surfels
 
 
