@@ -42,7 +42,9 @@ class Target(NamedTuple):
 
 def exact_depths(scene: Scene, cameras: Camera) -> jax.Array:
     """Exact z-depths `[V, H, W]` of stacked cameras on a procedural scene."""
-    return jnp.stack([scene.surface(camera_at(cameras, i)).depth for i in range(_count(cameras))])
+    depth = jax.jit(lambda camera: scene.surface(camera).depth)  # leaves the colours undrawn
+    count = cameras.intrinsics.shape[0]
+    return jnp.stack([depth(camera_at(cameras, i)) for i in range(count)])
 
 
 def make_targets(
@@ -54,16 +56,18 @@ def make_targets(
     baseline, so that every stage is scored on the same pixels.
     """
     views: Views = getattr(scene, split)
+    exact = exact_depths(scene, views.cameras) if scene.surface else None
     count = jax.jit(count_seen)
     targets = []
     for i, name in enumerate(scene.names[split]):
         camera = camera_at(views.cameras, i)
-        exact = scene.surface(camera).depth if scene.surface else None
-        depth = render(camera).depth if exact is None else exact
+        depth = render(camera).depth if exact is None else exact[i]
         pixels = pixel_grid(camera.height, camera.width)
         seen = count(camera, pixels, depth, scene.train, train_depths)
         rgb = to_float(jnp.asarray(views.rgb[i]))
-        targets.append(Target(name, camera, rgb, jnp.asarray(views.weight[i]), seen, exact))
+        weight = jnp.asarray(views.weight[i])
+        known = None if exact is None else exact[i]
+        targets.append(Target(name, camera, rgb, weight, seen, known))
     return targets
 
 
@@ -153,7 +157,3 @@ def _frame(weight):
     if not len(rows):
         return slice(None), slice(None)
     return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-
-
-def _count(cameras):
-    return cameras.intrinsics.shape[0]

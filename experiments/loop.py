@@ -12,7 +12,7 @@ from jaxcloseup.train import TrainState, run_steps
 
 def make_runner(step: Callable[..., Any]) -> Callable[..., Any]:
     """`runner(state, *data, count=...)`, compiled; it leaves its input state alone."""
-    return jax.jit(functools.partial(run_steps, step), static_argnames="count")
+    return jax.jit(functools.partial(run_steps, step))
 
 
 def run_stage(

@@ -151,9 +151,9 @@ def run(
     seconds: dict[str, float] = {}
     history, stages, renderings, targets = {}, {}, {}, {}
 
-    def train(stage, step, state, *data, steps):
+    def train(stage, runner, state, *data, steps):
         with timed(seconds, stage):
-            state, history[stage] = run_stage(stage, make_runner(step), state, *data, steps=steps)
+            state, history[stage] = run_stage(stage, runner, state, *data, steps=steps)
         return state
 
     def score(stage, state):
@@ -166,8 +166,9 @@ def run(
                 write_renders(folder, renderings[stage, split], scene)
                 print(f"{stage:>9} {split}: PSNR {stages[stage][split]['psnr']:.2f} dB", flush=True)
 
-    on_photographs = functools.partial(train_step, **bound)
+    on_photographs = make_runner(functools.partial(train_step, **bound))
 
+    @make_runner
     def on_labels(state, views, depths, settings, sources):
         return pseudo_step(state, views, depths, settings, sources=sources, **bound)
 
@@ -203,7 +204,10 @@ def run(
         pictures += label_pictures(key_pictures, shown, output_dir / "labels", **labels)
         audit = {}
         if exact is not None:
-            truth = {"depths": exact, "render_depth": lambda camera: scene.surface(camera).depth}
+            truth = {
+                "depths": exact,
+                "render_depth": jax.jit(lambda camera: scene.surface(camera).depth),
+            }
             audit["exact_depth"] = audit_labels(key_audit, exact, **labels | truth)
             audit["trained_depth"] = audit_labels(key_audit, exact, **labels)
     results = {

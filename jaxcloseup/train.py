@@ -171,11 +171,25 @@ def pseudo_step(
 
 
 def run_steps(
-    step: Callable[..., tuple[TrainState, Metrics]], state: TrainState, *data: Any, count: int
+    step: Callable[..., tuple[TrainState, Metrics]],
+    state: TrainState,
+    *data: Any,
+    count: jax.Array | int,
 ) -> tuple[TrainState, Metrics]:
-    """Take `count` steps `step(state, *data)` in one `lax.scan`; metrics are their means."""
-    state, metrics = jax.lax.scan(lambda state, _: step(state, *data), state, length=count)
-    return state, jax.tree.map(jnp.mean, metrics)
+    """Take `count` steps `step(state, *data)` in one loop; metrics are their means.
+
+    `count` may be traced, so one compiled program serves any number of steps.
+    """
+    _, shapes = jax.eval_shape(step, state, *data)
+    total = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+    def body(_, carry):
+        state, total = carry
+        state, metrics = step(state, *data)
+        return state, jax.tree.map(jnp.add, total, metrics)
+
+    state, total = jax.lax.fori_loop(0, count, body, (state, total))
+    return state, jax.tree.map(lambda leaf: leaf / jnp.asarray(count, leaf.dtype), total)
 
 
 def render_depths(
