@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from jaxcloseup.scenes.raycast import Hit, Solids, cast_rays
-from jaxcloseup.scenes.shading import GAMMA, World, mean_colours, sample_light
+from jaxcloseup.scenes.shading import GAMMA, Faces, World, mean_colours, sample_light
 
 
 _BLOCK, _SAMPLES = 256, 16
@@ -49,62 +49,55 @@ def bake_light(
     starts = positions + 5e-4 * normals  # just above the surface
     turns = np.random.default_rng(0).uniform(size=(len(starts), 1, 2))
     shines = np.asarray(world.faces.emission) > 0
-    light = np.zeros((len(starts), 4), np.float32)
-
-    for number, lamp in enumerate(lamps):
-        ends = lamp.position + lamp.radius * _on_sphere(_spread(_SAMPLES, turns))
-        hits = _cast_blocks(
-            world.solids, starts, normals, ends - starts[:, None], lamp.position, lamp.radius
-        )
-        visible = np.mean((hits.depth >= 1) | shines[hits.face], axis=1)
-        away = np.array(lamp.position) - starts
-        squared = np.sum(away**2, axis=-1)
-        cosine = np.maximum(np.sum(away * normals, axis=-1), 0) / np.sqrt(squared)
-        light[:, :3] += (visible * cosine / squared)[:, None] * np.array(lamp.power)
-        if number == 0:
-            light[:, 3] = visible
-
     albedo = np.asarray(world.faces.tint) * mean_colours(world.texels)[world.faces.texture]
     albedo **= 1 / GAMMA
-    irradiance, around = np.array(ambience.irradiance), np.zeros((len(starts), 3))
-    for number in range(_ROUNDS):
-        square = _spread(_SAMPLES, turns, number / _ROUNDS / _SAMPLES)
-        directions = normals[:, None] + 0.999 * _on_sphere(square)
-        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-        hits = _cast_blocks(world.solids, starts, normals, directions, None, 3 * ambience.reach)
-        # What shines by itself is as bright as it looks; the rest returns lamp light.
-        returned = np.asarray(_look_up(light, world, hits))[..., :3]
-        returned = np.where(np.isfinite(hits.depth)[..., None], returned, 0) * albedo[hits.face]
-        returned += irradiance * (1 - np.exp(-hits.depth / ambience.reach))[..., None]
-        glow = albedo[hits.face] * irradiance
-        around += np.mean(np.where(shines[hits.face][..., None], glow, returned), 1) / _ROUNDS
+    irradiance = np.array(ambience.irradiance)
 
-    light[:, :3] += around
+    def from_lamps(part: slice) -> np.ndarray:
+        start, normal, turn = starts[part], normals[part], turns[part]
+        light = np.zeros((len(start), 4))
+        for lamp in reversed(lamps):
+            wanted = _within(world.solids, start, normal, np.array(lamp.position), lamp.radius)
+            ends = lamp.position + lamp.radius * _on_sphere(_spread(_SAMPLES, turn))
+            ways = ends - start[:, None]
+            hits = cast_rays(world.solids, start[:, None], ways, wanted=wanted)
+            visible = np.mean((hits.depth >= 1) | shines[hits.face], axis=1)
+            away = np.array(lamp.position) - start
+            squared = np.sum(away**2, axis=-1)
+            cosine = np.maximum(np.sum(away * normal, axis=-1), 0) / np.sqrt(squared)
+            light[:, :3] += (visible * cosine / squared)[:, None] * np.array(lamp.power)
+            light[:, 3] = visible  # the first lamp comes last, and stays
+        return light
+
+    def from_around(part: slice) -> np.ndarray:
+        start, normal, turn = starts[part], normals[part], turns[part]
+        wanted = _within(world.solids, start, normal, start.mean(0), 3 * ambience.reach)
+        light = np.zeros((len(start), 4))
+        for number in range(_ROUNDS):
+            square = _spread(_SAMPLES, turn, number / _ROUNDS / _SAMPLES)
+            ways = normal[:, None] + 0.999 * _on_sphere(square)
+            ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
+            hits = cast_rays(world.solids, start[:, None], ways, wanted=wanted)
+            # What shines by itself is as bright as it looks; the rest returns lamp light.
+            returned = np.asarray(_look_up(direct, world.faces, hits))[..., :3]
+            returned = np.where(np.isfinite(hits.depth)[..., None], returned, 0) * albedo[hits.face]
+            returned += irradiance * (1 - np.exp(-hits.depth / ambience.reach))[..., None]
+            glow = albedo[hits.face] * irradiance
+            light[:, :3] += np.where(shines[hits.face][..., None], glow, returned).mean(1) / _ROUNDS
+        return light
+
+    parts = [slice(first, first + _BLOCK) for first in range(0, len(starts), _BLOCK)]
+    with concurrent.futures.ThreadPoolExecutor(2) as pool:
+        direct = np.concatenate(list(pool.map(from_lamps, parts))).astype(np.float32)
+        light = direct + np.concatenate(list(pool.map(from_around, parts))).astype(np.float32)
     light = _smooth(light, world)
     light[:, :3] **= GAMMA
     return light
 
 
 @jax.jit
-def _look_up(light: jax.Array, world: World, hits: Hit) -> jax.Array:
-    return jax.vmap(jax.vmap(lambda hit: sample_light(light, world.faces, hit)))(hits)
-
-
-def _cast_blocks(
-    solids: Solids, starts: np.ndarray, normals: np.ndarray, directions: np.ndarray,
-    end: tuple | None, radius: float,
-) -> Hit:  # fmt: skip
-    """Hits `[L, S]` of rays `directions[L, S, 3]`, towards a ball at `end` or all around."""
-
-    def block(first: int) -> Hit:
-        part = slice(first, first + _BLOCK)
-        goal = starts[part].mean(0) if end is None else np.array(end)
-        wanted = _within(solids, starts[part], normals[part], goal, radius)
-        return cast_rays(solids, starts[part, None], directions[part], wanted=wanted)
-
-    with concurrent.futures.ThreadPoolExecutor() as pool:
-        hits = list(pool.map(block, range(0, len(starts), _BLOCK)))
-    return Hit(*(np.concatenate(leaf) for leaf in zip(*hits, strict=True)))
+def _look_up(light: jax.Array, faces: Faces, hits: Hit) -> jax.Array:
+    return jax.vmap(jax.vmap(lambda hit: sample_light(light, faces, hit)))(hits)
 
 
 def _within(

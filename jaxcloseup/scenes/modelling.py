@@ -187,16 +187,21 @@ def build_world(model: Model, bake: Callable[..., np.ndarray] = bake_light) -> s
         padding = [(0, -len(rows) % _PAD_FACES)] + [(0, 0)] * (values.ndim - 1)
         return jnp.asarray(np.pad(values, padding, mode="edge").astype(kind))
 
-    with concurrent.futures.ThreadPoolExecutor() as pool:
-        texels = list(pool.map(_pyramid, names))
-    texels += [np.zeros_like(texels[0])] * (-len(names) % _PAD_TEXTURES)
+    # Padding stays untouched, and so costs no memory.
+    texels = np.zeros((-(-len(names) // _PAD_TEXTURES) * _PAD_TEXTURES, shading.TEXELS), np.uint32)
+
+    def fill(row: int) -> None:
+        texels[row] = shading.pack_pyramid(draw_texture(names[row]))
+
+    with concurrent.futures.ThreadPoolExecutor(2) as pool:
+        list(pool.map(fill, range(len(names))))
     world = shading.World(
         solids=make_solids(
             np.array([s.kind for s in solids]), to_world, np.array([s.taper for s in solids]),
             pad_to=_PAD_SOLIDS,
         ),
         faces=shading.Faces(**{key: column(key) for key in rows[0]}),
-        texels=jnp.asarray(np.stack(texels)),
+        texels=jnp.asarray(texels),
         light=jnp.zeros((0, 4)),
         lamp=jnp.asarray(model.lamps[0].position, jnp.float32),
     )  # fmt: skip
@@ -204,10 +209,6 @@ def build_world(model: Model, bake: Callable[..., np.ndarray] = bake_light) -> s
     light = bake(world, model.lamps, model.ambience, *places)
     light = np.pad(light, [(0, -start % _PAD_LIGHT), (0, 0)])
     return world.replace(light=jnp.asarray(light))
-
-
-def _pyramid(name: str) -> np.ndarray:
-    return shading.pack_pyramid(draw_texture(name))
 
 
 def _is_round(solid: Solid, side: int) -> bool:

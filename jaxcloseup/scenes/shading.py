@@ -22,6 +22,7 @@ from jaxcloseup.scenes.scene import Surface
 
 TEXTURE_SIZE = 1024  # texels a side, of every texture
 LEVELS = TEXTURE_SIZE.bit_length()
+TEXELS = (4 * TEXTURE_SIZE**2 - 1) // 3  # of a texture with all its halvings
 GAMMA = 1 / 2.2
 _SHININESS = 60.0
 _TILE = 24  # pixels a side that share a list of solids
