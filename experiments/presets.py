@@ -79,7 +79,7 @@ RELEASED = dataclasses.replace(
 )
 
 # A short training leaves depth errors of several per cent, under which the paper's labels are worse
-# than the model: only labels that the other views confirm closely are kept, each with a pixel's weight.
+# than the model: only labels that the other views confirm closely are kept, at a pixel's weight.
 QUICK = dataclasses.replace(
     PAPER,
     nerf=NerfConfig(
