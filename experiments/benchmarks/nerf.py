@@ -21,63 +21,58 @@ from jaxcloseup.volume.nerf import NerfConfig, nerf
 
 FULL = NerfConfig()
 SMALL = NerfConfig(depth=4, direction_width=64, num_coarse=32, num_fine=32)
-NUM_RAYS = 1024
+SMALL_WIDTHS = (64, 96, 128)
+NUM_RAYS = 256  # they go through 16 at a time: 1024 take four times as long
+IMAGE = 32
+CAMERA = Camera(jnp.eye(4)[:3], jnp.array([32.0, 32.0, 16.0, 16.0]), IMAGE, IMAGE)
 ROWS, WIDTH = 65536, 256
 
 
+DTYPES = ("float32", "bfloat16")
+
+
 def run() -> None:
-    """Measure and print; about three minutes on two cores."""
-    full = {"float32": FULL, "bfloat16": dataclasses.replace(FULL, compute_dtype="bfloat16")}
-    small = {width: dataclasses.replace(SMALL, width=width) for width in (64, 96, 128)}
-    calls = {}
-    for name in full:
-        calls["ceiling", name] = product(jnp.dtype(name), ROWS)
-        calls["in cache", name] = product(jnp.dtype(name), FULL.rays_at_once * 128)
-    memory = {}
-    for name, config in full.items():
-        calls["step", name], memory["training step", name] = training_step(config)
-        calls["image", name], memory["image, depth only", name] = depth_image(config)
-    calls["recomputing", "float32"], memory["recomputing step", "float32"] = training_step(
-        FULL, recompute=True
+    """Measure and print; about two minutes on two idle cores."""
+    calls, megabytes = {}, {}
+    for dtype in DTYPES:
+        config = dataclasses.replace(FULL, compute_dtype=dtype)
+        calls["ceiling", dtype] = product(dtype, ROWS)
+        calls["pieces", dtype] = product(dtype, min(ROWS, 128 * FULL.rays_at_once))
+        calls["step", dtype], megabytes["step", dtype] = training_step(config)
+        calls["again", dtype], megabytes["again", dtype] = training_step(config, recompute=True)
+        calls["image", dtype], megabytes["image", dtype] = depth_image(config)
+    for width in SMALL_WIDTHS:
+        calls["step", width], _ = training_step(dataclasses.replace(SMALL, width=width))
+    seconds = interleaved_medians(calls, repeats=5)
+
+    flops = {"ceiling": 2 * ROWS * WIDTH**2, "step": NUM_RAYS * training_flops(FULL)}
+    flops |= {"pieces": flops["ceiling"], "again": flops["step"]}
+    rate = {call: flops[call[0]] / s / 1e9 for call, s in seconds.items() if call[0] in flops}
+    print(f"\nNeRF 8 x 256, 64 + 64 samples; a training step is of {NUM_RAYS} rays, with Adam")
+    print(f"{'':44}{'float32':>10}{'bfloat16':>10}")
+    row("ceiling 65536 x 256 x 256, GFLOP/s", [rate["ceiling", d] for d in DTYPES])
+    row("the same in pieces that stay in the cache", [rate["pieces", d] for d in DTYPES])
+    row("training step, GFLOP/s", [rate["step", d] for d in DTYPES])
+    row("  % of the ceiling", [100 * rate["step", d] / rate["ceiling", d] for d in DTYPES])
+    row("  % of the pieces", [100 * rate["step", d] / rate["pieces", d] for d in DTYPES])
+    row("  ms", [1e3 * seconds["step", d] for d in DTYPES])
+    row(
+        "  speed relative to float32",
+        [seconds["step", DTYPES[0]] / seconds["step", d] for d in DTYPES],
     )
-    for width, config in small.items():
-        calls["step", width], _ = training_step(config)
-    seconds = interleaved_medians(calls, repeats=3)
-
-    product_flops = 2 * ROWS * WIDTH**2
-    rates = {
-        call: product_flops / seconds[call] / 1e9
-        for call in calls
-        if call[0] in ("ceiling", "in cache")
-    }
-    for call in calls:
-        if call[0] in ("step", "recomputing") and call[1] in full:
-            rates[call] = NUM_RAYS * training_flops(FULL) / seconds[call] / 1e9
-    print(f"\nNeRF 8 x 256, 64 + 64 samples, {NUM_RAYS} rays, forward, backward and Adam")
-    print(f"{'':36}{'float32':>12}{'bfloat16':>12}")
-    row("ceiling 65536x256x256, GFLOP/s", rates, "ceiling")
-    row("the same in pieces in cache, GFLOP/s", rates, "in cache")
-    row("training step, s", seconds, "step")
-    row("training step, GFLOP/s", rates, "step")
-    share = {("share", name): 100 * rates["step", name] / rates["ceiling", name] for name in full}
-    row("  % of the ceiling", share, "share")
-    share = {("share", name): 100 * rates["step", name] / rates["in cache", name] for name in full}
-    row("  % of the pieces in cache", share, "share")
-    row("plain gradient of render, s", seconds, "recomputing")
-    row("depth image, rays/s", {k: IMAGE**2 / s for k, s in seconds.items()}, "image")
-    for name in ("training step", "recomputing step", "image, depth only"):
-        row(f"temporaries, {name}, MB", memory, name)
-    ratio = seconds["step", "float32"] / seconds["step", "bfloat16"]
-    print(f"bfloat16 step is {ratio:.2f} times as fast as float32")
-    print(f"\nNeRF of depth 4, 32 + 32 samples, {NUM_RAYS} rays, float32")
-    for width in small:
-        print(f"  width {width:4}: {1e3 * seconds['step', width]:7.1f} ms a step")
+    row("  temporaries, MB", [megabytes["step", d] for d in DTYPES])
+    row("plain gradient, which renders twice, ms", [1e3 * seconds["again", d] for d in DTYPES])
+    row("  temporaries, MB", [megabytes["again", d] for d in DTYPES])
+    row("image of depth alone, rays/s", [IMAGE**2 / seconds["image", d] for d in DTYPES])
+    row("  temporaries, MB", [megabytes["image", d] for d in DTYPES])
+    print(f"\nNeRF of depth 4, 32 + 32 samples; a training step of {NUM_RAYS} rays, float32")
+    for width in SMALL_WIDTHS:
+        row(f"width {width}, ms", [1e3 * seconds["step", width]])
 
 
-def row(title: str, values: dict, name: str) -> None:
-    """Print a row of the table; what was not measured stays empty."""
-    cells = (values.get((name, dtype)) for dtype in ("float32", "bfloat16"))
-    print(f"{title:36}" + "".join(f"{cell:12.4g}" if cell else " " * 12 for cell in cells))
+def row(title: str, cells: list[float]) -> None:
+    """Print a row of the table."""
+    print(f"{title:44}" + "".join(f"{cell:10.4g}" for cell in cells))
 
 
 def training_flops(config: NerfConfig) -> int:
@@ -96,7 +91,7 @@ def training_flops(config: NerfConfig) -> int:
     return 2 * samples * (2 * encoded + 3 * (hidden + heads))
 
 
-def product(dtype: jnp.dtype, rows: int) -> Callable[[], jax.Array]:
+def product(dtype: str, rows: int) -> Callable[[], jax.Array]:
     """As many products of `rows` rows as make up ROWS, rows last, summed in float32."""
     weights = jnp.ones((WIDTH, WIDTH), dtype)
     x = jnp.ones((WIDTH, rows), dtype)
@@ -142,7 +137,3 @@ def compiled(function: Callable, *args):
     executable = jax.jit(function).lower(*args).compile()
     memory = executable.memory_analysis().temp_size_in_bytes / 1e6
     return functools.partial(executable, *args), memory
-
-
-IMAGE = 48
-CAMERA = Camera(jnp.eye(4)[:3], jnp.array([48.0, 48.0, 24.0, 24.0]), IMAGE, IMAGE)
