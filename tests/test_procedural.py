@@ -105,7 +105,7 @@ def test_a_capture_is_complete(scene):
         assert float(jnp.std(views.rgb.astype(jnp.float32))) > 20
     assert len(scene.metadata["magnification"]) == 12
     # Close-ups really are nearer than the far views.
-    subjects = scene.metadata["subjects"]
+    subjects = np.array(scene.metadata["subjects"])
     away = np.asarray(scene.train.cameras.position)[None] - subjects[:, None]
     own = np.linalg.norm(np.asarray(scene.test.cameras.position) - subjects, axis=-1)
     np.testing.assert_allclose(

@@ -4,13 +4,12 @@ Host code in NumPy around `cast_rays`. Entries of light are taken in blocks of n
 only the solids that matter to it, and blocks in threads.
 """
 
-import concurrent.futures
 from typing import NamedTuple
 
 import jax
 import numpy as np
 
-from jaxcloseup.scenes.raycast import Hit, Solids, cast_rays
+from jaxcloseup.scenes.raycast import Hit, Solids, cast_rays, map_in_threads
 from jaxcloseup.scenes.shading import GAMMA, Faces, World, mean_colours, sample_light
 
 
@@ -87,10 +86,9 @@ def bake_light(
         return light
 
     parts = [slice(first, first + _BLOCK) for first in range(0, len(starts), _BLOCK)]
-    with concurrent.futures.ThreadPoolExecutor(2) as pool:
-        direct = np.concatenate(list(pool.map(from_lamps, parts))).astype(np.float32)
-        light = direct + np.concatenate(list(pool.map(from_around, parts))).astype(np.float32)
-    light = _smooth(light, world)
+    direct = np.concatenate(map_in_threads(from_lamps, parts)).astype(np.float32)
+    around = np.concatenate(map_in_threads(from_around, parts)).astype(np.float32)
+    light = _smooth(direct + around, world)
     light[:, :3] **= GAMMA
     return light
 

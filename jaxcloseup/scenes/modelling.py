@@ -3,7 +3,6 @@
 The world is in metres with z up. Sizes are full extents (diameters, not radii).
 """
 
-import concurrent.futures
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -13,7 +12,15 @@ import numpy as np
 
 from jaxcloseup.scenes import shading
 from jaxcloseup.scenes.lighting import Ambience, Lamp, bake_light
-from jaxcloseup.scenes.raycast import BOX, CYLINDER, FACES_OF, PLANE, SPHERE, make_solids
+from jaxcloseup.scenes.raycast import (
+    BOX,
+    CYLINDER,
+    FACES_OF,
+    PLANE,
+    SPHERE,
+    make_solids,
+    map_in_threads,
+)
 from jaxcloseup.scenes.textures import draw_texture
 
 
@@ -193,8 +200,7 @@ def build_world(model: Model, bake: Callable[..., np.ndarray] = bake_light) -> s
     def fill(row: int) -> None:
         texels[row] = shading.pack_pyramid(draw_texture(names[row]))
 
-    with concurrent.futures.ThreadPoolExecutor(2) as pool:
-        list(pool.map(fill, range(len(names))))
+    map_in_threads(fill, range(len(names)))
     world = shading.World(
         solids=make_solids(
             np.array([s.kind for s in solids]), to_world, np.array([s.taper for s in solids]),

@@ -31,7 +31,7 @@ class Closeups(NamedTuple):
 
 
 def pose_looking_at(
-    position: np.ndarray, target: np.ndarray, turned: np.ndarray = (0.0, 0.0, 0.0)
+    position: np.ndarray, target: np.ndarray, turned: tuple[float, float, float] | np.ndarray
 ) -> np.ndarray:
     """An upright pose with z towards `target`, then turned by radians (pitch, yaw, roll)."""
     forward = np.subtract(target, position) / np.linalg.norm(np.subtract(target, position))
@@ -144,6 +144,9 @@ def _closeup(
     back = cast_rays(solids, subjects + 1e-3 * hit.normal, positions - subjects).depth > 1
     clear = cast_rays(solids, *grid_rays(poses, 32, 18)).depth.min(1) > np.maximum(0.07, 0.4 * own)
     for i in np.flatnonzero(on_subject & facing & back & clear):
+        fine = cast_rays(solids, *grid_rays(poses[i : i + 1], 96, 54)).depth
+        if fine.min() < max(0.07, 0.35 * own[i]) or not np.isfinite(fine).all():
+            continue
         origins, directions = grid_rays(poses[i : i + 1], 16, 9)
         depths = cast_rays(solids, origins, directions).depth[..., None]
         shown = (origins + depths * directions)[0]

@@ -5,7 +5,6 @@ seeds, at full size, and only then scaled. Photographs are kept on disk, since a
 takes minutes; the key covers the source files that draw them.
 """
 
-import concurrent.futures
 import functools
 import hashlib
 import os
@@ -35,7 +34,7 @@ from jaxcloseup.scenes.planning import (
     plan_closeups,
     plan_far,
 )
-from jaxcloseup.scenes.raycast import cast_rays
+from jaxcloseup.scenes.raycast import cast_rays, map_in_threads
 from jaxcloseup.scenes.scene import Scene, Surface
 
 
@@ -104,7 +103,7 @@ def procedural_scene(
         metadata={
             "downscale": downscale,
             "magnification": capture["magnification"].tolist(),
-            "subjects": capture["subjects"],
+            "subjects": capture["subjects"].tolist(),
         },
         surface=surface,
     )
@@ -183,8 +182,8 @@ def _capture(name: str, width: int, height: int) -> dict[str, np.ndarray]:
     world, rig = _world(name), SCENES[name]().rig
     rng = _rng(name, 0)
     far = plan_far(world.solids, rig, rng, NUM_TRAIN + NUM_FAR)
-    held_out = np.arange(len(far)) % ((NUM_TRAIN + NUM_FAR) // NUM_FAR + 1) == 4
-    train, test_far = far[~held_out], far[held_out]
+    held_out = np.s_[2 :: (NUM_TRAIN + NUM_FAR) // NUM_FAR + 1]  # between the others
+    train, test_far = np.delete(far, held_out, axis=0), far[held_out]
     closeups = plan_closeups(world.solids, rig, train, rng, NUM_TEST)
 
     every = np.concatenate([train, test_far, closeups.poses])
@@ -198,23 +197,20 @@ def _capture(name: str, width: int, height: int) -> dict[str, np.ndarray]:
         "near": 0.8 * depths.min(),
         "far": 1.1 * depths.max(),
     }
-    for split in ("train", "test", "test_far"):
-        cameras = _cameras(capture[f"{split}_poses"], width, height)
-        # Two views at a time: one alone keeps a single core busy.
-        with concurrent.futures.ThreadPoolExecutor(2) as pool:
-            each = [camera_at(cameras, i) for i in range(len(cameras.camtoworld))]
-            capture[f"{split}_rgb"] = np.stack(
-                list(pool.map(lambda camera: _photograph(world, camera), each))
-            )
+    cameras = _cameras(every, width, height)
+
+    def photograph(index: int) -> np.ndarray:
+        rgb = _render_rgb(world, camera_at(cameras, index), samples=_SAMPLES)
+        return np.round(np.asarray(rgb) * 255).astype(np.uint8)
+
+    photographs = map_in_threads(photograph, range(len(every)))
+    for split, stop in (("test", NUM_TEST), ("test_far", NUM_FAR), ("train", NUM_TRAIN)):
+        capture[f"{split}_rgb"] = np.stack(photographs[-stop:])
+        del photographs[-stop:]
     capture["points"], capture["colours"] = _sparse_points(
         world, train, capture["train_rgb"], _rng(name, 1)
     )
     return capture
-
-
-def _photograph(world: shading.World, camera: Camera) -> np.ndarray:
-    rgb = _render_rgb(world, camera, samples=_SAMPLES)
-    return np.round(np.asarray(rgb) * 255).astype(np.uint8)
 
 
 def _sparse_points(
@@ -222,7 +218,7 @@ def _sparse_points(
 ) -> tuple[np.ndarray, np.ndarray]:
     """About 5000 surface points `[P, 3]` at training pixels, with the photographs' colours."""
     views, height, width = rgb.shape[:3]
-    count = 5040 // views * views
+    count = 5000 // views * views
     view = np.repeat(np.arange(views), count // views)
     y, x = rng.integers(height, size=count), rng.integers(width, size=count)
     xy = np.stack([((x + 0.5) / width - 0.5) * WIDTH, ((y + 0.5) / height - 0.5) * HEIGHT], -1)
@@ -238,15 +234,12 @@ def _degrade(
     views: Views, rng: np.random.Generator, noise: float, exposure_jitter: float, pose_noise: float
 ) -> Views:
     """Photographs and reported poses as a hand-held camera and its calibration would give them."""
-    poses = np.array(views.cameras.camtoworld, np.float64)
-    exposure = np.exp(exposure_jitter * rng.normal(size=(len(poses), 1, 1, 1)))
-    rgb = np.asarray(views.rgb) / np.float32(255) * exposure.astype(np.float32)
-    rgb = rgb + np.float32(noise) * rng.standard_normal(rgb.shape, np.float32)
-    for pose in poses:
-        turns = pose_noise * rng.normal(size=3)
-        pose[:, :3] = pose[:, :3] @ turn(*np.rad2deg(turns))
+    poses, rgb = np.array(views.cameras.camtoworld, np.float64), np.array(views.rgb)
+    for pose, image in zip(poses, rgb, strict=True):
+        pose[:, :3] = pose[:, :3] @ turn(*np.rad2deg(pose_noise * rng.normal(size=3)))
         pose[:, 3] += pose_noise * rng.normal(size=3)
-    return views.replace(
-        cameras=views.cameras.replace(camtoworld=jnp.asarray(poses, jnp.float32)),
-        rgb=jnp.asarray(np.round(np.clip(rgb, 0, 1) * 255).astype(np.uint8)),
-    )
+        exposed = image * np.exp(exposure_jitter * rng.normal())
+        grainy = exposed + 255 * noise * rng.normal(size=image.shape)
+        image[:] = np.round(np.clip(grainy, 0, 255))
+    cameras = views.cameras.replace(camtoworld=jnp.asarray(poses, jnp.float32))
+    return views.replace(cameras=cameras, rgb=jnp.asarray(rgb))

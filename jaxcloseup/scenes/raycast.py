@@ -10,8 +10,9 @@ A point on a solid has a *face* (an integer, counted through all solids) and a *
 `cast_ray` takes one ray, to be batched with `jax.vmap`; `cast_rays` serves host code.
 """
 
-from collections.abc import Callable
-from typing import NamedTuple
+import concurrent.futures
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import chex
 import jax
@@ -158,6 +159,13 @@ def cast_rays(
     return jax.tree.map(
         lambda *leaf: np.concatenate(leaf)[:count].reshape(shape + leaf[0].shape[1:]), *parts
     )
+
+
+def map_in_threads(fn: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
+    """`fn` of each item, two at a time, since XLA keeps to one core in loops as small as ours."""
+    first = fn(items[0])  # alone: threads would each compile what they share
+    with concurrent.futures.ThreadPoolExecutor(2) as pool:
+        return [first, *pool.map(fn, items[1:])]
 
 
 @jax.jit
