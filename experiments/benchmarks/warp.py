@@ -18,7 +18,7 @@ from jaxcloseup.geometry.union_warp import block_sources, union_warp
 
 VIEWS, HEIGHT, WIDTH, FOCAL = 50, 540, 960, 800.0
 CHOSEN = 1024
-TARGETS = 5
+TARGETS = 3
 
 
 def run() -> None:
