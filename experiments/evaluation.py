@@ -95,12 +95,12 @@ def score(rendering: Rendering, target: Target) -> dict[str, float | str | None]
         values |= _depth_error(rendering.depth, target.depth)
     result = {}
     for key, value in values.items():
-        if isinstance(value, str):
-            result[key] = value
+        result[key] = value if isinstance(value, str) else float(value)
+        if isinstance(value, str) or np.isfinite(value):
             continue
-        result[key] = float(value) if np.isfinite(value) else None
-        if result[key] is None and "_reason" not in key:
-            result[f"{key}_reason"] = "no pixel of this view counts"
+        result[key] = None
+        equal = np.isposinf(value)
+        result[f"{key}_reason"] = "equals the truth" if equal else "no pixel of this view counts"
     return result | {"lpips_vgg": None, "lpips_vgg_reason": LPIPS_REASON}
 
 

@@ -2,7 +2,7 @@
 
 import html
 import json
-import os
+import math
 import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -11,6 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from jaxcloseup.artifacts.files import write_file
 from jaxcloseup.artifacts.images import png_data_uri
 
 
@@ -63,8 +64,16 @@ def print_table(results: Mapping[str, Any]) -> None:
 
 
 def write_json(path: pathlib.Path, results: Mapping[str, Any]) -> None:
-    """Write strict JSON, whole or not at all."""
-    _write_text(path, json.dumps(results, indent=1, allow_nan=False))
+    """Write strict JSON, whole or not at all; numbers that are not finite become null."""
+
+    def strict(value):
+        if isinstance(value, Mapping):
+            return {key: strict(inner) for key, inner in value.items()}
+        if isinstance(value, list | tuple):
+            return [strict(inner) for inner in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    write_file(path, json.dumps(strict(results), indent=1, allow_nan=False).encode())
 
 
 def write_report(
@@ -101,7 +110,7 @@ def write_report(
         )
     config = html.escape(json.dumps({k: results[k] for k in ("config", "versions")}, indent=1))
     parts.append(f"<details><summary>Configuration</summary><pre>{config}</pre></details></html>")
-    _write_text(path, "\n".join(parts))
+    write_file(path, "\n".join(parts).encode())
 
 
 def _labels_table(labels):
@@ -122,12 +131,6 @@ def _format(key, value):
     if value is None:
         return "-"
     return f"{value:.2f}" if "psnr" in key else f"{value:.4f}"
-
-
-def _write_text(path, text):
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
 
 
 _STYLE = """

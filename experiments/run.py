@@ -10,11 +10,13 @@ import contextlib
 import dataclasses
 import datetime
 import functools
+import logging
 import os
 import pathlib
 import platform
 import sys
 import time
+import warnings
 from collections.abc import Iterator
 from typing import Any
 
@@ -84,6 +86,9 @@ def main(argv: list[str]) -> None:
     if len(argv) > 1:
         raise app.UsageError(f"unexpected argument: {argv[1]}")
     set_up_compilation_cache(FLAGS.compilation_cache)
+    # Warnings are sentences for the user; jax's notes on absent accelerators are not.
+    warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
+    logging.getLogger("jax._src.xla_bridge").setLevel(logging.WARNING)
     preset = preset_from_flags()
     try:
         output_dir = choose_output_dir(FLAGS.output_dir, FLAGS.scene, FLAGS.method)
@@ -220,7 +225,7 @@ def run(
         "labels": audit,
         "seconds": seconds,
         "history": history,
-        "config": jsonable(preset),
+        "config": config(preset),
         "versions": versions(),
     }
     write_json(output_dir / "results.json", results)
@@ -236,17 +241,10 @@ def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
     seconds[name] = time.perf_counter() - start
 
 
-def jsonable(preset: Preset) -> dict[str, Any]:
-    """The configuration as JSON can hold it: infinities become text."""
-
-    def plain(value):
-        if isinstance(value, dict):
-            return {key: plain(inner) for key, inner in value.items()}
-        if isinstance(value, tuple):
-            return [plain(inner) for inner in value]
-        return str(value) if isinstance(value, float) and not np.isfinite(value) else value
-
-    return plain(dataclasses.asdict(preset))
+def config(preset: Preset) -> dict[str, Any]:
+    """The configuration as JSON can hold it: what is infinite, and so off, becomes "inf"."""
+    values = dataclasses.asdict(preset)
+    return {key: "inf" if value == np.inf else value for key, value in values.items()}
 
 
 def versions() -> dict[str, str]:

@@ -14,6 +14,7 @@ from experiments import run as program
 from experiments.audit import blur_to_footprint
 from experiments.evaluation import Target, score, summarise
 from experiments.presets import PRESETS, QUICK
+from experiments.report import write_json
 from jaxcloseup.field import Rendering
 from jaxcloseup.scenes import load_scene
 from jaxcloseup.train import TrainConfig
@@ -146,7 +147,24 @@ def test_flags_override_the_preset(parsed_flags):
     assert preset.closeup_steps == 7
     assert preset.nerf.compute_dtype == "bfloat16"
     assert preset.baseline_steps == PRESETS["paper"].baseline_steps == 200_000
-    assert "inf" in json.dumps(program.jsonable(preset), allow_nan=False)
+    assert program.config(preset)["depth_tolerance"] == "inf"
+    json.dumps(program.config(preset), allow_nan=False)
+
+
+def test_numbers_that_are_not_finite_become_null(tmp_path):
+    write_json(tmp_path / "results.json", {"a": [float("nan"), 1.5], "b": {"c": float("inf")}})
+    text = (tmp_path / "results.json").read_text()
+    assert json.loads(text) == {"a": [None, 1.5], "b": {"c": None}}
+
+
+def test_a_perfect_render_has_no_psnr_but_a_reason():
+    rgb = jnp.full((16, 16, 3), 0.5)
+    ones = jnp.ones((16, 16))
+    result = score(Rendering(rgb, ones, ones), Target("0", None, rgb, ones, ones * 3, ones))
+    assert result["psnr"] is None
+    assert result["psnr_reason"] == "equals the truth"
+    assert result["ssim"] == pytest.approx(1)
+    assert result["depth_error_median"] == 0
 
 
 def test_scores_ignore_padding_and_say_what_is_missing():

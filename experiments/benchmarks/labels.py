@@ -6,18 +6,21 @@ pixels that the source sees. What training leaves of these figures is in each ru
 """
 
 import dataclasses
+import pathlib
 
 import jax
 import jax.numpy as jnp
 
 from experiments.audit import audit_labels
 from experiments.evaluation import exact_depths
+from experiments.pictures import label_pictures
 from experiments.presets import PRESETS, pseudo_settings
 from jaxcloseup.scenes import load_scene
 from jaxcloseup.scenes.procedural import PROCEDURAL_SCENES
 
 
 DOWNSCALE = 8
+PICTURES = pathlib.Path("outputs/labels")
 MASKS = {
     "paper": {},
     "no mask": {"use_mask": 0.0},
@@ -26,13 +29,14 @@ MASKS = {
 
 
 def run() -> None:
-    """Print error, kept and leaked shares for each scene and mask."""
+    """Print error, kept and leaked shares for each scene and mask; write pictures of labels."""
     print(f"labels from exact depth at 1/{DOWNSCALE} of the full size")
     print(f"{'scene':>8}  {'mask':<22}  {'error':>6}  {'kept':>6}  {'leaked':>6}")
     for name in PROCEDURAL_SCENES:
         scene = load_scene(name, downscale=DOWNSCALE)
         scene = dataclasses.replace(scene, train=jax.device_put(scene.train))
         exact = exact_depths(scene, scene.train.cameras)
+        render_depth = jax.jit(lambda camera, scene=scene: scene.surface(camera).depth)
         for mask, changes in MASKS.items():
             settings = pseudo_settings(PRESETS["paper"])
             settings = settings.replace(**{k: jnp.float32(v) for k, v in changes.items()})
@@ -42,10 +46,20 @@ def run() -> None:
                 scene=scene,
                 settings=settings,
                 depths=exact,
-                render_depth=jax.jit(lambda camera, scene=scene: scene.surface(camera).depth),
+                render_depth=render_depth,
             )
             print(
                 f"{name:>8}  {mask:<22}  {found['error']:>6.4f}  {found['kept']:>6.1%}"
                 f"  {found['leaked']:>6.1%}",
                 flush=True,
             )
+        label_pictures(
+            jax.random.key(1),
+            [],
+            PICTURES / name,
+            scene=scene,
+            settings=pseudo_settings(PRESETS["paper"]),
+            depths=exact,
+            render_depth=render_depth,
+        )
+    print(f"pictures: {PICTURES}")
