@@ -96,7 +96,7 @@ def ssim_map(a, b):
 
 
 def first_crossing(solids, origin, direction, nearest=1e-4):
-    """Depth, world normal and index of the nearest of `solids` = (kind, to_world, taper) on one ray.
+    """Depth, world normal and index of the nearest of `solids` = (kind, to_world, taper) on a ray.
 
     Kinds are "plane", "box", "sphere", "cylinder": unit shapes under an affine map `[3, 4]`. Each
     face is intersected by itself, in the unit frame. Also returned is the least distance, in the
