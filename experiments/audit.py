@@ -51,7 +51,7 @@ def audit_labels(
     depths: jax.Array,
     render_depth: Callable[[Camera], jax.Array],
     count: int = 16,
-) -> dict[str, float]:
+) -> dict[str, float | str | None]:
     """Label error and yield over random virtual close-ups of a procedural scene.
 
     Args:
@@ -66,6 +66,7 @@ def audit_labels(
     Returns:
       `error`, mean absolute difference of kept labels from the blurred truth; `kept`, share of the
       pixels that the source view truly sees; `leaked`, share of kept pixels that it does not.
+      None beside a reason where there is nothing to divide by.
     """
     sample = jax.jit(sample_virtual_camera)
     label_image = jax.jit(make_label)
@@ -86,11 +87,17 @@ def audit_labels(
         kept += float(weight.sum())
         kept_visible += float((weight * visible).sum())
         visible_total += float(visible.sum())
-    return {
-        "error": error / max(kept, 1),
-        "kept": kept_visible / max(visible_total, 1),
-        "leaked": 1 - kept_visible / max(kept, 1),
+    shares = {
+        "error": (error, kept),
+        "kept": (kept_visible, visible_total),
+        "leaked": (kept - kept_visible, kept),
     }
+    result: dict[str, float | str | None] = {}
+    for name, (part, whole) in shares.items():
+        result[name] = part / whole if whole else None
+        if not whole:
+            result[f"{name}_reason"] = "no label was kept" if name != "kept" else "nothing is seen"
+    return result
 
 
 @jax.jit

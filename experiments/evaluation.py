@@ -1,6 +1,5 @@
 """Scoring a field on held-out views, full frame and where training photographs saw the surface."""
 
-import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -11,7 +10,7 @@ import numpy as np
 from jaxcloseup.batch import Views, camera_at, to_float
 from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
-from jaxcloseup.metrics import cc_psnr, psnr, quantize, ssim
+from jaxcloseup.metrics import SSIM_TAPS, cc_psnr, psnr, quantize, ssim
 from jaxcloseup.pseudo import count_seen
 from jaxcloseup.scenes import Scene
 
@@ -80,10 +79,7 @@ def score(rendering: Rendering, target: Target) -> dict[str, float | str | None]
 
     image, truth, weight = map(crop, (rendering.rgb, target.rgb, target.weight))
     seen = crop(target.seen)
-    values = {}
-    if min(truth.shape[:2]) < 11:
-        values["ssim_reason"] = "SSIM needs 11 pixels a side"
-    values |= _full_metrics(image, truth, weight)
+    values = dict(_full_metrics(image, truth, weight))
     for least in SEEN_BY:
         values |= {
             f"{key}_seen{least}": value
@@ -93,14 +89,21 @@ def score(rendering: Rendering, target: Target) -> dict[str, float | str | None]
         }
     if target.depth is not None:
         values |= _depth_error(rendering.depth, target.depth)
+    finite_image = np.isfinite(image).all()
     result = {}
     for key, value in values.items():
-        result[key] = value if isinstance(value, str) else float(value)
-        if isinstance(value, str) or np.isfinite(value):
+        result[key] = float(value) if np.isfinite(value) else None
+        if result[key] is not None:
             continue
-        result[key] = None
-        equal = np.isposinf(value)
-        result[f"{key}_reason"] = "equals the truth" if equal else "no pixel of this view counts"
+        if not finite_image:
+            reason = "the rendering is not finite"
+        elif np.isposinf(value):
+            reason = "equals the truth"
+        elif "ssim" in key and min(truth.shape[:2]) < SSIM_TAPS:
+            reason = f"SSIM needs {SSIM_TAPS} pixels a side"
+        else:
+            reason = "no pixel of this view counts"
+        result[f"{key}_reason"] = reason
     return result | {"lpips_vgg": None, "lpips_vgg_reason": LPIPS_REASON}
 
 
@@ -112,7 +115,8 @@ def summarise(views: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
         known = [values[key] for values in views.values() if values.get(key) is not None]
         summary[key] = float(np.mean(known)) if known else None
         if not known:
-            summary[f"{key}_reason"] = next(iter(views.values()))[f"{key}_reason"]
+            reasons = (values.get(f"{key}_reason") for values in views.values())
+            summary[f"{key}_reason"] = next(filter(None, reasons))
     return summary | {"views": {name: dict(values) for name, values in views.items()}}
 
 
@@ -124,22 +128,25 @@ def evaluate(
     return summarise({t.name: score(renderings[t.name], t) for t in targets}), renderings
 
 
-@functools.partial(jax.jit)
+@jax.jit
 def _full_metrics(image, truth, weight):
     image, truth = quantize(image), quantize(truth)
-    metrics = {"psnr": psnr, "cc_psnr": cc_psnr}
-    if min(truth.shape[:2]) >= 11:
-        metrics["ssim"] = ssim
+    metrics = {"psnr": psnr, "cc_psnr": cc_psnr, "ssim": _ssim}
     return {name: metric(image, truth, weight=weight) for name, metric in metrics.items()}
 
 
 @jax.jit
 def _masked_metrics(image, truth, weight):
     image, truth = quantize(image), quantize(truth)
-    metrics = {"psnr": psnr(image, truth, weight=weight), "coverage": jnp.mean(weight > 0)}
-    if min(truth.shape[:2]) >= 11:
-        metrics["ssim"] = ssim(image, truth, weight=weight)
-    return metrics
+    return {
+        "psnr": psnr(image, truth, weight=weight),
+        "ssim": _ssim(image, truth, weight=weight),
+        "coverage": jnp.mean(weight > 0),
+    }
+
+
+def _ssim(image, truth, *, weight):
+    return ssim(image, truth, weight=weight) if min(truth.shape[:2]) >= SSIM_TAPS else jnp.nan
 
 
 @jax.jit

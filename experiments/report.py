@@ -50,7 +50,7 @@ def rows(results: Mapping[str, Any]) -> list[list[str]]:
         for stage, splits in results["stages"].items():
             if split in splits:
                 values = [splits[split].get(key) for key in shown]
-                table.append([title, stage, *map(_format, shown, values)])
+                table.append([title, stage, *map(format_metric, shown, values)])
     return table
 
 
@@ -115,8 +115,8 @@ def write_report(
 
 def _labels_table(labels):
     lines = "".join(
-        f"<tr><td>{depth.replace('_', ' ')}<td>{values['error']:.4f}<td>{values['kept']:.1%}"
-        f"<td>{values['leaked']:.1%}"
+        f"<tr><td>{depth.replace('_', ' ')}"
+        + "".join(f"<td>{format_metric(key, values[key])}" for key in ("error", "kept", "leaked"))
         for depth, values in labels.items()
     )
     return (
@@ -127,7 +127,8 @@ def _labels_table(labels):
     )
 
 
-def _format(key, value):
+def format_metric(key: str, value: float | None) -> str:
+    """A metric as text, "-" where it could not be computed."""
     if value is None:
         return "-"
     return f"{value:.2f}" if "psnr" in key else f"{value:.4f}"

@@ -37,7 +37,7 @@ from experiments.presets import (
     make_train_config,
     pseudo_settings,
 )
-from experiments.report import print_table, write_json, write_report
+from experiments.report import format_metric, print_table, write_json, write_report
 from jaxcloseup.geometry.union_warp import block_sources
 from jaxcloseup.scenes import Scene, SceneError, load_scene
 from jaxcloseup.train import init_state, pseudo_step, render_depths, train_step
@@ -141,6 +141,7 @@ def run(
 ) -> dict[str, Any]:
     """All stages on one scene; writes everything under `output_dir` and returns the results."""
     key_init, key_audit, key_pictures = jax.random.split(jax.random.key(seed), 3)
+    key_depths = jax.random.fold_in(key_init, 1)
     scene = dataclasses.replace(scene, train=jax.device_put(scene.train))
     views, size = scene.train, scene.train.cameras
     print(
@@ -169,7 +170,8 @@ def run(
                 stages[stage][split], renderings[stage, split] = evaluate(rendered, of_split)
                 folder = output_dir / "renders" / stage / split
                 write_renders(folder, renderings[stage, split], scene)
-                print(f"{stage:>9} {split}: PSNR {stages[stage][split]['psnr']:.2f} dB", flush=True)
+                psnr = format_metric("psnr", stages[stage][split]["psnr"])
+                print(f"{stage:>9} {split}: PSNR {psnr} dB", flush=True)
 
     on_photographs = make_runner(functools.partial(train_step, **bound))
 
@@ -180,9 +182,14 @@ def run(
     state = init_state(key_init, scene.points, scene.rgb, field=field, optimizer=optimizer)
     baseline = train("baseline", on_photographs, state, views, steps=preset.baseline_steps)
     with timed(seconds, "depths"):
-        depths = jax.jit(functools.partial(render_depths, field, near=scene.near, far=scene.far))(
-            baseline.params, baseline.buffers, views.cameras
-        )
+        options = {
+            "near": scene.near,
+            "far": scene.far,
+            "key": key_depths if preset.train.perturbed_depth else None,
+            "divided": not preset.train.undivided_depth,
+        }
+        render_all = jax.jit(functools.partial(render_depths, field, **options))
+        depths = render_all(baseline.params, baseline.buffers, views.cameras)
         sources = jax.jit(block_sources)(views.cameras, depths, views.weight)
         exact = exact_depths(scene, views.cameras) if scene.surface else None
         for split in scene.names:

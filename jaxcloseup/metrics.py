@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxcloseup.numerics import matmul, safe_divide
 
 
-_SSIM_TAPS = 11
+SSIM_TAPS = 11
 
 
 def quantize(image: jax.Array) -> jax.Array:
@@ -47,13 +47,13 @@ def ssim(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = None
         so crop padding away rather than give it the weight 0.
     """
     weight = _check(image, target, weight)
-    if min(image.shape[:2]) < _SSIM_TAPS:
-        raise ValueError(f"SSIM needs {_SSIM_TAPS} pixels a side: the image is {image.shape[:2]}.")
+    if min(image.shape[:2]) < SSIM_TAPS:
+        raise ValueError(f"SSIM needs {SSIM_TAPS} pixels a side: the image is {image.shape[:2]}.")
     with jax.numpy_dtype_promotion("standard"):  # dm_pix mixes integers and floats
         similarity = dm_pix.ssim(
-            image, target, max_val=1.0, filter_size=_SSIM_TAPS, filter_sigma=1.5, return_map=True
+            image, target, max_val=1.0, filter_size=SSIM_TAPS, filter_sigma=1.5, return_map=True
         )
-    border = _SSIM_TAPS // 2
+    border = SSIM_TAPS // 2
     return _weighted_mean(similarity, weight[border:-border, border:-border])
 
 

@@ -65,7 +65,8 @@ def sample_virtual_camera(
     key_view, key_pose = jax.random.split(key)
     index = jax.random.randint(key_view, (), 0, len(views))
     weight = views.weight[index]
-    weight = jnp.where(settings.fixed_anchors > 0, four_anchors(*weight.shape), weight)
+    anchors = jnp.where(weight > 0, four_anchors(*weight.shape), 0)
+    weight = jnp.where(settings.fixed_anchors > 0, anchors, weight)
     camera = camera_at(views.cameras, index)
     return sample_closeup_camera(key_pose, camera, depths[index], settings.pose, weight), index
 

@@ -54,7 +54,8 @@ class TrainConfig:
       undivided_depth: use depth not divided by alpha, as released, for labels.
       pooled_loss: one mean over all valid pixels, as released, not half of each mean (paper);
         for fields that render single pixels.
-      gradient_chunk: pixels differentiated at once, see `rendered_loss`; None for all.
+      gradient_chunk: pixels differentiated at once, see `rendered_loss`; None for all. With chunks,
+        every leaf of the field's `aux` is per pixel.
     """
 
     num_rays: int | None = 1024
@@ -201,18 +202,24 @@ def render_depths(
     near: float,
     far: float,
     min_alpha: float = 0.5,
+    key: jax.Array | None = None,
+    divided: bool = True,
 ) -> jax.Array:
     """Z-depths `[V, H, W]` of whole views, one after the other, for labels and anchors.
 
-    Depth is 0, undefined, where alpha is under `min_alpha` or depth outside [near, far].
+    Depth is 0, undefined, where alpha is under `min_alpha` or depth outside [near, far]. The
+    released script renders with sampling noise (`key`) and does not divide by alpha (`divided`).
     """
 
-    def one_view(camera):
-        seen = field.render(params, buffers, camera, None, None)
-        defined = (seen.alpha >= min_alpha) & (seen.depth >= near) & (seen.depth <= far)
-        return jnp.where(defined, seen.depth, 0)
+    def one_view(view):
+        camera, key = view
+        seen = field.render(params, buffers, camera, None, key)
+        depth = seen.depth if divided else seen.depth * seen.alpha
+        defined = (seen.alpha >= min_alpha) & (depth >= near) & (depth <= far)
+        return jnp.where(defined, depth, 0)
 
-    return jax.lax.map(one_view, cameras)
+    keys = None if key is None else jax.random.split(key, cameras.intrinsics.shape[0])
+    return jax.lax.map(one_view, (cameras, keys))
 
 
 def _sample_batch(key, views, config):

@@ -2,9 +2,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import reference
 
 from jaxcloseup.volume import compositing
-from tests import reference
 
 
 composite = jax.jit(compositing.composite)

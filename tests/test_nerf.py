@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+import reference
 
 from jaxcloseup.batch import Batch
 from jaxcloseup.field import Rendering
@@ -14,7 +15,6 @@ from jaxcloseup.rendered_loss import rendered_loss
 from jaxcloseup.volume.encodings import positional_encoding
 from jaxcloseup.volume.mlp import apply_network, init_network
 from jaxcloseup.volume.nerf import NerfAux, NerfConfig, nerf
-from tests import reference
 
 
 TINY = NerfConfig(

@@ -260,3 +260,10 @@ def test_a_new_camera_reuses_the_compiled_render(scene):
     moved = Camera(camera.camtoworld + 0.01, camera.intrinsics, 27, 48)
     scene.surface(moved)
     assert procedural._render_surface._cache_size() == before
+
+
+def test_a_surface_first_asked_for_inside_a_trace_serves_later_traces(scene):
+    procedural._world.cache_clear()
+    camera = camera_at(scene.test.cameras, 0)
+    for _ in range(2):
+        jax.jit(lambda camera: scene.surface(camera).depth).lower(camera)

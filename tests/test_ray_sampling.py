@@ -2,10 +2,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import reference
 
 from jaxcloseup.volume import ray_sampling
 from jaxcloseup.volume.ray_sampling import stratified
-from tests import reference
 
 
 importance = jax.jit(ray_sampling.importance, static_argnames="num_samples")

@@ -32,8 +32,8 @@ def read_image(path: pathlib.Path, *, background: float = 1.0) -> np.ndarray:
 
 
 def read_mask(path: pathlib.Path) -> np.ndarray:
-    """A mask as uint8 `[H, W]`: white counts, black does not."""
-    return read_image(path)[..., 0]
+    """A mask as uint8 `[H, W]`: white counts, black and transparent do not."""
+    return read_image(path, background=0.0)[..., 0]
 
 
 def downscale_image(image: np.ndarray, factor: int) -> np.ndarray:

@@ -120,7 +120,9 @@ def _world(name: str) -> shading.World:
     def bake(*scene: Any) -> np.ndarray:
         return _kept(f"{name}-light", lambda: {"light": bake_light(*scene)})["light"]
 
-    return build_world(model, bake)
+    # The first call may come from inside a trace, whose arrays must not be kept.
+    with jax.ensure_compile_time_eval():
+        return build_world(model, bake)
 
 
 def _rng(name: str, stream: int) -> np.random.Generator:

@@ -169,12 +169,16 @@ def _read_frame(path: pathlib.Path, fields: dict[str, Any], entry: dict[str, Any
     if "transform_matrix" not in entry:
         raise SceneError(f"{label}: no transform_matrix: give its camera-to-world pose.")
     pose = _rigid_transform(label, "transform_matrix", entry["transform_matrix"])
-    mask = entry.get("mask_path")
+    mask = entry.get("mask_path") or None
+    if not isinstance(mask, str | None):
+        raise SceneError(
+            f"{label}: mask_path is {mask!r}: give the path of a mask, or leave it out."
+        )
     frame = Frame(
         source=path,
         listed=listed,
         file=_find(path.parent, listed),
-        mask=_find(path.parent, mask) if isinstance(mask, str) and mask else None,
+        mask=_find(path.parent, mask) if mask else None,
         camtoworld=pose * np.array([1, -1, -1, 1]),  # OpenGL to OpenCV: y and z change sign
         size=size or None,
         lens=(entry, fields),
