@@ -53,6 +53,7 @@ def without(key, **changes):
         ([frame("")], r"a frame has no file_path \(got ''\)"),
         ([frame(3)], r"a frame has no file_path \(got 3\)"),
         ([without("transform_matrix")], "no transform_matrix"),
+        ([frame("train/a.png", mask_path=3)], "mask_path is 3"),
         (
             [frame("train/a.png"), frame("x.png"), frame("y.png")],
             r"2 of 3 listed images do not exist \(x\.png, y\.png\)",

@@ -176,6 +176,11 @@ def test_mask_weighs_pixels(capture):
     scene = load_scene(capture, downscale=2)
     assert scene.train.weight[0, 0].tolist() == pytest.approx([1, 0.5, 0, 0], abs=2e-3)
     assert (np.asarray(scene.train.weight[1]) == 1).all()
+    clear = np.full((HEIGHT, WIDTH, 4), 255, np.uint8)
+    clear[..., 3] = mask
+    write_image(capture / "masks/a.png", clear)
+    again = load_scene(capture, downscale=2)
+    np.testing.assert_array_equal(again.train.weight, scene.train.weight)
     write_image(capture / "masks/a.png", mask[:3])
     with pytest.raises(SceneError, match=r"masks/a\.png is 8 x 3 pixels and its photograph 8 x 6"):
         load_scene(capture)

@@ -156,6 +156,15 @@ def test_virtual_cameras_come_from_every_view_and_keep_to_their_anchors(capture)
     assert len(np.unique(np.round(ground, 1), axis=0)) > 4  # magnification still varies
 
 
+def test_fixed_anchors_keep_out_of_what_weighs_nothing(capture):
+    views, depths, _ = capture
+    left = views.replace(weight=views.weight.at[:, :, plane.WIDTH // 2 :].set(0))
+    sample = jax.jit(jax.vmap(sample_virtual_camera, (0, None, None, None)))
+    keys = jax.random.split(jax.random.key(0), 64)
+    cameras, index = sample(keys, left, depths, settings(fixed_anchors=1.0))
+    assert jnp.all(cameras.position[:, 0] < views.cameras.position[index, 0])
+
+
 def test_best_source_sees_most_of_the_target(capture):
     views, depths, _ = capture
     for index, x in enumerate((-1.0, 0.0, 1.0)):

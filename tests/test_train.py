@@ -186,3 +186,7 @@ def test_depths_are_undefined_where_the_field_is_thin_or_out_of_range(capture):
     result = render_depths(field, None, (), views.cameras, near=2, far=4)
     expected = np.where((alpha >= 0.5) & (depth >= 2) & (depth <= 4), depth, 0)
     np.testing.assert_array_equal(result, np.stack([expected] * 3))
+    result = render_depths(field, None, (), views.cameras, near=2, far=4, divided=False)
+    thin = np.asarray(depth * alpha)
+    expected = np.where((alpha >= 0.5) & (thin >= 2) & (thin <= 4), thin, 0)
+    np.testing.assert_array_equal(result, np.stack([expected] * 3))
