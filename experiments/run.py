@@ -250,7 +250,7 @@ def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
 
 def config(preset: Preset) -> dict[str, Any]:
     """The configuration as JSON can hold it: what is infinite, and so off, becomes "inf"."""
-    values = dataclasses.asdict(preset)
+    values = dataclasses.asdict(preset) | {"magnification": list(preset.magnification)}
     return {key: "inf" if value == np.inf else value for key, value in values.items()}
 
 
