@@ -3,7 +3,9 @@
 The paper's union of forward warps. At full size it has tens of millions of sources of which a
 close-up sees a few, so sources are kept in square blocks with bounding spheres: blocks that cannot
 land in the virtual view are culled whole, and the rest are lifted and projected on the fly, a chunk
-at a time. The number of chunks is dynamic, so there is no capacity to overflow.
+at a time. Most of those miss the chosen pixels: a chunk leaves one bit for each source, and only
+sources whose bit is set are projected again and drawn. Both loops have dynamic lengths, so there is
+no capacity to overflow.
 """
 
 import chex
@@ -12,15 +14,15 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points
-from jaxcloseup.geometry.warp import ForwardWarp
+from jaxcloseup.geometry.warp import NO_SOURCE, ForwardWarp, draw_nearest
 from jaxcloseup.numerics import matmul
 
 
 # Measured on two CPU cores; the result does not depend on them.
 BLOCK = 16  # pixels on the side of a block: culled as one
-CHUNK = 512  # blocks projected together
-RUN = 32  # consecutive pixels of a block: drawn together if one of them lands
-GROUP = 128  # runs drawn together
+CHUNK = 2048  # most blocks projected together
+GROUP = 1024  # least number of sources drawn together
+_WORD = 32  # bits
 
 
 @struct.dataclass
@@ -124,35 +126,38 @@ def union_warp(
     chosen = chosen[:, 1] * camera.width + chosen[:, 0]
     slot_of_pixel = jnp.full(camera.height * camera.width, -1, jnp.int32)
     slot_of_pixel = slot_of_pixel.at[chosen].set(jnp.arange(chosen.size, dtype=jnp.int32))
+    wanted = slot_of_pixel >= 0
 
     blocks_there = _may_land(sources, camera) & (sources.view != exclude)
     affine = _pixel_to_virtual(cameras, camera)
-    size = BLOCK * BLOCK
+    every_offset = jnp.arange(BLOCK * BLOCK, dtype=jnp.int32)[None]
+    num_blocks = len(blocks_there)
+    group = max(GROUP, chosen.size // 32)
 
-    def draw_chunk(index, live, buffer):
-        target, depth = _project(sources, index, affine, camera)
-        slot = jnp.where(target >= 0, slot_of_pixel[target], -1)
-        slot = jnp.where(live[:, None], slot, -1)
-        source = index[:, None] * size + jnp.arange(size, dtype=jnp.int32)[None]
-        slot, depth, source = (array.reshape(-1, RUN) for array in (slot, depth, source))
+    def draw_chunk(block, live, buffer):
+        depth = sources.depth[block]
+        target, _ = _project(sources, block[:, None], every_offset, depth, affine, camera)
+        hit = (target >= 0) & wanted[target] & live[:, None]
 
-        def draw_runs(run, live, buffer):
-            # A slot past the end drops the pixel.
-            target = jnp.where((slot[run] >= 0) & live[:, None], slot[run], chosen.size)
-            return _draw(buffer, target.ravel(), depth[run].ravel(), source[run].ravel())
+        def draw_group(row, offset, live, buffer):
+            source = block[row] * BLOCK * BLOCK + offset
+            depth = sources.depth[block[row], offset]
+            target, depth = _project(sources, block[row], offset, depth, affine, camera)
+            slot = jnp.where((target >= 0) & live, slot_of_pixel[target], -1)
+            # A slot past the end is not drawn.
+            return draw_nearest(buffer, jnp.where(slot >= 0, slot, chosen.size), depth, source)
 
-        return _for_each_true(jnp.any(slot >= 0, axis=1), GROUP, draw_runs, buffer)
+        return _for_each_hit(hit, group, draw_group, buffer)
 
-    nothing = jnp.iinfo(jnp.int32).max
     buffer = (
         jnp.full(chosen.size, jnp.inf, sources.depth.dtype),
-        jnp.full(chosen.size, nothing, jnp.int32),
+        jnp.full(chosen.size, NO_SOURCE, jnp.int32),
     )
-    buffer = _for_each_true(blocks_there, CHUNK, draw_chunk, buffer)
+    buffer = _for_each_true(blocks_there, min(CHUNK, -(-num_blocks // 8)), draw_chunk, buffer)
     depth, source = (array[slot_of_pixel[chosen]] for array in buffer)
 
-    hit = source != nothing
-    block, offset = jnp.divmod(jnp.where(hit, source, 0), size)
+    hit = source != NO_SOURCE
+    block, offset = jnp.divmod(jnp.where(hit, source, 0), BLOCK * BLOCK)
     x = sources.corner[block, 0] + offset % BLOCK
     y = sources.corner[block, 1] + offset // BLOCK
     found = jnp.where(hit[:, None], values[sources.view[block], y, x], 0)
@@ -201,20 +206,16 @@ def _pixel_to_virtual(cameras, camera):
     return jax.vmap(one_view)(cameras)
 
 
-def _project(sources, index, affine, camera):
-    """Flat target pixel (-1 for none) and depth of every pixel of some blocks, `[n, P]`."""
-    matrix, offset = (array[sources.view[index]] for array in affine)
-    corner = sources.corner[index].astype(offset.dtype) + 0.5
-    depth = sources.depth[index]
-    column, row = (
-        array.reshape(1, -1).astype(depth.dtype)
-        for array in jnp.meshgrid(jnp.arange(BLOCK), jnp.arange(BLOCK))
-    )
+def _project(sources, block, offset, depth, affine, camera):
+    """Flat target pixel (-1 for none) and depth of pixels of blocks; indices broadcast."""
+    matrix, shift = (array[sources.view[block]] for array in affine)
+    corner = sources.corner[block].astype(depth.dtype) + 0.5
+    column, row = (index.astype(depth.dtype) for index in (offset % BLOCK, offset // BLOCK))
 
     def coordinate(axis):
-        by_x, by_y, one = (matrix[:, axis, k][:, None] for k in range(3))
-        start = by_x * corner[:, :1] + by_y * corner[:, 1:] + one
-        return depth * (start + by_x * column + by_y * row) + offset[:, axis][:, None]
+        by_x, by_y, one = (matrix[..., axis, k] for k in range(3))
+        start = by_x * corner[..., 0] + by_y * corner[..., 1] + one
+        return depth * (start + by_x * column + by_y * row) + shift[..., axis]
 
     x, y, z = map(coordinate, range(3))
     in_front = (depth > 0) & (z > jnp.finfo(z.dtype).eps)
@@ -225,12 +226,44 @@ def _project(sources, index, affine, camera):
     return jnp.where(lands, y * camera.width + x, -1), z
 
 
-def _draw(buffer, slot, depth, source):
-    """Draw into a z-buffer of (depth, source); among equal depths the lowest source wins."""
-    nearest = buffer[0].at[slot].min(depth, mode="drop")
-    wins = depth == nearest.at[slot].get(mode="fill", fill_value=jnp.nan)
-    kept = jnp.where(nearest < buffer[0], jnp.iinfo(jnp.int32).max, buffer[1])
-    return nearest, kept.at[jnp.where(wins, slot, nearest.size)].min(source, mode="drop")
+def _for_each_hit(hit, count, body, carry):
+    """Fold `body(row[count], column[count], live[count], carry)` over the true of `[N, P]`.
+
+    XLA's own compaction, `jnp.nonzero`, writes an index for every flag. Here flags become bits, 32
+    to a word, and the k-th one is found by bisection: over rows, then words, then in its word.
+    """
+    bits = jnp.left_shift(jnp.uint32(1), jnp.arange(_WORD, dtype=jnp.uint32))
+    words = jnp.where(hit.reshape(len(hit), -1, _WORD), bits, 0)
+    words = jnp.sum(words, axis=-1, dtype=jnp.uint32)
+    ends_in_row = jnp.cumsum(jax.lax.population_count(words).astype(jnp.int32), axis=-1)
+    ends = jnp.cumsum(ends_in_row[:, -1])
+
+    def step(i, carry):
+        rank = i * count + jnp.arange(count, dtype=jnp.int32)
+        live = rank < ends[-1]
+        row = jnp.minimum(jnp.searchsorted(ends, rank, side="right"), len(hit) - 1)
+        rank = rank - (ends[row] - ends_in_row[row, -1])
+        word = jnp.sum(ends_in_row[row] <= rank[:, None], axis=-1, dtype=jnp.int32)
+        word = jnp.minimum(word, words.shape[1] - 1)
+        rank = rank - jnp.where(word > 0, ends_in_row[row, word - 1], 0)
+        bit = _nth_set_bit(words[row, word], rank)
+        return body(row, word * _WORD + bit, live, carry)
+
+    return jax.lax.fori_loop(0, (ends[-1] + count - 1) // count, step, carry)
+
+
+def _nth_set_bit(word, rank):
+    """Position of the set bit of a uint32 that has `rank` set bits below it."""
+    position = jnp.zeros_like(rank)
+    for half in (16, 8, 4, 2, 1):
+        low = (word >> position.astype(word.dtype)) & jnp.asarray(2**half - 1, word.dtype)
+        below = jax.lax.population_count(low).astype(rank.dtype)
+        above = rank >= below
+        rank, position = (
+            jnp.where(above, rank - below, rank),
+            jnp.where(above, position + half, position),
+        )
+    return position
 
 
 def _for_each_true(flags, count, body, carry):

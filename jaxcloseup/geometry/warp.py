@@ -12,6 +12,9 @@ import jax.numpy as jnp
 from jaxcloseup.geometry.masks import in_bounds
 
 
+NO_SOURCE = 2**31 - 1
+
+
 class ForwardWarp(NamedTuple):
     """What arrived at each target pixel.
 
@@ -102,8 +105,14 @@ def forward_warp(
         )
     pixels = jnp.where(usable[:, None], pixels, 0)
     target = _index(pixels[:, 1], height) * width + _index(pixels[:, 0], width)
-    winner = _nearest_source(target, jax.lax.stop_gradient(depth), usable, into.depth)
-    arrived = winner < depth.size
+    target = jnp.where(usable, target, height * width)
+    # What is there already counts as source -1, so that it wins ties.
+    there = jnp.where(into.hit, -1, NO_SOURCE).reshape(-1)
+    index = jnp.arange(depth.size, dtype=jnp.int32)
+    buffer = into.depth.reshape(-1), there
+    _, winner = draw_nearest(buffer, target, jax.lax.stop_gradient(depth), index)
+    winner = winner.reshape(shape)
+    arrived = (winner >= 0) & (winner < NO_SOURCE)
     winner = jnp.where(arrived, winner, 0)
     return ForwardWarp(
         values=jnp.where(arrived[..., None], values[winner], into.values),
@@ -112,22 +121,25 @@ def forward_warp(
     )
 
 
-def _nearest_source(target, depth, usable, background):
-    """Lowest index of the nearest source of each target pixel, or the number of sources."""
-    count, nowhere = depth.size, background.size
-    target = jnp.where(usable, target, nowhere)
-    buffer = background.reshape(-1)
-    nearest = buffer.at[target].min(depth, mode="drop")
+def draw_nearest(
+    buffer: tuple[jax.Array, jax.Array], target: jax.Array, depth: jax.Array, source: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Draw into a z-buffer: the nearest source wins, and among equal depths the lowest.
 
-    def at_target(array):
-        return array.at[target].get(mode="fill", fill_value=0)
+    Args:
+      buffer: depths `[N]`, inf where empty, and int32 sources `[N]`, `NO_SOURCE` where empty.
+      target: `[M]` int32 where each source falls; N and above are not drawn.
+      depth: `[M]`.
+      source: `[M]` int32 its name.
 
-    wins = usable & (depth == at_target(nearest)) & (depth < at_target(buffer))
-    index = jnp.full(nowhere, count, jnp.int32)
-    index = index.at[jnp.where(wins, target, nowhere)].min(
-        jnp.arange(count, dtype=jnp.int32), mode="drop"
-    )
-    return index.reshape(background.shape)
+    Returns:
+      The buffer, drawn into.
+    """
+    before, sources = buffer
+    nearest = before.at[target].min(depth, mode="drop")
+    wins = depth == nearest.at[target].get(mode="fill", fill_value=jnp.nan)
+    sources = jnp.where(nearest < before, NO_SOURCE, sources)
+    return nearest, sources.at[jnp.where(wins, target, nearest.size)].min(source, mode="drop")
 
 
 def _index(coordinate, size):
