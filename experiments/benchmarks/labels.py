@@ -19,7 +19,7 @@ from jaxcloseup.scenes import load_scene
 from jaxcloseup.scenes.procedural import PROCEDURAL_SCENES
 
 
-DOWNSCALE = 8
+DOWNSCALE = 4
 PICTURES = pathlib.Path("outputs/labels")
 MASKS = {
     "paper": {},
