@@ -1,6 +1,7 @@
 """What a run leaves behind: a table, results.json and one self-contained page."""
 
 import html
+import itertools
 import json
 import math
 import pathlib
@@ -55,12 +56,14 @@ def rows(results: Mapping[str, Any]) -> list[list[str]]:
 
 
 def print_table(results: Mapping[str, Any]) -> None:
-    """Print the table of a run."""
+    """Print a table for each split, a column for each stage: it fits a narrow terminal."""
     header, *body = rows(results)
-    table = Table(*header)
-    for row in body:
-        table.add_row(*row)
-    Console().print(table)
+    for split, group in itertools.groupby(body, key=lambda row: row[0]):
+        _, stages, *metrics = zip(*group, strict=True)
+        table = Table(split, *stages)
+        for name, values in zip(header[2:], metrics, strict=True):
+            table.add_row(name, *values)
+        Console().print(table)
 
 
 def write_json(path: pathlib.Path, results: Mapping[str, Any]) -> None:
