@@ -137,21 +137,28 @@ def test_float32_keeps_the_digits_of_small_splats():
         np.testing.assert_allclose(single, double, atol=1e-4 * np.abs(double).max(), rtol=0)
 
 
-def test_tiles_do_not_matter():
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_tiles_do_not_matter(precision):
     scene = random_scene(5, depth=(0.1, 2.0), log_scale=(-4.0, 0.0))
-    images = [
-        render(
-            to_surfels(scene),
-            to_camera(),
-            config=RasterizeConfig(capacity=1024, near=NEAR, tile=tile, chunk=chunk, block=block),
-        )
-        for tile, chunk, block in ((8, 4, 4), (16, 3, 1), (32, 8, 2))
-    ]
+    with jax.enable_x64(precision == "float64"):
+        images = [
+            render(
+                to_surfels(scene, precision),
+                to_camera(dtype=precision),
+                config=RasterizeConfig(
+                    capacity=1024, near=NEAR, tile=tile, chunk=chunk, block=block
+                ),
+            )
+            for tile, chunk, block in ((8, 4, 4), (16, 3, 1), (32, 8, 2))
+        ]
     for other in images[1:]:
         for name in OUTPUTS:
-            # Depth and its spread are not of order 1.
-            rtol = 0 if name in ("alpha", *VECTORS) else 5e-5
-            np.testing.assert_allclose(other[name], images[0][name], atol=1e-6, rtol=rtol)
+            # Float32 rounds depth and its spread, which are not of order 1, by more than the rest.
+            if precision == "float64":
+                atol, rtol = 1e-12, 0
+            else:
+                atol, rtol = 1e-6, 0 if name in ("alpha", *VECTORS) else 5e-5
+            np.testing.assert_allclose(other[name], images[0][name], atol=atol, rtol=rtol)
 
 
 def test_same_bits_every_time_and_in_any_order():
@@ -171,16 +178,21 @@ def test_same_bits_every_time_and_in_any_order():
         jax.tree.map(np.testing.assert_array_equal, result, results[0])
 
 
-def test_crops_are_the_image():
+@pytest.mark.parametrize(("precision", "tolerance"), [("float32", 4e-6), ("float64", 1e-12)])
+def test_crops_are_the_image(precision, tolerance):
+    """Up to the rounding of a principal point that is subtracted and added again."""
     scene = random_scene(6, depth=(0.1, 2.0), log_scale=(-4.0, 0.0))
-    whole = render(to_surfels(scene), to_camera())
-    for top in (0, 12):
-        for left in (0, 16):
-            shifted = INTRINSICS - np.array([0, 0, left, top])
-            crop = render(to_surfels(scene), to_camera(intrinsics=shifted, size=(12, 16)))
-            for name in OUTPUTS:
-                expected = whole[name][top : top + 12, left : left + 16]
-                np.testing.assert_allclose(crop[name], expected, atol=4e-6, rtol=0)
+    with jax.enable_x64(precision == "float64"):
+        surfels = to_surfels(scene, precision)
+        whole = render(surfels, to_camera(dtype=precision))
+        for top in (0, 12):
+            for left in (0, 16):
+                shifted = INTRINSICS - np.array([0, 0, left, top])
+                camera = to_camera(intrinsics=shifted, size=(12, 16), dtype=precision)
+                crop = render(surfels, camera)
+                for name in OUTPUTS:
+                    expected = whole[name][top : top + 12, left : left + 16]
+                    np.testing.assert_allclose(crop[name], expected, atol=tolerance, rtol=0)
 
 
 def test_rigid_motion_of_everything_changes_nothing():

@@ -1,5 +1,6 @@
 """Surfels rendered and differentiated, against a plain scan and against arithmetic.
 
+The discs lie at points that the photographs of `table` saw, as they do when training starts.
 The plain scan is what one would write first, given the same projection and the same tile lists: all
 tiles step through their lists together and `jax.grad` does the rest. The bound is the arithmetic of
 all (pixel, splat) evaluations at the rate at which this machine multiplies matrices.
@@ -12,16 +13,18 @@ import time
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 
 from experiments.benchmarks.timing import interleaved_medians
-from jaxcloseup.geometry.cameras import Camera
+from experiments.evaluation import exact_depths
+from jaxcloseup.batch import to_float
+from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points
 from jaxcloseup.numerics import safe_divide, safe_norm
-from jaxcloseup.splats import RasterizeConfig, Surfels, render_surfels
+from jaxcloseup.scenes import load_scene
+from jaxcloseup.splats import RasterizeConfig, render_surfels, surfels_from_points
 from jaxcloseup.splats.kernel import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from jaxcloseup.splats.projection import project_discs, to_camera
-from jaxcloseup.splats.spherical_harmonics import rgb_to_sh, sh_to_rgb
+from jaxcloseup.splats.spherical_harmonics import sh_to_rgb
 from jaxcloseup.splats.tiling import tile_lists
 
 
@@ -40,13 +43,14 @@ def run() -> None:
         "splats     image   pairs/px  forward    both  one core  cores  scan both  ratio"
         "  bound  MiB  (scan)  compile s"
     )
+    scene = load_scene("table", downscale=4)
     for count in COUNTS:
         for size in SIZES:
-            _report(count, size, rate)
+            _report(*_workload(scene, count, size), rate)
 
 
-def _report(count, size, rate):
-    surfels, camera = _surfels(count), _camera(*size)
+def _report(surfels, camera, rate):
+    count, size = surfels.means.shape[0], (camera.height, camera.width)
     # What a first guess counts as overflow says how much is needed.
     pairs, _ = _count(surfels, camera, RasterizeConfig(capacity=2**16))
     config = RasterizeConfig(capacity=-(-pairs // 2**14) * 2**14)
@@ -97,26 +101,22 @@ def _report(count, size, rate):
     )
 
 
-def _surfels(count):
-    """Surfels on a wavy surface that fills the view, smaller the more there are."""
-    rng = np.random.default_rng(0)
-    a, b = rng.uniform(-1, 1, (2, count))
-    z = 3.5 + 0.8 * np.sin(3 * a) * np.cos(2 * b) + 0.25 * rng.normal(size=count)
-    size = 0.56 * np.exp(0.4 * rng.normal(size=(count, 2))) * z[:, None] / np.sqrt(count)
-    quaternions = 0.35 * rng.normal(size=(count, 4)) + [1, 0, 0, 0]
-    leaves = (
-        np.stack([0.55 * a * z, 0.32 * b * z, z], axis=-1),
-        np.log(size),
-        quaternions,
-        1.5 * rng.normal(size=count),
-        rgb_to_sh(rng.uniform(size=(count, 1, 3))),
+def _workload(scene, count, size):
+    """Discs at random points that the photographs saw, and the camera of the first of them."""
+    key_pixel, key_opacity, key_surfels = jax.random.split(jax.random.key(0), 3)
+    cameras, depths = scene.train.cameras, exact_depths(scene, scene.train.cameras)
+    grid = pixel_grid(cameras.height, cameras.width)
+    points = jax.vmap(pixels_to_points, (0, None, 0))(cameras, grid, depths).reshape(-1, 3)
+    chosen = jax.random.choice(key_pixel, len(points), (count,), replace=False)
+    rgb = to_float(scene.train.rgb).reshape(-1, 3)
+    surfels, _ = surfels_from_points(
+        key_surfels, points[chosen], rgb[chosen], capacity=count, sh_degree=0
     )
-    return Surfels(*(jnp.asarray(leaf, jnp.float32) for leaf in leaves))
-
-
-def _camera(height, width):
-    intrinsics = jnp.array([0.95 * width, 0.95 * width, width / 2, height / 2])
-    return Camera(jnp.eye(4)[:3], intrinsics, height, width)
+    logits = 1.5 * jax.random.normal(key_opacity, (count,))
+    first = jax.tree.map(lambda leaf: leaf[0], cameras)
+    scale = jnp.array([size[1] / cameras.width, size[0] / cameras.height])
+    camera = Camera(first.camtoworld, first.intrinsics * jnp.tile(scale, 2), *size)
+    return surfels.replace(opacity_logits=logits), camera
 
 
 def _loss(render, surfels, camera):

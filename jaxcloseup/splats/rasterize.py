@@ -36,7 +36,7 @@ class RasterizeConfig:
     near: float = 0.01
     tile: int = 8
     chunk: int = 8
-    block: int = 64
+    block: int = 128
 
 
 @struct.dataclass
