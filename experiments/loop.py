@@ -1,26 +1,92 @@
-"""Running a stage: steps in chunks, with rates and the time left."""
+"""Compiled programs of one field, and stages: steps in chunks, with rates and the time left."""
 
 import functools
+import math
 import time
-from collections.abc import Callable
 from typing import Any
 
 import jax
+import optax
 
-from jaxcloseup.train import TrainState, run_steps
+from experiments.presets import Preset, make_field, make_optimizer, make_train_config
+from jaxcloseup.batch import Views
+from jaxcloseup.field import Rendering
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.geometry.union_warp import SourceBlocks
+from jaxcloseup.pseudo import PseudoSettings
+from jaxcloseup.scenes import Scene
+from jaxcloseup.train import TrainState, pseudo_step, run_steps, train_step
 
 
-def make_runner(step: Callable[..., Any]) -> Callable[..., Any]:
-    """`runner(state, *data, count=...)`, compiled; it leaves its input state alone."""
-    return jax.jit(functools.partial(run_steps, step))
+class Programs:
+    """What is compiled for one field on one scene.
+
+    A rasteriser has room for a fixed number of (tile, splat) pairs. Where an image needs more it
+    is discarded, the room is doubled, everything is compiled anew and the work done again: nothing
+    is ever learnt from, or shown of, a truncated image.
+    """
+
+    def __init__(self, preset: Preset, scene: Scene) -> None:
+        """Compile for a preset's field on a scene."""
+        self.preset, self.scene = preset, scene
+        self.optimizer: optax.GradientTransformation = make_optimizer(preset, scene)
+        self._growth = 1
+        self._compile()
+
+    def _compile(self) -> None:
+        self.field = make_field(self.preset, self.scene, growth=self._growth)
+        bound = {
+            "field": self.field,
+            "optimizer": self.optimizer,
+            "config": make_train_config(self.preset),
+        }
+
+        def label_step(
+            state: TrainState,
+            views: Views,
+            depths: jax.Array,
+            settings: PseudoSettings,
+            sources: SourceBlocks,
+        ) -> Any:
+            return pseudo_step(state, views, depths, settings, sources=sources, **bound)
+
+        # `count` may be traced; the input state is left alone.
+        self._train = jax.jit(functools.partial(run_steps, functools.partial(train_step, **bound)))
+        self._label = jax.jit(functools.partial(run_steps, label_step))
+        self._render = jax.jit(
+            lambda state, camera: self.field.render(state.params, state.buffers, camera, None, None)
+        )
+
+    def _grow(self) -> None:
+        self._growth *= 2
+        print(f"an image has more (tile, splat) pairs than fit: room for {self._growth} times more")
+        self._compile()
+
+    def run(self, state: TrainState, *data: Any, count: int) -> tuple[TrainState, dict[str, float]]:
+        """Take `count` steps: on photographs if `data` is views alone, else with labels."""
+        while True:
+            runner = self._train if len(data) == 1 else self._label
+            after, metrics = runner(state, *data, count=count)
+            metrics = {key: float(v) for key, v in metrics.items()}
+            # Means of counts: positive if any step had an overflow.
+            overflow = [metrics.pop(key, 0) for key in ("overflow", "label_overflow")]
+            if not any(overflow):
+                # The PSNR of no label at all is infinite.
+                return after, {key: v for key, v in metrics.items() if math.isfinite(v)}
+            self._grow()
+
+    def render(self, state: TrainState, camera: Camera) -> Rendering:
+        """Render a whole image."""
+        while True:
+            rendering = self._render(state, camera)
+            surfels = getattr(rendering.aux, "surfels", None)
+            if surfels is None or not int(surfels.overflow):
+                return rendering
+            self._grow()
 
 
 def run_stage(
-    name: str,
-    runner: Callable[..., Any],
-    state: TrainState,
-    *data: Any,
-    steps: int,
+    name: str, programs: Programs, state: TrainState, *data: Any, steps: int
 ) -> tuple[TrainState, list[dict[str, float]]]:
     """Take `steps` steps, reporting ten times or at least every 500 steps.
 
@@ -33,9 +99,8 @@ def run_stage(
     done = 0
     while done < steps:
         count = min(chunk, steps - done)
-        state, metrics = runner(state, *data, count=count)
+        state, values = programs.run(state, *data, count=count)
         done += count
-        values = {key: float(value) for key, value in metrics.items()}
         history.append({"step": done} | values)
         seconds = time.perf_counter() - start
         left = seconds / done * (steps - done)

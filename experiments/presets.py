@@ -1,12 +1,14 @@
-"""Named sets of hyper-parameters.
+"""Named sets of hyper-parameters, for each method.
 
 `quick` is the smallest run that shows the method honestly, `paper` the text of the paper and
-`released` what its public NeRF script does where the two differ.
+`released` what its public script, which knows NeRF alone, does where the two differ.
 """
 
 import dataclasses
 import math
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
@@ -15,6 +17,10 @@ from jaxcloseup.field import RadianceField
 from jaxcloseup.geometry.poses import PoseSettings
 from jaxcloseup.pseudo import PseudoSettings
 from jaxcloseup.scenes import Scene
+from jaxcloseup.splats.density_control import DensityConfig
+from jaxcloseup.splats.field import SurfelConfig, camera_extent, surfel_field, surfel_optimizer
+from jaxcloseup.splats.rasterize import RasterizeConfig
+from jaxcloseup.splats.surfels import random_points
 from jaxcloseup.train import TrainConfig
 from jaxcloseup.volume.nerf import NerfConfig, nerf
 
@@ -24,11 +30,11 @@ class Preset:
     """One experiment; plain numbers, so that it prints and serialises.
 
     Attributes:
-      nerf: the network and its sampling.
+      field: the network and its sampling, or the surfels and their training.
       train: what a step looks at.
       baseline_steps: stage 1, on photographs alone.
       closeup_steps: stage 2, with labels, and as many of its control without.
-      learning_rate: Adam's, at the first step.
+      learning_rate: Adam's for a NeRF, at the first step.
       decay_rate: factor on it over `decay_steps`, continued through both stages.
       decay_steps: see `decay_rate`.
       downscale: photographs are reduced by this factor.
@@ -42,7 +48,7 @@ class Preset:
       leave_out_source: labels are held against the other views alone.
     """
 
-    nerf: NerfConfig = dataclasses.field(default_factory=NerfConfig)
+    field: NerfConfig | SurfelConfig = dataclasses.field(default_factory=NerfConfig)
     train: TrainConfig = dataclasses.field(default_factory=TrainConfig)
     baseline_steps: int = 200_000
     closeup_steps: int = 10_000
@@ -82,7 +88,7 @@ RELEASED = dataclasses.replace(
 # than the model: only labels that the other views confirm closely are kept, at a pixel's weight.
 QUICK = dataclasses.replace(
     PAPER,
-    nerf=NerfConfig(
+    field=NerfConfig(
         depth=4, width=64, skip_after=2, direction_width=64, num_coarse=24, num_fine=24
     ),
     train=TrainConfig(num_rays=512, num_label_rays=512, pooled_loss=True),
@@ -97,20 +103,77 @@ QUICK = dataclasses.replace(
     leave_out_source=True,
 )
 
-PRESETS = {"quick": QUICK, "paper": PAPER, "released": RELEASED}
+WHOLE_IMAGES = TrainConfig(num_rays=None, num_label_rays=None)
+
+PAPER_SURFELS = Preset(
+    field=SurfelConfig(density=DensityConfig(stop=25_000)),
+    train=WHOLE_IMAGES,
+    baseline_steps=30_000,
+    closeup_steps=500,
+)
+
+QUICK_SURFELS = dataclasses.replace(
+    PAPER_SURFELS,
+    field=SurfelConfig(
+        capacity=10_000,
+        sh_degree=1,
+        sh_every=500,
+        regularise_from=500,
+        means_rate=(1.6e-3, 1.6e-5),
+        decay_steps=2000,
+        density=DensityConfig(start=200, stop=1600, growth=1.1),
+        raster=RasterizeConfig(capacity=2**15, block=32),
+    ),
+    baseline_steps=2000,
+    closeup_steps=200,
+    downscale=8,
+)
+
+PRESETS = {
+    "nerf": {"quick": QUICK, "paper": PAPER, "released": RELEASED},
+    "surfels": {"quick": QUICK_SURFELS, "paper": PAPER_SURFELS},
+}
 
 
-def make_field(preset: Preset, scene: Scene) -> RadianceField:
-    """The preset's NeRF for a scene."""
+def make_field(preset: Preset, scene: Scene, *, growth: int = 1) -> RadianceField:
+    """The preset's field for a scene; `growth` multiplies a rasteriser's capacity."""
+    if isinstance(preset.field, SurfelConfig):
+        raster = preset.field.raster
+        raster = dataclasses.replace(raster, capacity=raster.capacity * growth)
+        config = dataclasses.replace(preset.field, raster=raster)
+        return surfel_field(config, extent=extent(scene))
     centre, scale = (0.0, 0.0, 0.0), 1.0
     if preset.normalise:
         centre, scale = unit_cube(scene)
-    return nerf(preset.nerf, near=scene.near, far=scene.far, centre=centre, scale=scale)
+    return nerf(preset.field, near=scene.near, far=scene.far, centre=centre, scale=scale)
 
 
 def make_train_config(preset: Preset) -> TrainConfig:
     """What a step looks at, differentiated in the chunks that suit the network and the machine."""
-    return dataclasses.replace(preset.train, gradient_chunk=preset.nerf.rays_at_once)
+    if isinstance(preset.field, SurfelConfig):
+        return preset.train
+    return dataclasses.replace(preset.train, gradient_chunk=preset.field.rays_at_once)
+
+
+def make_optimizer(preset: Preset, scene: Scene) -> optax.GradientTransformation:
+    """Adam: for a NeRF with exponentially decaying learning rate, for surfels with their own."""
+    if isinstance(preset.field, SurfelConfig):
+        return surfel_optimizer(preset.field, extent=extent(scene))
+    schedule = optax.exponential_decay(preset.learning_rate, preset.decay_steps, preset.decay_rate)
+    return optax.adam(schedule)
+
+
+def initial_points(key: jax.Array, scene: Scene, count: int = 5000) -> tuple[Any, Any]:
+    """Points `[P, 3]` and colours to start from: the capture's, or else random ones, in grey."""
+    if len(scene.points):
+        return scene.points, scene.rgb
+    points = random_points(key, scene.train.cameras, near=scene.near, far=scene.far, count=count)
+    return points, jnp.full_like(points, 0.5)
+
+
+def extent(scene: Scene) -> float:
+    """Size of a capture: the reach of its cameras, or half its depth if they stand in one place."""
+    return float(camera_extent(scene.train.cameras)) or 0.5 * scene.far
 
 
 def unit_cube(scene: Scene) -> tuple[tuple[float, float, float], float]:
@@ -122,12 +185,6 @@ def unit_cube(scene: Scene) -> tuple[tuple[float, float, float], float]:
     both = np.concatenate([positions, np.percentile(seen, [5, 95], axis=0)])
     low, high = both.min(axis=0), both.max(axis=0)
     return tuple(((low + high) / 2).tolist()), float(2 / (high - low).max())
-
-
-def make_optimizer(preset: Preset) -> optax.GradientTransformation:
-    """Adam with exponentially decaying learning rate."""
-    schedule = optax.exponential_decay(preset.learning_rate, preset.decay_steps, preset.decay_rate)
-    return optax.adam(schedule)
 
 
 def pseudo_settings(preset: Preset) -> PseudoSettings:

@@ -27,28 +27,32 @@ from absl import app, flags
 import jaxcloseup
 from experiments.audit import audit_labels
 from experiments.evaluation import evaluate, exact_depths, make_targets
-from experiments.loop import make_runner, run_stage
+from experiments.loop import Programs, run_stage
 from experiments.pictures import comparisons, label_pictures, write_renders
 from experiments.presets import (
     PRESETS,
     Preset,
-    make_field,
-    make_optimizer,
-    make_train_config,
+    initial_points,
     pseudo_settings,
 )
 from experiments.report import format_metric, print_table, write_json, write_report
+from jaxcloseup.batch import camera_at
 from jaxcloseup.geometry.union_warp import block_sources
 from jaxcloseup.scenes import Scene, SceneError, load_scene
-from jaxcloseup.train import init_state, pseudo_step, render_depths, train_step
+from jaxcloseup.train import init_state, render_depths
 
 
 FLAGS = flags.FLAGS
 flags.DEFINE_string(
     "scene", "table", "a built-in scene (counter, table, room, bench, stairs) or a folder"
 )
-flags.DEFINE_enum("method", "nerf", ["nerf"], "radiance field")
-flags.DEFINE_enum("preset", "quick", list(PRESETS), "hyper-parameters; flags below override them")
+flags.DEFINE_enum("method", "surfels", list(PRESETS), "radiance field")
+flags.DEFINE_enum(
+    "preset",
+    "quick",
+    ["quick", "paper", "released"],
+    "hyper-parameters; flags below override them; released: of NeRF alone",
+)
 flags.DEFINE_integer("seed", 0, "random seed; the same seed gives the same metrics", lower_bound=0)
 flags.DEFINE_string(
     "output_dir", None, "where results go; default outputs/<scene>/<method>/<date_time>"
@@ -69,7 +73,7 @@ flags.DEFINE_enum(
     "compute_dtype",
     "float32",
     ["float32", "bfloat16"],
-    "operands of the network's products; bfloat16 is faster and less exact",
+    "operands of the products of a NeRF's network; bfloat16 is faster and less exact",
 )
 flags.DEFINE_bool(
     "half_pixel", False, "the capture has pixel centres at integers: add 0.5 to cx, cy"
@@ -89,28 +93,36 @@ def main(argv: list[str]) -> None:
     # Warnings are sentences for the user; jax's notes on absent accelerators are not.
     warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
     logging.getLogger("jax._src.xla_bridge").setLevel(logging.WARNING)
-    preset = preset_from_flags()
     try:
+        preset = preset_from_flags()
         output_dir = choose_output_dir(FLAGS.output_dir, FLAGS.scene, FLAGS.method)
         scene = load_scene(FLAGS.scene, downscale=preset.downscale, half_pixel=FLAGS.half_pixel)
         output_dir.mkdir(parents=True, exist_ok=True)
-    except (SceneError, OSError) as error:
+    except (SceneError, OSError, ValueError) as error:
         sys.exit(f"experiments.run: {error}")
-    results = run(scene, preset, FLAGS.seed, output_dir, preset_name=FLAGS.preset)
+    names = {"method": FLAGS.method, "preset": FLAGS.preset}
+    results = run(scene, preset, FLAGS.seed, output_dir, names=names)
     print_table(results)
     print(f"report: {output_dir / 'report.html'}")
 
 
 def preset_from_flags() -> Preset:
     """The preset, with the flags that were given in place of its values."""
-    preset = PRESETS[FLAGS.preset]
+    of_method = PRESETS[FLAGS.method]
+    if FLAGS.preset not in of_method:
+        raise ValueError(
+            f"--preset={FLAGS.preset} is not for --method={FLAGS.method}: choose "
+            + " or ".join(of_method)
+        )
+    preset = of_method[FLAGS.preset]
     given = {
         name: getattr(FLAGS, name)
         for name in ("downscale", "baseline_steps", "closeup_steps")
         if getattr(FLAGS, name) is not None
     }
-    network = dataclasses.replace(preset.nerf, compute_dtype=FLAGS.compute_dtype)
-    return dataclasses.replace(preset, nerf=network, **given)
+    if FLAGS.method == "nerf":
+        given["field"] = dataclasses.replace(preset.field, compute_dtype=FLAGS.compute_dtype)
+    return dataclasses.replace(preset, **given)
 
 
 def set_up_compilation_cache(folder: str | None) -> None:
@@ -137,50 +149,49 @@ def choose_output_dir(folder: str | None, scene: str, method: str) -> pathlib.Pa
 
 
 def run(
-    scene: Scene, preset: Preset, seed: int, output_dir: pathlib.Path, *, preset_name: str
+    scene: Scene, preset: Preset, seed: int, output_dir: pathlib.Path, *, names: dict[str, str]
 ) -> dict[str, Any]:
-    """All stages on one scene; writes everything under `output_dir` and returns the results."""
+    """All stages on one scene; writes everything under `output_dir` and returns the results.
+
+    Args:
+      scene: what is photographed.
+      preset: how it is trained.
+      seed: random seed.
+      output_dir: an empty folder.
+      names: of "method" and "preset", for the report.
+    """
     key_init, key_audit, key_pictures = jax.random.split(jax.random.key(seed), 3)
-    key_depths = jax.random.fold_in(key_init, 1)
+    key_depths, key_points = jax.random.fold_in(key_init, 1), jax.random.fold_in(key_init, 2)
     scene = dataclasses.replace(scene, train=jax.device_put(scene.train))
     views, size = scene.train, scene.train.cameras
     print(
         f"{scene.name}: {len(views)} training photographs of {size.width} x {size.height}, "
         f"depth {scene.near:.3g} to {scene.far:.3g}"
     )
-    field, optimizer = make_field(preset, scene), make_optimizer(preset)
-    bound = {"field": field, "optimizer": optimizer, "config": make_train_config(preset)}
+    programs = Programs(preset, scene)
     settings = pseudo_settings(preset)
-    render = jax.jit(
-        lambda state, camera: field.render(state.params, state.buffers, camera, None, None)
-    )
     seconds: dict[str, float] = {}
     history, stages, renderings, targets = {}, {}, {}, {}
 
-    def train(stage, runner, state, *data, steps):
+    def train(stage, state, *data, steps):
         with timed(seconds, stage):
-            state, history[stage] = run_stage(stage, runner, state, *data, steps=steps)
+            state, history[stage] = run_stage(stage, programs, state, *data, steps=steps)
         return state
 
     def score(stage, state):
         with timed(seconds, f"{stage}_evaluation"):
             stages[stage] = {}
             for split, of_split in targets.items():
-                rendered = functools.partial(render, state)
+                rendered = functools.partial(programs.render, state)
                 stages[stage][split], renderings[stage, split] = evaluate(rendered, of_split)
                 folder = output_dir / "renders" / stage / split
                 write_renders(folder, renderings[stage, split], scene)
                 psnr = format_metric("psnr", stages[stage][split]["psnr"])
                 print(f"{stage:>9} {split}: PSNR {psnr} dB", flush=True)
 
-    on_photographs = make_runner(functools.partial(train_step, **bound))
-
-    @make_runner
-    def on_labels(state, views, depths, settings, sources):
-        return pseudo_step(state, views, depths, settings, sources=sources, **bound)
-
-    state = init_state(key_init, scene.points, scene.rgb, field=field, optimizer=optimizer)
-    baseline = train("baseline", on_photographs, state, views, steps=preset.baseline_steps)
+    points = initial_points(key_points, scene)
+    state = init_state(key_init, *points, field=programs.field, optimizer=programs.optimizer)
+    baseline = train("baseline", state, views, steps=preset.baseline_steps)
     with timed(seconds, "depths"):
         options = {
             "near": scene.near,
@@ -188,20 +199,22 @@ def run(
             "key": key_depths if preset.train.perturbed_depth else None,
             "divided": not preset.train.undivided_depth,
         }
-        render_all = jax.jit(functools.partial(render_depths, field, **options))
+        for i in range(len(views)):  # which makes room for every view
+            programs.render(baseline, camera_at(size, i))
+        render_all = jax.jit(functools.partial(render_depths, programs.field, **options))
         depths = render_all(baseline.params, baseline.buffers, views.cameras)
         sources = jax.jit(block_sources)(views.cameras, depths, views.weight)
         exact = exact_depths(scene, views.cameras) if scene.surface else None
         for split in scene.names:
             if split != "train":
                 seen_from = depths if exact is None else exact
-                rendered = functools.partial(render, baseline)
+                rendered = functools.partial(programs.render, baseline)
                 targets[split] = make_targets(scene, split, seen_from, rendered)
     score("baseline", baseline)
-    control = train("control", on_photographs, baseline, views, steps=preset.closeup_steps)
+    control = train("control", baseline, views, steps=preset.closeup_steps)
     score("control", control)
     data = views, depths, settings, sources
-    closeup = train("closeup", on_labels, baseline, *data, steps=preset.closeup_steps)
+    closeup = train("closeup", baseline, *data, steps=preset.closeup_steps)
     score("closeup", closeup)
 
     with timed(seconds, "report"):
@@ -209,7 +222,7 @@ def run(
             "scene": scene,
             "settings": settings,
             "depths": depths,
-            "render_depth": lambda camera: render(baseline, camera).depth,
+            "render_depth": lambda camera: programs.render(baseline, camera).depth,
         }
         pictures = comparisons(output_dir / "compare", targets, renderings)
         shown = targets.get("test", [])
@@ -224,8 +237,7 @@ def run(
             audit["trained_depth"] = audit_labels(key_audit, exact, **labels)
     results = {
         "scene": scene.name,
-        "method": "nerf",
-        "preset": preset_name,
+        **names,
         "seed": seed,
         "resolution": [size.width, size.height],
         "stages": stages,

@@ -135,7 +135,8 @@ def pseudo_step(
       sources: `block_sources(views.cameras, depths, views.weight)`; recomputed here if absent.
 
     Returns:
-      The next state, and metrics with `label_coverage`, the share of labelled virtual pixels.
+      The next state, and metrics with `label_coverage`, the share of labelled virtual pixels; where
+      the two means are not pooled, the field's metrics of the labelled pixels as `label_<name>`.
     """
     key_step = jax.random.fold_in(state.key, state.step)
     key_batch, key_render, key_adapt, key_label = jax.random.split(key_step, 4)
@@ -144,31 +145,43 @@ def pseudo_step(
 
     camera, source_index = sample_virtual_camera(key_virtual, views, depths, settings)
     pixels = _sample_virtual_pixels(key_pixels, camera, config.num_label_rays)
-    seen = field.render(
-        jax.lax.stop_gradient(state.params),
-        state.buffers,
-        camera,
-        pixels,
-        key_depth if config.perturbed_depth else None,
-    )
-    depth = seen.depth * seen.alpha if config.undivided_depth else seen.depth
     label_pixels = pixel_grid(camera.height, camera.width) if pixels is None else pixels
-    label = make_label(
-        camera, label_pixels, depth, source_index, views, depths, settings, sources=sources
-    )
-    virtual = Batch(camera, pixels, label.rgb, label.weight)
+
+    def render(params):
+        key = key_depth if config.perturbed_depth else None
+        return field.render(params, state.buffers, camera, pixels, key)
+
+    def label_of(seen):
+        depth = seen.depth * seen.alpha if config.undivided_depth else seen.depth
+        data = source_index, views, depths, settings
+        return make_label(camera, label_pixels, depth, *data, sources=sources)
 
     loss_of = functools.partial(rendered_loss, field=field, chunk=config.gradient_chunk)
+    if pixels is not None:
+        label = label_of(render(jax.lax.stop_gradient(state.params)))
 
     def loss(params):
-        if config.pooled_loss:
-            return loss_of(params, state.buffers, _pool(batch, virtual), key_render)
+        if pixels is None:
+            # The image that depth is taken from is the one that is judged.
+            seen = render(params)
+            of_image = label_of(jax.lax.stop_gradient(seen))
+            coverage = jnp.mean(of_image.weight)
+            virtual_loss, virtual_metrics = field.loss(seen, of_image.rgb, of_image.weight)
+        else:
+            coverage = jnp.mean(label.weight)
+            virtual = Batch(camera, pixels, label.rgb, label.weight)
+            if config.pooled_loss:
+                pooled = _pool(batch, virtual)
+                value, metrics = loss_of(params, state.buffers, pooled, key_render)
+                return value, metrics | {"label_coverage": coverage}
+            virtual_loss, virtual_metrics = loss_of(
+                params, state.buffers, virtual, key_virtual_render
+            )
         batch_loss, metrics = loss_of(params, state.buffers, batch, key_render)
-        virtual_loss, _ = loss_of(params, state.buffers, virtual, key_virtual_render)
-        return (batch_loss + virtual_loss) / 2, metrics
+        metrics = metrics | {f"label_{name}": value for name, value in virtual_metrics.items()}
+        return (batch_loss + virtual_loss) / 2, metrics | {"label_coverage": coverage}
 
-    state, metrics = _update(state, loss, key_adapt, field, optimizer)
-    return state, metrics | {"label_coverage": jnp.mean(label.weight)}
+    return _update(state, loss, key_adapt, field, optimizer)
 
 
 def run_steps(

@@ -17,7 +17,7 @@ MAY_IMPORT = {
     "rendered_loss": {"numerics", "field", "batch"},
     "metrics": {"numerics"},
     "volume": {"numerics", "geometry", "field"},
-    "splats": {"numerics", "geometry", "field"},
+    "splats": {"numerics", "geometry", "field", "metrics"},
     "pseudo": {"geometry", "field", "batch"},
     "train": {"geometry", "field", "batch", "pseudo", "rendered_loss"},
     "scenes": {"numerics", "geometry", "batch"},

@@ -23,7 +23,7 @@ from jaxcloseup.volume.nerf import NerfConfig
 
 TINY = dataclasses.replace(
     QUICK,
-    nerf=NerfConfig(
+    field=NerfConfig(
         depth=2, width=16, skip_after=0, direction_width=8, num_coarse=8, num_fine=8, chunk=512
     ),
     train=TrainConfig(num_rays=64, num_label_rays=64),
@@ -72,7 +72,8 @@ def run_tiny(capture_folder, output_dir):
     # Libraries under a run (optax's schedules) mix integers and floats.
     with jax.numpy_dtype_promotion("standard"):
         scene = load_scene(str(capture_folder))
-        return program.run(scene, TINY, 0, output_dir, preset_name="tiny")
+        names = {"method": "nerf", "preset": "tiny"}
+        return program.run(scene, TINY, 0, output_dir, names=names)
 
 
 def test_a_run_scores_every_stage_on_every_split(finished):
@@ -142,13 +143,23 @@ def test_a_folder_that_holds_something_is_refused_before_any_work(parsed_flags, 
 
 
 def test_flags_override_the_preset(parsed_flags):
-    with flagsaver.flagsaver(preset="paper", closeup_steps=7, compute_dtype="bfloat16"):
+    given = {"preset": "paper", "closeup_steps": 7, "compute_dtype": "bfloat16"}
+    with flagsaver.flagsaver(method="nerf", **given):
         preset = program.preset_from_flags()
     assert preset.closeup_steps == 7
-    assert preset.nerf.compute_dtype == "bfloat16"
-    assert preset.baseline_steps == PRESETS["paper"].baseline_steps == 200_000
+    assert preset.field.compute_dtype == "bfloat16"
+    assert preset.baseline_steps == PRESETS["nerf"]["paper"].baseline_steps == 200_000
     assert program.config(preset)["depth_tolerance"] == "inf"
     json.dumps(program.config(preset), allow_nan=False)
+
+
+def test_a_preset_of_the_other_method_is_one_sentence(parsed_flags, tmp_path):
+    with (
+        flagsaver.flagsaver(method="surfels", preset="released", output_dir=str(tmp_path / "out")),
+        pytest.raises(SystemExit, match="--preset=released is not for --method=surfels"),
+    ):
+        program.main(["run"])
+    assert not (tmp_path / "out").exists()
 
 
 def test_numbers_that_are_not_finite_become_null(tmp_path):

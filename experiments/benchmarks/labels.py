@@ -38,7 +38,7 @@ def run() -> None:
         exact = exact_depths(scene, scene.train.cameras)
         render_depth = jax.jit(lambda camera, scene=scene: scene.surface(camera).depth)
         for mask, changes in MASKS.items():
-            settings = pseudo_settings(PRESETS["paper"])
+            settings = pseudo_settings(PRESETS["nerf"]["paper"])
             settings = settings.replace(**{k: jnp.float32(v) for k, v in changes.items()})
             found = audit_labels(
                 jax.random.key(0),
@@ -58,7 +58,7 @@ def run() -> None:
             [],
             PICTURES / name,
             scene=scene,
-            settings=pseudo_settings(PRESETS["paper"]),
+            settings=pseudo_settings(PRESETS["nerf"]["paper"]),
             depths=exact,
             render_depth=render_depth,
         )

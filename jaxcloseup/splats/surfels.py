@@ -11,6 +11,8 @@ import jax.numpy as jnp
 from flax import struct
 from jax import lax
 
+from jaxcloseup.geometry.cameras import Camera, pixels_to_points, points_to_pixels
+from jaxcloseup.geometry.masks import in_bounds
 from jaxcloseup.splats.spherical_harmonics import rgb_to_sh
 
 
@@ -77,6 +79,38 @@ def surfels_from_points(
         sh=jnp.concatenate([constant, higher], axis=1),
     )
     return jax.tree.map(lambda leaf: _pad_rows(leaf, capacity), (surfels, alive))
+
+
+def random_points(
+    key: jax.Array, cameras: Camera, *, near: float, far: float, count: int
+) -> jax.Array:
+    """Random points `[count, 3]` that many cameras see, for captures without any.
+
+    Four times as many are drawn along random pixels of random cameras, uniformly in inverse depth,
+    and those that most cameras have in their images are kept. `key` is consumed.
+
+    Args:
+      key: random key.
+      cameras: stacked `[V]`.
+      near: least z-depth, world units.
+      far: largest z-depth.
+      count: how many.
+    """
+    key_view, key_pixel, key_depth = jax.random.split(key, 3)
+    view = jax.random.randint(key_view, (4 * count,), 0, cameras.intrinsics.shape[0])
+    size = jnp.array([[cameras.width, cameras.height]], jnp.float32)
+    pixels = size * jax.random.uniform(key_pixel, (4 * count, 2))
+    depth = 1 / jax.random.uniform(key_depth, (4 * count,), minval=1 / far, maxval=1 / near)
+    own = jax.tree.map(lambda leaf: leaf[view], cameras)
+    points = jax.vmap(pixels_to_points)(own, pixels, depth)
+
+    def add(total, camera):
+        landed, depth = points_to_pixels(camera, points)
+        inside = in_bounds(landed, camera.height, camera.width)
+        return total + (inside & (depth > near)).astype(jnp.int32), None
+
+    seen, _ = lax.scan(add, jnp.zeros(4 * count, jnp.int32), cameras)
+    return points[jnp.argsort(-seen, stable=True)[:count]]
 
 
 def _pad_rows(array: jax.Array, rows: int) -> jax.Array:

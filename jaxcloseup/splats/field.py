@@ -1,0 +1,276 @@
+"""Surfels as a radiance field: 2-D Gaussian splatting (Huang et al., SIGGRAPH 2024), trainable.
+
+Whole images only. Normals are pulled towards the surface and light along a ray to one depth, with
+weights that depend on no unit of length; density is controlled at a fixed capacity.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from jaxcloseup.field import RadianceField, Rendering
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.metrics import ssim
+from jaxcloseup.numerics import safe_divide
+from jaxcloseup.splats.density_control import DensityConfig, relocate, wander
+from jaxcloseup.splats.rasterize import RasterizeConfig
+from jaxcloseup.splats.regularizers import (
+    depth_to_normal,
+    normal_inconsistency,
+    scale_free_distortion,
+)
+from jaxcloseup.splats.render import SurfelAux, render_surfels
+from jaxcloseup.splats.surfels import Surfels, surfels_from_points
+
+
+@dataclasses.dataclass(frozen=True)
+class SurfelConfig:
+    """Surfels and their training; lengths are in extents of the capture.
+
+    Attributes:
+      capacity: how many surfels there can be.
+      sh_degree: of the colour's spherical harmonics.
+      sh_every: steps after which one more degree is drawn.
+      initial_opacity: of surfels at the initial points.
+      depth: "median" or "expected": what the field calls depth, and labels are made with.
+      background: grey level in [0, 1] behind the scene; None is black.
+      ssim_weight: share of 1 - SSIM in the loss; the rest is the absolute difference.
+      normal_weight: of the disagreement between normals and depth.
+      distortion_weight: of the spread of light along a ray, for a mean depth of 1.
+      regularise_from: step from which these two count.
+      opacity_weight: of the mean opacity.
+      scale_weight: of the mean scale.
+      means_rate: learning rate of the means, first and at `decay_steps`.
+      decay_steps: see `means_rate`; it stays there.
+      sh_rate, opacity_rate, scale_rate, rotation_rate: Adam's; 1/20 of `sh_rate` for what depends
+        on the direction.
+      density: when surfels move, or None for never.
+      raster: static sizes of the rasteriser.
+    """
+
+    capacity: int = 200_000
+    sh_degree: int = 3
+    sh_every: int = 1000
+    initial_opacity: float = 0.5
+    depth: str = "median"
+    background: float | None = None
+    ssim_weight: float = 0.2
+    normal_weight: float = 0.05
+    distortion_weight: float = 1.0
+    regularise_from: int = 3000
+    opacity_weight: float = 0.01
+    scale_weight: float = 0.01
+    means_rate: tuple[float, float] = (1.6e-4, 1.6e-6)
+    decay_steps: int = 30_000
+    sh_rate: float = 2.5e-3
+    opacity_rate: float = 5e-2
+    scale_rate: float = 5e-3
+    rotation_rate: float = 1e-3
+    density: DensityConfig | None = dataclasses.field(default_factory=DensityConfig)
+    raster: RasterizeConfig = dataclasses.field(default_factory=RasterizeConfig)
+
+
+@struct.dataclass
+class SurfelBuffers:
+    """What surfels keep beside their parameters.
+
+    Attributes:
+      alive: `[N]` bool.
+      degree: `[]` int32 degree of spherical harmonics that is drawn.
+      regularise: `[]` 1 once regularisers count, before that 0.
+    """
+
+    alive: jax.Array
+    degree: jax.Array
+    regularise: jax.Array
+
+
+class SurfelFieldAux(NamedTuple):
+    """What else the field renders.
+
+    Attributes:
+      surfels: of `render_surfels`.
+      penalty: `[H, W]` the regularisers of each pixel.
+      prior: `[]` the regularisers of opacities and scales.
+    """
+
+    surfels: SurfelAux
+    penalty: jax.Array
+    prior: jax.Array
+
+
+def surfel_field(config: SurfelConfig, *, extent: float) -> RadianceField:
+    """Surfels as a field of whole images.
+
+    Args:
+      config: static.
+      extent: size of the capture in world units, such as `camera_extent`.
+
+    Raises:
+      ValueError: a setting is out of range.
+    """
+    if config.depth not in ("median", "expected"):
+        raise ValueError(f'SurfelConfig.depth is "median" or "expected", not "{config.depth}"')
+    if not extent > 0:
+        raise ValueError(f"extent must be a positive length, not {extent}")
+
+    def init(key: jax.Array, points: jax.Array, rgb: jax.Array) -> tuple[Surfels, SurfelBuffers]:
+        surfels, alive = surfels_from_points(
+            key,
+            points,
+            rgb,
+            capacity=config.capacity,
+            sh_degree=config.sh_degree,
+            opacity=config.initial_opacity,
+        )
+        return surfels, SurfelBuffers(alive, *_schedule(config, jnp.zeros((), jnp.int32)))
+
+    def render(
+        params: Surfels,
+        buffers: SurfelBuffers,
+        camera: Camera,
+        pixels: jax.Array | None,
+        key: jax.Array | None,
+    ) -> Rendering:
+        del key  # nothing is random
+        if pixels is not None:
+            raise ValueError("surfels render whole images: pixels must be None")
+        band = jnp.repeat(jnp.arange(4), jnp.array([1, 3, 5, 7]), total_repeat_length=16)
+        drawn = (band[: params.sh.shape[1]] <= buffers.degree)[None, :, None]
+        surfels = params.replace(sh=jnp.where(drawn, params.sh, 0))
+        background = None if config.background is None else jnp.full(3, config.background)
+        image = render_surfels(surfels, buffers.alive, camera, config.raster, background=background)
+        depth = image.aux.median_depth if config.depth == "median" else image.depth
+
+        inconsistency = normal_inconsistency(
+            image.aux.normal, depth_to_normal(camera, depth), image.alpha
+        )
+        typical = safe_divide(jnp.sum(image.alpha * image.depth), jnp.sum(image.alpha))
+        distortion = scale_free_distortion(image.aux.distortion, jax.lax.stop_gradient(typical))
+        penalty = config.normal_weight * inconsistency + config.distortion_weight * distortion
+        number = jnp.sum(buffers.alive, dtype=image.rgb.dtype)
+
+        def mean(values):
+            return safe_divide(jnp.sum(jnp.where(buffers.alive, values, 0)), number)
+
+        opacity = mean(jax.nn.sigmoid(params.opacity_logits))
+        scale = mean(jnp.mean(jnp.exp(params.log_scales), axis=-1)) / extent
+        prior = config.opacity_weight * opacity + config.scale_weight * scale
+        aux = SurfelFieldAux(image.aux, buffers.regularise * penalty, prior)
+        return Rendering(image.rgb, depth, image.alpha, aux)
+
+    def loss(
+        rendering: Rendering, target_rgb: jax.Array, weight: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        return _loss(rendering, target_rgb, weight, config.ssim_weight)
+
+    def adapt(key: jax.Array, state: Any) -> Any:
+        return _adapt(key, state, config, extent)
+
+    return RadianceField(init=init, render=render, loss=loss, adapt=adapt)
+
+
+def camera_extent(cameras: Camera) -> jax.Array:
+    """Size `[]` of a capture in world units: 1.1 times the reach of its cameras from their middle.
+
+    Args:
+      cameras: stacked `[V]`; of a single camera the extent is 0.
+    """
+    offset = cameras.position - jnp.mean(cameras.position, axis=0, keepdims=True)
+    return 1.1 * jnp.max(jnp.linalg.norm(offset, axis=-1))
+
+
+def surfel_optimizer(config: SurfelConfig, *, extent: float) -> optax.GradientTransformation:
+    """Adam with a learning rate for each kind of parameter, that of the means decaying."""
+
+    def init(params):
+        del params
+        return optax.ScaleByScheduleState(count=jnp.zeros((), jnp.int32))
+
+    def update(updates, state, params=None):
+        del params
+        by_band = jnp.full(updates.sh.shape[1], config.sh_rate / 20).at[0].set(config.sh_rate)
+        rates = Surfels(
+            means=means_rate(config, state.count) * extent,
+            log_scales=config.scale_rate,
+            quaternions=config.rotation_rate,
+            opacity_logits=config.opacity_rate,
+            sh=by_band[None, :, None],
+        )
+        updates = jax.tree.map(lambda rate, update: -rate * update, rates, updates)
+        return updates, optax.ScaleByScheduleState(count=state.count + 1)
+
+    rescale = optax.GradientTransformation(init, update)
+    return optax.chain(optax.scale_by_adam(eps=1e-15), rescale)
+
+
+def means_rate(config: SurfelConfig, step: jax.Array) -> jax.Array:
+    """Learning rate of the means at a step, in extents: from first to last along an exponential."""
+    first, last = config.means_rate
+    share = jnp.minimum(step.astype(jnp.float32) / config.decay_steps, 1)
+    return first * (last / first) ** share
+
+
+def _loss(rendering, target_rgb, weight, ssim_weight):
+    chex.assert_equal_shape([rendering.rgb, target_rgb])
+    chex.assert_shape(weight, target_rgb.shape[:-1])
+    total = jnp.sum(weight)
+
+    def mean(values):
+        return safe_divide(jnp.sum(weight * values), total)
+
+    # What weighs nothing must not show in windows beside it either.
+    counts = weight[..., None] > 0
+    target_rgb = jnp.where(counts, target_rgb, jax.lax.stop_gradient(rendering.rgb))
+    difference = mean(jnp.mean(jnp.abs(rendering.rgb - target_rgb), axis=-1))
+    similarity = ssim(rendering.rgb, target_rgb, weight=weight)
+    dissimilarity = jnp.where(jnp.isnan(similarity), 0, 1 - similarity)
+    image = (1 - ssim_weight) * difference + ssim_weight * dissimilarity
+    prior = jnp.where(total > 0, rendering.aux.prior, 0)
+    squared = mean(jnp.mean((jnp.clip(rendering.rgb, 0, 1) - target_rgb) ** 2, axis=-1))
+    metrics = {
+        "psnr": -10 * jnp.log10(squared),
+        "overflow": rendering.aux.surfels.overflow.astype(jnp.float32),
+    }
+    return image + mean(rendering.aux.penalty) + prior, metrics
+
+
+def _schedule(config, step):
+    degree = jnp.minimum(step // config.sh_every, config.sh_degree).astype(jnp.int32)
+    return degree, (step >= config.regularise_from).astype(jnp.float32)
+
+
+def _adapt(key, state, config, extent):
+    degree, regularise = _schedule(config, state.step)
+    buffers = state.buffers.replace(degree=degree, regularise=regularise)
+    state = state.replace(buffers=buffers)
+    density = config.density
+    if density is None:
+        return state
+    key_relocate, key_wander = jax.random.split(key)
+
+    def move(state):
+        surfels, alive, changed = relocate(key_relocate, state.params, state.buffers.alive, density)
+
+        def forget(leaf):
+            if leaf.ndim == 0 or leaf.shape[0] != changed.shape[0]:
+                return leaf
+            return jnp.where(changed.reshape(-1, *(1,) * (leaf.ndim - 1)), 0, leaf)
+
+        return state.replace(
+            params=surfels,
+            buffers=state.buffers.replace(alive=alive),
+            opt_state=jax.tree.map(forget, state.opt_state),
+        )
+
+    due = (state.step % density.every == 0) & (state.step > density.start)
+    due &= state.step < density.stop
+    state = jax.lax.cond(due, move, lambda state: state, state)
+    rate = means_rate(config, state.step) * extent
+    surfels = wander(key_wander, state.params, state.buffers.alive, rate, density)
+    return state.replace(params=surfels)
