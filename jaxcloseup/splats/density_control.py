@@ -70,7 +70,9 @@ def relocate(
     share = jnp.cumsum(jnp.where(donor, opacity, 0))
     source = jnp.searchsorted(share, jax.random.uniform(key, (count,)) * share[-1], side="right")
     # Rounding may point past the last donor; the most opaque one is as good.
-    source = jnp.where(donor[jnp.minimum(source, count - 1)], source, jnp.argmax(opacity * donor))
+    source = jnp.where(
+        donor[jnp.minimum(source, count - 1)], source, jnp.argmax(jnp.where(donor, opacity, 0))
+    )
     copies = jnp.zeros(count, jnp.int32).at[source].add(receiver.astype(jnp.int32))
     copies = jnp.minimum(copies + 1, MOST_COPIES)
     thinner, smaller = split_opacity(opacity, copies)

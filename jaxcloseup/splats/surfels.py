@@ -86,7 +86,7 @@ def random_points(
 ) -> jax.Array:
     """Random points `[count, 3]` that many cameras see, for captures without any.
 
-    Four times as many are drawn along random pixels of random cameras, uniformly in inverse depth,
+    Eight times as many are drawn along random pixels of random cameras, uniformly in inverse depth,
     and those that most cameras have in their images are kept. `key` is consumed.
 
     Args:
@@ -97,10 +97,10 @@ def random_points(
       count: how many.
     """
     key_view, key_pixel, key_depth = jax.random.split(key, 3)
-    view = jax.random.randint(key_view, (4 * count,), 0, cameras.intrinsics.shape[0])
+    view = jax.random.randint(key_view, (8 * count,), 0, cameras.intrinsics.shape[0])
     size = jnp.array([[cameras.width, cameras.height]], jnp.float32)
-    pixels = size * jax.random.uniform(key_pixel, (4 * count, 2))
-    depth = 1 / jax.random.uniform(key_depth, (4 * count,), minval=1 / far, maxval=1 / near)
+    pixels = size * jax.random.uniform(key_pixel, (8 * count, 2))
+    depth = 1 / jax.random.uniform(key_depth, (8 * count,), minval=1 / far, maxval=1 / near)
     own = jax.tree.map(lambda leaf: leaf[view], cameras)
     points = jax.vmap(pixels_to_points)(own, pixels, depth)
 
@@ -109,7 +109,7 @@ def random_points(
         inside = in_bounds(landed, camera.height, camera.width)
         return total + (inside & (depth > near)).astype(jnp.int32), None
 
-    seen, _ = lax.scan(add, jnp.zeros(4 * count, jnp.int32), cameras)
+    seen, _ = lax.scan(add, jnp.zeros(8 * count, jnp.int32), cameras)
     return points[jnp.argsort(-seen, stable=True)[:count]]
 
 

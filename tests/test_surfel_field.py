@@ -1,0 +1,230 @@
+"""Surfels as a field: its loss, its schedules, and that training finds a surface."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import plane
+import pytest
+from splat_scenes import random_scene, to_camera, to_surfels
+
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.metrics import psnr
+from jaxcloseup.splats import RasterizeConfig
+from jaxcloseup.splats.density_control import DensityConfig
+from jaxcloseup.splats.field import (
+    SurfelConfig,
+    camera_extent,
+    surfel_field,
+    surfel_optimizer,
+)
+from jaxcloseup.splats.surfels import random_points
+from jaxcloseup.train import TrainConfig, init_state, run_steps, train_step
+
+
+STEPS = 200
+CONFIG = SurfelConfig(
+    capacity=400,
+    sh_degree=1,
+    sh_every=80,
+    initial_opacity=0.5,
+    regularise_from=50,
+    means_rate=(2e-3, 2e-4),
+    sh_rate=2e-2,
+    rotation_rate=1e-2,
+    decay_steps=STEPS,
+    density=DensityConfig(every=25, start=25, stop=150, growth=1.1),
+    raster=RasterizeConfig(capacity=2**13, near=0.2, tile=8, chunk=4, block=12),
+)
+EXTENT = 2.0
+FIELD = surfel_field(CONFIG, extent=EXTENT)
+OPTIMIZER = surfel_optimizer(CONFIG, extent=EXTENT)
+
+
+@pytest.fixture(scope="module")
+def capture():
+    places = [(x, y) for x in (-0.6, 0.0, 0.6) for y in (-0.4, 0.4)]
+    return plane.make_views([plane.camera_above(x, y, 2.0, tilt=0.3 * y) for x, y in places])
+
+
+@pytest.fixture(scope="module")
+def trained(capture):
+    views, _ = capture
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-1.6, -1.4, -0.15], [1.6, 1.4, 0.15], (250, 3))
+    points = jnp.asarray(points, jnp.float32)
+    grey = jnp.full_like(points, 0.5)
+    state = init_state(jax.random.key(0), points, grey, field=FIELD, optimizer=OPTIMIZER)
+    bound = {
+        "field": FIELD,
+        "optimizer": OPTIMIZER,
+        "config": TrainConfig(num_rays=None, num_label_rays=None),
+    }
+    run = jax.jit(functools.partial(run_steps, functools.partial(train_step, **bound)))
+    with jax.numpy_dtype_promotion("standard"):  # optax mixes integers and floats
+        first, _ = run(state, views, count=STEPS // 2)
+        last, metrics = run(first, views, count=STEPS // 2)
+    return state, first, last, metrics
+
+
+render = jax.jit(lambda params, buffers, camera: FIELD.render(params, buffers, camera, None, None))
+
+
+@jax.jit
+@jax.value_and_grad
+def judge(rgb, image, target, weight):
+    return FIELD.loss(image._replace(rgb=rgb), target, weight)[0]
+
+
+def test_training_finds_the_plane(trained, capture):
+    views, depths = capture
+    start, _, state, metrics = trained
+    assert metrics["overflow"] == 0
+    errors = []
+    for i in range(len(views.rgb)):
+        camera = jax.tree.map(lambda leaf, i=i: leaf[i], views.cameras)
+        image = render(state.params, state.buffers, camera)
+        assert psnr(image.rgb, views.rgb[i]) > 26
+        errors.append(np.abs(image.depth - depths[i]) / depths[i])
+        # They start at random, and three seconds of training turn them half of the way.
+        upwards = [
+            np.mean(render(s.params, s.buffers, camera).aux.surfels.normal[..., 2])
+            for s in (start, state)
+        ]
+        assert upwards[1] > upwards[0] + 0.1
+    assert np.median(errors) < 0.01
+
+
+def test_schedules_follow_the_step(trained):
+    start, middle, end, _ = trained
+    for state, degree, regularise in ((start, 0, 0), (middle, 1, 1), (end, 1, 1)):
+        assert state.buffers.degree == degree
+        assert state.buffers.regularise == regularise
+    assert start.buffers.alive.sum() == 250
+    # Relocations at 50, 75, 100, 125, the last one before 150.
+    assert middle.buffers.alive.sum() == int(int(int(250 * 1.1) * 1.1) * 1.1)
+    assert end.buffers.alive.sum() == int(int(middle.buffers.alive.sum()) * 1.1)
+    assert start.step == 0
+    assert end.step == STEPS
+
+
+def test_the_optimizer_forgets_surfels_that_moved(trained):
+    """Adam's moments of rows that a relocation changed are zero, of the others they are not."""
+    state = trained[1]
+    state = state.replace(step=jnp.int32(50))
+    moved = jax.jit(FIELD.adapt)(jax.random.key(1), state)
+    changed = np.any(np.asarray(moved.params.log_scales != state.params.log_scales), axis=1)
+    changed |= np.asarray(moved.buffers.alive & ~state.buffers.alive)
+    alive = np.asarray(state.buffers.alive)
+    assert changed.sum() > 10
+    for moment in (moved.opt_state[0].mu, moved.opt_state[0].nu):
+        assert np.all(np.asarray(moment.means)[changed] == 0)
+    kept = alive & ~changed
+    np.testing.assert_array_equal(
+        np.asarray(moved.opt_state[0].mu.means)[kept], state.opt_state[0].mu.means[kept]
+    )
+    assert np.mean(np.any(np.asarray(moved.opt_state[0].mu.means)[kept] != 0, axis=1)) > 0.5
+    assert moved.opt_state[0].count == state.opt_state[0].count
+
+
+def test_first_step_moves_everything_by_its_learning_rate():
+    surfels = to_surfels(random_scene(0))
+    gradient = jax.tree.map(lambda leaf: jnp.where(leaf > 0, 3.0, -0.5), surfels)
+    with jax.numpy_dtype_promotion("standard"):
+        updates, _ = OPTIMIZER.update(gradient, OPTIMIZER.init(surfels), surfels)
+    expected = {
+        "means": 2e-3 * EXTENT,
+        "log_scales": 5e-3,
+        "quaternions": 1e-2,
+        "opacity_logits": 5e-2,
+    }
+    for name, rate in expected.items():
+        sign = np.sign(getattr(gradient, name))
+        np.testing.assert_allclose(getattr(updates, name), -rate * sign, rtol=1e-5)
+    size = np.abs(updates.sh)
+    np.testing.assert_allclose(size[:, 0], 2e-2, rtol=1e-5)
+    np.testing.assert_allclose(size[:, 1:], 2e-2 / 20, rtol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def image(trained, capture):
+    state, views = trained[2], capture[0]
+    camera = jax.tree.map(lambda leaf: leaf[0], views.cameras)
+    return render(state.params, state.buffers, camera)
+
+
+def test_what_weighs_nothing_does_not_count(image, capture):
+    target = capture[0].rgb[1]
+    weight = jnp.ones(target.shape[:2]).at[:, 20:].set(0)
+    value, gradient = judge(image.rgb, image, target, weight)
+    other, same = judge(image.rgb, image, jnp.where(weight[..., None] > 0, target, 0.3), weight)
+    assert value == other
+    np.testing.assert_array_equal(gradient, same)
+    assert np.all(np.asarray(gradient[:, 20:][:, 6:]) == 0)
+    assert np.any(np.asarray(gradient[:, :20]) != 0)
+
+
+@pytest.mark.parametrize("kind", ["nothing", "the border"])
+def test_no_weight_is_no_loss_and_no_nan(image, capture, kind):
+    weight = jnp.zeros(capture[0].rgb.shape[1:3])
+    if kind == "the border":
+        weight = weight.at[0].set(1)
+    value, gradient = judge(image.rgb, image, capture[0].rgb[0], weight)
+    assert np.isfinite(value)
+    assert (value == 0) == (kind == "nothing")
+    assert np.isfinite(gradient).all()
+
+
+def test_degree_zero_looks_alike_from_everywhere(trained, capture):
+    state = trained[2]
+    camera = jax.tree.map(lambda leaf: leaf[0], capture[0].cameras)
+    bands = state.params.replace(sh=state.params.sh.at[:, 1:].add(0.5))
+    low = state.buffers.replace(degree=jnp.int32(0))
+    plain, banded = (render(params, low, camera).rgb for params in (state.params, bands))
+    np.testing.assert_array_equal(plain, banded)
+    assert np.any(render(bands, state.buffers, camera).rgb != plain)
+
+
+def test_depth_is_the_median_or_the_mean(trained, capture):
+    state = trained[2]
+    camera = jax.tree.map(lambda leaf: leaf[0], capture[0].cameras)
+    expected = surfel_field(dataclasses.replace(CONFIG, depth="expected"), extent=EXTENT)
+    mean = jax.jit(expected.render)(state.params, state.buffers, camera, None, None)
+    image = render(state.params, state.buffers, camera)
+    np.testing.assert_array_equal(image.depth, image.aux.surfels.median_depth)
+    assert np.any(mean.depth != image.depth)
+    assert np.median(np.abs(mean.depth / image.depth - 1)) < 0.05
+
+
+def test_settings_that_cannot_be_are_refused():
+    with pytest.raises(ValueError, match="depth"):
+        surfel_field(dataclasses.replace(CONFIG, depth="mean"), extent=EXTENT)
+    with pytest.raises(ValueError, match="extent"):
+        surfel_field(CONFIG, extent=0.0)
+    with pytest.raises(ValueError, match="whole images"):
+        FIELD.render(to_surfels(random_scene(0)), None, to_camera(), jnp.zeros((5, 2)), None)
+
+
+def test_extent_is_the_reach_of_the_cameras():
+    poses = np.tile(np.eye(4)[:3], (3, 1, 1))
+    poses[:, 0, 3] = [-1, 0, 4]
+    cameras = Camera(jnp.asarray(poses, jnp.float32), jnp.ones((3, 4)), 4, 4)
+    assert float(camera_extent(cameras)) == pytest.approx(1.1 * 3)
+
+
+def test_random_points_lie_where_the_cameras_look(capture, key):
+    cameras = capture[0].cameras
+    points = np.asarray(random_points(key, cameras, near=0.5, far=6.0, count=300), float)
+    assert points.shape == (300, 3)
+    seen = np.zeros(300)
+    for i in range(cameras.intrinsics.shape[0]):
+        pose = np.asarray(cameras.camtoworld[i], float)
+        x, y, z = ((points - pose[:, 3]) @ pose[:, :3]).T
+        assert z.min() > 0
+        column, row = plane.FOCAL * x / z + 16, plane.FOCAL * y / z + 12
+        seen += (column > 0) & (column < 32) & (row > 0) & (row < 24)
+    assert seen.min() >= 3
+    assert seen.mean() > 4
+    assert np.ptp(points[:, 2]) > 1
