@@ -18,6 +18,10 @@ from jaxcloseup.scenes import Scene
 from jaxcloseup.train import TrainState, pseudo_step, run_steps, train_step
 
 
+class TrainingError(Exception):
+    """Training cannot go on; the message says why, in one sentence."""
+
+
 class Programs:
     """What is compiled for one field on one scene.
 
@@ -71,6 +75,14 @@ class Programs:
             # Means of counts: positive if any step had an overflow.
             overflow = [metrics.pop(key, 0) for key in ("overflow", "label_overflow")]
             if not any(overflow):
+                skipped = round(metrics.pop("skipped") * count)
+                if skipped == count:
+                    raise TrainingError(
+                        f"loss or gradient was not finite in each of {count} steps: lower the "
+                        "learning rate, or look for broken photographs or poses"
+                    )
+                if skipped:
+                    print(f"warning: {skipped} of {count} steps skipped, not finite")
                 # The PSNR of no label at all is infinite.
                 return after, {key: v for key, v in metrics.items() if math.isfinite(v)}
             self._grow()

@@ -27,7 +27,7 @@ from absl import app, flags
 import jaxcloseup
 from experiments.audit import audit_labels
 from experiments.evaluation import evaluate, exact_depths, make_targets
-from experiments.loop import Programs, run_stage
+from experiments.loop import Programs, TrainingError, run_stage
 from experiments.pictures import comparisons, label_pictures, write_renders
 from experiments.presets import (
     PRESETS,
@@ -101,7 +101,10 @@ def main(argv: list[str]) -> None:
     except (SceneError, OSError, ValueError) as error:
         sys.exit(f"experiments.run: {error}")
     names = {"method": FLAGS.method, "preset": FLAGS.preset}
-    results = run(scene, preset, FLAGS.seed, output_dir, names=names)
+    try:
+        results = run(scene, preset, FLAGS.seed, output_dir, names=names)
+    except TrainingError as error:
+        sys.exit(f"experiments.run: {error}")
     print_table(results)
     print(f"report: {output_dir / 'report.html'}")
 

@@ -96,7 +96,12 @@ def train_step(
     optimizer: optax.GradientTransformation,
     config: TrainConfig,
 ) -> tuple[TrainState, Metrics]:
-    """One step on training photographs alone."""
+    """One step on training photographs alone.
+
+    Returns:
+      The next state, and metrics: `loss`, `skipped` and those of the field. A step whose loss or
+      gradient is not finite changes nothing but the count of steps; then `skipped` is 1, else 0.
+    """
     key_step = jax.random.fold_in(state.key, state.step)
     key_batch, key_render, key_adapt, _ = jax.random.split(key_step, 4)
     batch = _sample_batch(key_batch, views, config)
@@ -262,6 +267,23 @@ def _pool(batch, virtual):
 def _update(state, loss, key_adapt, field, optimizer):
     (value, metrics), gradients = jax.value_and_grad(loss, has_aux=True)(state.params)
     updates, opt_state = optimizer.update(gradients, state.opt_state, state.params)
-    params = optax.apply_updates(state.params, updates)
-    state = state.replace(step=state.step + 1, params=params, opt_state=opt_state)
-    return field.adapt(key_adapt, state), {"loss": value} | metrics
+    after = state.replace(
+        step=state.step + 1,
+        params=optax.apply_updates(state.params, updates),
+        opt_state=opt_state,
+    )
+    after = field.adapt(key_adapt, after)
+    # One bad step must not spoil the run: it is skipped, whole, and counted.
+    finite = jnp.isfinite(value)
+    for leaf in jax.tree.leaves(gradients):
+        finite &= jnp.all(jnp.isfinite(leaf))
+
+    def kept(new, old):
+        return jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, old)
+
+    after = after.replace(
+        params=kept(after.params, state.params),
+        buffers=kept(after.buffers, state.buffers),
+        opt_state=kept(after.opt_state, state.opt_state),
+    )
+    return after, {"loss": value, "skipped": 1 - finite.astype(jnp.float32)} | metrics

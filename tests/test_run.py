@@ -13,11 +13,12 @@ from absl.testing import flagsaver
 from experiments import run as program
 from experiments.audit import blur_to_footprint
 from experiments.evaluation import Target, score, summarise
+from experiments.loop import Programs, TrainingError
 from experiments.presets import PRESETS, QUICK
 from experiments.report import write_json
 from jaxcloseup.field import Rendering
 from jaxcloseup.scenes import load_scene
-from jaxcloseup.train import TrainConfig
+from jaxcloseup.train import TrainConfig, init_state
 from jaxcloseup.volume.nerf import NerfConfig
 
 
@@ -160,6 +161,22 @@ def test_a_preset_of_the_other_method_is_one_sentence(parsed_flags, tmp_path):
     ):
         program.main(["run"])
     assert not (tmp_path / "out").exists()
+
+
+def test_training_that_never_is_finite_stops_with_one_sentence(capture_folder):
+    with jax.numpy_dtype_promotion("standard"):
+        scene = load_scene(str(capture_folder))
+        programs = Programs(TINY, scene)
+        state = init_state(
+            jax.random.key(0),
+            scene.points,
+            scene.rgb,
+            field=programs.field,
+            optimizer=programs.optimizer,
+        )
+        broken = scene.train.replace(rgb=jnp.full(scene.train.rgb.shape, jnp.nan))
+        with pytest.raises(TrainingError, match="not finite in each of 3 steps"):
+            programs.run(state, broken, count=3)
 
 
 def test_numbers_that_are_not_finite_become_null(tmp_path):

@@ -172,6 +172,25 @@ def test_steps_in_one_scan_equal_steps_one_by_one(capture):
     assert not np.array_equal(first.params, other.params)
 
 
+@pytest.mark.parametrize("step", ["photographs", "labels"])
+def test_a_step_that_is_not_finite_changes_nothing_but_the_count(capture, step):
+    views, depths = capture
+    broken = views.replace(rgb=views.rgb.at[:, 3, 4].set(jnp.nan))
+    state = fresh_state()
+    if step == "photographs":
+        after, metrics = bind(train_step, num_rays=None)(state, broken)
+        _, fine = bind(train_step, num_rays=None)(state, views)
+    else:
+        run = bind(pseudo_step, num_rays=None, num_label_rays=None)
+        after, metrics = run(state, broken, depths, settings())
+        _, fine = run(state, views, depths, settings())
+    assert metrics["skipped"] == 1
+    assert fine["skipped"] == 0
+    assert after.step == state.step + 1
+    jax.tree.map(np.testing.assert_array_equal, after.params, state.params)
+    jax.tree.map(np.testing.assert_array_equal, after.opt_state, state.opt_state)
+
+
 def test_depths_are_undefined_where_the_field_is_thin_or_out_of_range(capture):
     views, _ = capture
     alpha = jnp.linspace(0, 1, plane.WIDTH)[None].repeat(plane.HEIGHT, axis=0)
