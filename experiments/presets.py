@@ -46,6 +46,7 @@ class Preset:
       depth_tolerance: relative agreement with the source view's depth.
       forward_label: colours from the forward warps.
       leave_out_source: labels are held against the other views alone.
+      label_share: of the labels' loss in a step's, unless both are pooled.
     """
 
     field: NerfConfig | SurfelConfig = dataclasses.field(default_factory=NerfConfig)
@@ -64,6 +65,7 @@ class Preset:
     depth_tolerance: float = math.inf
     forward_label: bool = False
     leave_out_source: bool = False
+    label_share: float = 0.5
 
 
 PAPER = Preset()
@@ -121,7 +123,9 @@ QUICK_SURFELS = dataclasses.replace(
         regularise_from=500,
         means_rate=(1.6e-3, 1.6e-5),
         decay_steps=2000,
-        density=DensityConfig(start=200, stop=1600, growth=1.1),
+        rotation_rate=5e-3,
+        distortion_weight=0.1,
+        density=DensityConfig(start=200, stop=1600, growth=1.1, noise=5e4),
         raster=RasterizeConfig(capacity=2**15, block=32),
     ),
     baseline_steps=2000,
@@ -201,4 +205,5 @@ def pseudo_settings(preset: Preset) -> PseudoSettings:
         fixed_anchors=jnp.float32(0),
         forward_label=jnp.float32(preset.forward_label),
         leave_out_source=jnp.float32(preset.leave_out_source),
+        label_share=jnp.float32(preset.label_share),
     )

@@ -31,6 +31,7 @@ class PseudoSettings:
       fixed_anchors: `[]` 1 draws only the four fixed anchors of the paper's ablation.
       forward_label: `[]` 1 takes the colour from the forward warps (released), 0 the backward one.
       leave_out_source: `[]` 1 keeps the source view out of the union that checks its label.
+      label_share: `[]` share of the labels' loss in a step's, 1/2 in the paper; 0: no labels.
     """
 
     pose: PoseSettings
@@ -40,6 +41,7 @@ class PseudoSettings:
     fixed_anchors: jax.Array
     forward_label: jax.Array
     leave_out_source: jax.Array
+    label_share: jax.Array
 
 
 class PseudoLabel(NamedTuple):
@@ -131,18 +133,71 @@ def make_label(
     return jax.lax.stop_gradient(label)
 
 
-def best_source(camera: Camera, views: Views, depths: jax.Array) -> jax.Array:
+def label_views(
+    cameras: Camera,
+    target_depths: jax.Array,
+    views: Views,
+    depths: jax.Array,
+    settings: PseudoSettings,
+    *,
+    sources: SourceBlocks | None = None,
+) -> Views:
+    """Label whole views at known poses, for test-time fine-tuning: pixels without label weigh 0.
+
+    Args:
+      cameras: stacked `[Q]`.
+      target_depths: `[Q, H, W]` rendered z-depth of these views; 0 where undefined.
+      views: the training photographs.
+      depths: `[V, H, W]` their rendered z-depth.
+      settings: tolerances and switches.
+      sources: as for `make_label`.
+    """
+    if sources is None:
+        sources = block_sources(views.cameras, depths, views.weight)
+    pixels = pixel_grid(cameras.height, cameras.width)
+
+    def one_view(target):
+        camera, depth = target
+        source = best_source(camera, views, depths, depth=depth)
+        data = source, views, depths, settings
+        label = make_label(camera, pixels, depth, *data, sources=sources)
+        return label.rgb, label.weight
+
+    rgb, weight = jax.lax.map(one_view, (cameras, target_depths))
+    return Views(cameras, rgb, weight)
+
+
+def best_source(
+    camera: Camera,
+    views: Views,
+    depths: jax.Array,
+    *,
+    depth: jax.Array | None = None,
+    tolerance: float = 0.05,
+) -> jax.Array:
     """The training view `[]` with most pixels landing in `camera` with their own depth.
 
-    The paper's tau for test-time fine-tuning: occlusion is ignored. Ties go to the lowest index.
+    The paper's tau for test-time fine-tuning. As published it ignores occlusion, and may choose a
+    photograph of the other side; given `depth`, only pixels that `camera` sees are counted. Ties go
+    to the lowest index.
+
+    Args:
+      camera: the virtual or target camera.
+      views: training photographs.
+      depths: `[V, H, W]` their rendered z-depth.
+      depth: `[H, W]` rendered z-depth of `camera`, or None to count as published.
+      tolerance: relative, within which a pixel's depth in `camera` must be that of `depth`.
     """
     pixels = pixel_grid(*depths.shape[1:])
 
     def count(view):
-        source, depth, weight = view
-        landed, landed_depth = points_to_pixels(camera, pixels_to_points(source, pixels, depth))
-        inside = in_bounds(landed, camera.height, camera.width)
-        return jnp.sum(inside & (landed_depth > 0) & (depth > 0) & (weight > 0))
+        source, own_depth, weight = view
+        landed, landed_depth = points_to_pixels(camera, pixels_to_points(source, pixels, own_depth))
+        lands = in_bounds(landed, camera.height, camera.width) & (landed_depth > 0)
+        if depth is not None:
+            observed = backward_warp(depth[..., None], landed, order=0)[..., 0]
+            lands &= depth_consistent(observed, landed_depth, tolerance)
+        return jnp.sum(lands & (own_depth > 0) & (weight > 0))
 
     return jnp.argmax(jax.lax.map(count, (views.cameras, depths, views.weight)))
 

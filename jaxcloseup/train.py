@@ -126,8 +126,9 @@ def pseudo_step(
 ) -> tuple[TrainState, Metrics]:
     """One step on training photographs and on one pseudo-labelled virtual close-up.
 
-    L = (L_c + L_pl) / 2, where L_pl is the mean over labelled pixels only, and 0 without any. The
-    photographs' draw is that of `train_step` at the same step, so that a control is paired.
+    L = (1 - s) L_c + s L_pl with `settings.label_share` s, 1/2 in the paper, where L_pl is the mean
+    over labelled pixels only, and 0 without any. The photographs' draw is that of `train_step` at
+    the same step, so that a control is paired.
 
     Args:
       state: what is trained.
@@ -184,7 +185,52 @@ def pseudo_step(
             )
         batch_loss, metrics = loss_of(params, state.buffers, batch, key_render)
         metrics = metrics | {f"label_{name}": value for name, value in virtual_metrics.items()}
-        return (batch_loss + virtual_loss) / 2, metrics | {"label_coverage": coverage}
+        share = settings.label_share
+        value = (1 - share) * batch_loss + share * virtual_loss
+        return value, metrics | {"label_coverage": coverage}
+
+    return _update(state, loss, key_adapt, field, optimizer)
+
+
+def labelled_step(
+    state: TrainState,
+    views: Views,
+    labels: Views,
+    settings: PseudoSettings,
+    *,
+    field: RadianceField,
+    optimizer: optax.GradientTransformation,
+    config: TrainConfig,
+) -> tuple[TrainState, Metrics]:
+    """One step on training photographs and on views labelled once, for test-time fine-tuning.
+
+    The loss is that of `pseudo_step`, never pooled; the photographs' draw is that of `train_step`.
+
+    Args:
+      state: what is trained.
+      views: training photographs.
+      labels: of `label_views`.
+      settings: of which `label_share` counts.
+      field: static.
+      optimizer: static.
+      config: static.
+    """
+    key_step = jax.random.fold_in(state.key, state.step)
+    key_batch, key_render, key_adapt, key_label = jax.random.split(key_step, 4)
+    key_label_batch, key_label_render = jax.random.split(key_label)
+    batch = _sample_batch(key_batch, views, config)
+    if config.num_label_rays is None:
+        labelled = sample_image(key_label_batch, labels)
+    else:
+        labelled = sample_pixels(key_label_batch, labels, config.num_label_rays)
+    loss_of = functools.partial(rendered_loss, field=field, chunk=config.gradient_chunk)
+
+    def loss(params):
+        batch_loss, metrics = loss_of(params, state.buffers, batch, key_render)
+        label_loss, label_metrics = loss_of(params, state.buffers, labelled, key_label_render)
+        share = settings.label_share
+        value = (1 - share) * batch_loss + share * label_loss
+        return value, metrics | {f"label_{name}": value for name, value in label_metrics.items()}
 
     return _update(state, loss, key_adapt, field, optimizer)
 

@@ -10,6 +10,7 @@ from jaxcloseup.pseudo import (
     PseudoSettings,
     best_source,
     count_seen,
+    label_views,
     make_label,
     sample_virtual_camera,
 )
@@ -28,6 +29,7 @@ def settings(**changes):
         "fixed_anchors": 0.0,
         "forward_label": 0.0,
         "leave_out_source": 0.0,
+        "label_share": 0.5,
     }
     return PseudoSettings(pose, **{k: jnp.float32(v) for k, v in (values | changes).items()})
 
@@ -170,6 +172,33 @@ def test_best_source_sees_most_of_the_target(capture):
     for index, x in enumerate((-1.0, 0.0, 1.0)):
         target = plane.camera_above(x, 0.1 * x, 3.9, tilt=0.1 * x)
         assert best_source(target, views, depths) == index
+
+
+def test_best_source_does_not_look_through_walls(capture):
+    views, depths, _ = capture
+    target = plane.camera_above(0.0, 0.0, 3.9)
+    _, depth, _ = truth(target)
+    assert best_source(target, views, depths, depth=jnp.asarray(depth, jnp.float32)) == 1
+    # The same photograph, if it saw the plane's underside two units further down.
+    behind = depths.at[1].multiply(1.5)
+    assert best_source(target, views, behind) == 1
+    assert best_source(target, views, behind, depth=jnp.asarray(depth, jnp.float32)) != 1
+
+
+def test_target_views_are_labelled_from_their_best_source(capture):
+    views, depths, closeup = capture
+    targets = [closeup, plane.camera_above(-0.9, 0.0, 2.0)]
+    stacked, exact = plane.make_views(targets)
+    labels = label_views(stacked.cameras, exact, views, depths, settings())
+    assert labels.rgb.shape == stacked.rgb.shape
+    for i, camera in enumerate(targets):
+        source = best_source(camera, views, depths, depth=exact[i])
+        alone = label(camera, GRID, exact[i], source, views, depths, settings())
+        np.testing.assert_allclose(labels.rgb[i], alone.rgb, atol=1e-6)
+        np.testing.assert_array_equal(labels.weight[i], alone.weight)
+        kept = np.asarray(labels.weight[i]) > 0
+        assert kept.mean() > 0.2
+        np.testing.assert_allclose(labels.rgb[i][kept], stacked.rgb[i][kept], atol=0.03)
 
 
 def test_photographs_that_saw_a_pixel_are_counted(capture):

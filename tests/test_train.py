@@ -14,6 +14,7 @@ from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_rays
 from jaxcloseup.train import (
     TrainConfig,
     init_state,
+    labelled_step,
     pseudo_step,
     render_depths,
     run_steps,
@@ -156,6 +157,21 @@ def test_the_control_sees_the_same_photographs(capture):
     control, _ = bind(train_step, num_rays=64)(state, views)
     half_way = (control.params - state.params) / 2
     np.testing.assert_allclose(unlabelled.params - state.params, half_way, atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [64, None])
+@pytest.mark.parametrize("share", [0.0, 0.25])
+def test_labelled_views_count_with_their_share(capture, count, share):
+    views, _ = capture
+    white = jnp.zeros(views.weight.shape).at[:, :, :5].set(1)
+    labels = views.replace(rgb=jnp.where(white[..., None] > 0, 1.0, 0.3), weight=white)
+    state = fresh_state()
+    step = bind(labelled_step, num_rays=count, num_label_rays=count and 4096)
+    after, metrics = step(state, views, labels, settings(label_share=share))
+    photographs = drawn(state, views, count).mean(axis=0)
+    pull = (1 - share) * (state.params - photographs) + share * (state.params - 1)
+    np.testing.assert_allclose(after.params, state.params - RATE * 2 * pull, atol=1e-6)
+    assert metrics["skipped"] == 0
 
 
 def test_steps_in_one_scan_equal_steps_one_by_one(capture):
