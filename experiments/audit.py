@@ -1,21 +1,23 @@
-"""How good pseudo-labels are, where the truth is known: on procedural scenes.
+"""How good pseudo-labels are: against the truth on procedural scenes, against photographs on all.
 
 A label can at best be what its source photograph resolves, so it is compared with the true close-up
-blurred to the footprint that the source's pixels have there.
+blurred to the footprint that the source's pixels have there. On captures, training photographs are
+left out one by one, labelled from the others and compared with what they are.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcloseup.batch import camera_at
+from jaxcloseup.batch import Views, camera_at, to_float
+from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points, points_to_pixels
 from jaxcloseup.geometry.masks import depth_consistent, in_bounds
 from jaxcloseup.geometry.warp import backward_warp
-from jaxcloseup.pseudo import PseudoSettings, make_label, sample_virtual_camera
+from jaxcloseup.pseudo import PseudoSettings, best_source, make_label, sample_virtual_camera
 from jaxcloseup.scenes import Scene
 
 
@@ -98,6 +100,61 @@ def audit_labels(
         if not whole:
             result[f"{name}_reason"] = "no label was kept" if name != "kept" else "nothing is seen"
     return result
+
+
+def audit_left_out(
+    views: Views,
+    depths: jax.Array,
+    render: Callable[[Camera], Rendering],
+    candidates: Sequence[PseudoSettings],
+    *,
+    count: int = 8,
+) -> list[dict[str, float | None]]:
+    """Labels of left-out training photographs, and the model, against these photographs.
+
+    The model has seen them, so its error is the least that it can be: labels that win here win.
+
+    Args:
+      views: training photographs.
+      depths: `[V, H, W]` their rendered z-depth.
+      render: `camera -> Rendering` of the model.
+      candidates: settings to compare.
+      count: photographs to leave out, spread evenly.
+
+    Returns:
+      For each candidate `label_psnr` and `model_psnr` over the pixels that are labelled, None where
+      none is, and `coverage`, their share.
+    """
+    audit = jax.jit(_left_out)
+    sums = np.zeros((len(candidates), 4))
+    for index in np.unique(np.linspace(0, len(views) - 1, count).round().astype(int)):
+        seen = render(camera_at(views.cameras, index))
+        for row, settings in enumerate(candidates):
+            sums[row] += audit(index, seen.rgb, seen.depth, views, depths, settings)
+    rows = []
+    for label, model, kept, total in sums:
+        of_label, of_model = (
+            float(-10 * np.log10(error / kept)) if kept and error else None
+            for error in (label, model)
+        )
+        rows.append({"label_psnr": of_label, "model_psnr": of_model, "coverage": kept / total})
+    return rows
+
+
+def _left_out(index, rgb, depth, views, depths, settings):
+    """Sums over kept pixels: squared errors of label and model, kept pixels, all pixels."""
+    camera, weight = camera_at(views.cameras, index), views.weight[index]
+    others = views.replace(weight=views.weight.at[index].set(0))
+    source = best_source(camera, others, depths, depth=depth)
+    pixels = pixel_grid(camera.height, camera.width)
+    label = make_label(camera, pixels, depth, source, others, depths, settings)
+    kept = label.weight * weight
+    truth = to_float(views.rgb[index])
+
+    def error(image):
+        return jnp.sum(kept * jnp.mean((jnp.clip(image, 0, 1) - truth) ** 2, axis=-1))
+
+    return jnp.stack([error(label.rgb), error(rgb), jnp.sum(kept), jnp.sum(weight)])
 
 
 @jax.jit

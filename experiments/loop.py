@@ -15,7 +15,7 @@ from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.geometry.union_warp import SourceBlocks
 from jaxcloseup.pseudo import PseudoSettings
 from jaxcloseup.scenes import Scene
-from jaxcloseup.train import TrainState, pseudo_step, run_steps, train_step
+from jaxcloseup.train import TrainState, labelled_step, pseudo_step, run_steps, train_step
 
 
 class TrainingError(Exception):
@@ -54,9 +54,15 @@ class Programs:
         ) -> Any:
             return pseudo_step(state, views, depths, settings, sources=sources, **bound)
 
-        # `count` may be traced; the input state is left alone.
-        self._train = jax.jit(functools.partial(run_steps, functools.partial(train_step, **bound)))
-        self._label = jax.jit(functools.partial(run_steps, label_step))
+        steps = {
+            "photographs": functools.partial(train_step, **bound),
+            "virtual": label_step,
+            "targets": functools.partial(labelled_step, **bound),
+        }
+        # The number of steps is traced; the input state is left alone.
+        self._runners = {
+            name: jax.jit(functools.partial(run_steps, step)) for name, step in steps.items()
+        }
         self._render = jax.jit(
             lambda state, camera: self.field.render(state.params, state.buffers, camera, None, None)
         )
@@ -66,11 +72,18 @@ class Programs:
         print(f"an image has more (tile, splat) pairs than fit: room for {self._growth} times more")
         self._compile()
 
-    def run(self, state: TrainState, *data: Any, count: int) -> tuple[TrainState, dict[str, float]]:
-        """Take `count` steps: on photographs if `data` is views alone, else with labels."""
+    def run(
+        self, kind: str, state: TrainState, *data: Any, count: int
+    ) -> tuple[TrainState, dict[str, float]]:
+        """Take `count` steps on "photographs", and with labels of "virtual" or "targets" views.
+
+        `data` is what `train_step`, `pseudo_step` (with its sources) and `labelled_step` take.
+
+        Raises:
+          TrainingError: no step had a finite loss and gradient.
+        """
         while True:
-            runner = self._train if len(data) == 1 else self._label
-            after, metrics = runner(state, *data, count=count)
+            after, metrics = self._runners[kind](state, *data, count=count)
             metrics = {key: float(v) for key, v in metrics.items()}
             # Means of counts: positive if any step had an overflow.
             overflow = [metrics.pop(key, 0) for key in ("overflow", "label_overflow")]
@@ -98,7 +111,7 @@ class Programs:
 
 
 def run_stage(
-    name: str, programs: Programs, state: TrainState, *data: Any, steps: int
+    name: str, programs: Programs, kind: str, state: TrainState, *data: Any, steps: int
 ) -> tuple[TrainState, list[dict[str, float]]]:
     """Take `steps` steps, reporting ten times or at least every 500 steps.
 
@@ -111,7 +124,7 @@ def run_stage(
     done = 0
     while done < steps:
         count = min(chunk, steps - done)
-        state, values = programs.run(state, *data, count=count)
+        state, values = programs.run(kind, state, *data, count=count)
         done += count
         history.append({"step": done} | values)
         seconds = time.perf_counter() - start

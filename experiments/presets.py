@@ -47,6 +47,9 @@ class Preset:
       forward_label: colours from the forward warps.
       leave_out_source: labels are held against the other views alone.
       label_share: of the labels' loss in a step's, unless both are pooled.
+      test_time_steps: in total for a NeRF, for each target view for surfels.
+      gated: use labels only where left-out photographs show that they beat the model, and with the
+        tolerances found there.
     """
 
     field: NerfConfig | SurfelConfig = dataclasses.field(default_factory=NerfConfig)
@@ -66,6 +69,8 @@ class Preset:
     forward_label: bool = False
     leave_out_source: bool = False
     label_share: float = 0.5
+    test_time_steps: int = 200
+    gated: bool = False
 
 
 PAPER = Preset()
@@ -112,6 +117,7 @@ PAPER_SURFELS = Preset(
     train=WHOLE_IMAGES,
     baseline_steps=30_000,
     closeup_steps=500,
+    test_time_steps=5,
 )
 
 QUICK_SURFELS = dataclasses.replace(
@@ -123,6 +129,7 @@ QUICK_SURFELS = dataclasses.replace(
         regularise_from=500,
         means_rate=(1.6e-3, 1.6e-5),
         decay_steps=2000,
+        late_rate=0.1,
         rotation_rate=5e-3,
         distortion_weight=0.1,
         density=DensityConfig(start=200, stop=1600, growth=1.1, noise=5e4),
@@ -131,6 +138,8 @@ QUICK_SURFELS = dataclasses.replace(
     baseline_steps=2000,
     closeup_steps=200,
     downscale=8,
+    leave_out_source=True,
+    gated=True,
 )
 
 PRESETS = {

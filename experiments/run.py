@@ -3,7 +3,8 @@
     python -m experiments.run --scene=table
 
 Stages: `baseline` trains on the photographs; `control` and `closeup` both go on from it for the
-same number of steps, without and with pseudo-labels. The scene is a built-in one or a folder.
+same number of steps, without and with pseudo-labels of random close-ups; `test_time` goes on from
+it with labels of the very close-ups that are scored. The scene is a built-in one or a folder.
 """
 
 import contextlib
@@ -17,16 +18,18 @@ import platform
 import sys
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from absl import app, flags
 
 import jaxcloseup
 from experiments.audit import audit_labels
 from experiments.evaluation import evaluate, exact_depths, make_targets
+from experiments.gate import choose_settings, print_gate
 from experiments.loop import Programs, TrainingError, run_stage
 from experiments.pictures import comparisons, label_pictures, write_renders
 from experiments.presets import (
@@ -38,9 +41,12 @@ from experiments.presets import (
 from experiments.report import format_metric, print_table, write_json, write_report
 from jaxcloseup.batch import camera_at
 from jaxcloseup.geometry.union_warp import block_sources
+from jaxcloseup.pseudo import label_views
 from jaxcloseup.scenes import Scene, SceneError, load_scene
-from jaxcloseup.train import init_state, render_depths
+from jaxcloseup.train import init_state, labelled_depth, render_depths
 
+
+STAGES = ("baseline", "control", "closeup", "test_time")
 
 FLAGS = flags.FLAGS
 flags.DEFINE_string(
@@ -69,6 +75,7 @@ flags.DEFINE_integer(
 flags.DEFINE_integer(
     "closeup_steps", None, "steps of closeup and of control; default: the preset's", lower_bound=1
 )
+flags.DEFINE_list("stages", list(STAGES), "of the stages those to run; baseline always is")
 flags.DEFINE_enum(
     "compute_dtype",
     "float32",
@@ -102,7 +109,7 @@ def main(argv: list[str]) -> None:
         sys.exit(f"experiments.run: {error}")
     names = {"method": FLAGS.method, "preset": FLAGS.preset}
     try:
-        results = run(scene, preset, FLAGS.seed, output_dir, names=names)
+        results = run(scene, preset, FLAGS.seed, output_dir, names=names, to_run=FLAGS.stages)
     except TrainingError as error:
         sys.exit(f"experiments.run: {error}")
     print_table(results)
@@ -151,10 +158,21 @@ def choose_output_dir(folder: str | None, scene: str, method: str) -> pathlib.Pa
     return path
 
 
+@flags.multi_flags_validator(["stages"], message=f"--stages takes names of {', '.join(STAGES)}")
+def _known(values: dict[str, list[str]]) -> bool:
+    return set(values["stages"]) <= set(STAGES)
+
+
 def run(
-    scene: Scene, preset: Preset, seed: int, output_dir: pathlib.Path, *, names: dict[str, str]
+    scene: Scene,
+    preset: Preset,
+    seed: int,
+    output_dir: pathlib.Path,
+    *,
+    names: dict[str, str],
+    to_run: Sequence[str] = STAGES,
 ) -> dict[str, Any]:
-    """All stages on one scene; writes everything under `output_dir` and returns the results.
+    """The stages on one scene; writes everything under `output_dir` and returns the results.
 
     Args:
       scene: what is photographed.
@@ -162,6 +180,7 @@ def run(
       seed: random seed.
       output_dir: an empty folder.
       names: of "method" and "preset", for the report.
+      to_run: stages; `baseline` always runs.
     """
     key_init, key_audit, key_pictures = jax.random.split(jax.random.key(seed), 3)
     key_depths, key_points = jax.random.fold_in(key_init, 1), jax.random.fold_in(key_init, 2)
@@ -176,9 +195,9 @@ def run(
     seconds: dict[str, float] = {}
     history, stages, renderings, targets = {}, {}, {}, {}
 
-    def train(stage, state, *data, steps):
+    def train(stage, kind, state, *data, steps):
         with timed(seconds, stage):
-            state, history[stage] = run_stage(stage, programs, state, *data, steps=steps)
+            state, history[stage] = run_stage(stage, programs, kind, state, *data, steps=steps)
         return state
 
     def score(stage, state):
@@ -194,7 +213,7 @@ def run(
 
     points = initial_points(key_points, scene)
     state = init_state(key_init, *points, field=programs.field, optimizer=programs.optimizer)
-    baseline = train("baseline", state, views, steps=preset.baseline_steps)
+    baseline = train("baseline", "photographs", state, views, steps=preset.baseline_steps)
     with timed(seconds, "depths"):
         options = {
             "near": scene.near,
@@ -214,14 +233,45 @@ def run(
                 rendered = functools.partial(programs.render, baseline)
                 targets[split] = make_targets(scene, split, seen_from, rendered)
     score("baseline", baseline)
-    control = train("control", baseline, views, steps=preset.closeup_steps)
-    score("control", control)
-    data = views, depths, settings, sources
-    closeup = train("closeup", baseline, *data, steps=preset.closeup_steps)
-    score("closeup", closeup)
+    gate = None
+    if preset.gated:
+        with timed(seconds, "gate"):
+            rendered = functools.partial(programs.render, baseline)
+            chosen, gate = choose_settings(views, depths, rendered, settings)
+            settings = settings if chosen is None else chosen
+            print_gate(gate)
+    use_labels = gate is None or gate["use_labels"]
+    steps = preset.closeup_steps
+    if "control" in to_run or not use_labels:
+        control = train("control", "photographs", baseline, views, steps=steps)
+        score("control", control)
+    if "closeup" in to_run:
+        if use_labels:
+            data = views, depths, settings, sources
+            closeup = train("closeup", "virtual", baseline, *data, steps=steps)
+        else:
+            closeup = control  # the same steps on the same photographs
+        score("closeup", closeup)
+    if "test_time" in to_run and scene.test is not None:
+        with timed(seconds, "test_time_labels"):
+            cameras = scene.test.cameras
+            seen = [
+                programs.render(baseline, camera_at(cameras, i)) for i in range(len(scene.test))
+            ]
+            target_depths = jnp.stack(
+                [labelled_depth(one, near=scene.near, far=scene.far) for one in seen]
+            )
+            data = views, depths, settings
+            labels = jax.jit(label_views)(cameras, target_depths, *data, sources=sources)
+        per_view = len(scene.test) if names["method"] == "surfels" else 1
+        kind, data = (
+            ("targets", (views, labels, settings)) if use_labels else ("photographs", (views,))
+        )
+        steps = preset.test_time_steps * per_view
+        score("test_time", train("test_time", kind, baseline, *data, steps=steps))
 
     with timed(seconds, "report"):
-        labels = {
+        of_labels = {
             "scene": scene,
             "settings": settings,
             "depths": depths,
@@ -229,15 +279,15 @@ def run(
         }
         pictures = comparisons(output_dir / "compare", targets, renderings)
         shown = targets.get("test", [])
-        pictures += label_pictures(key_pictures, shown, output_dir / "labels", **labels)
+        pictures += label_pictures(key_pictures, shown, output_dir / "labels", **of_labels)
         audit = {}
         if exact is not None:
             truth = {
                 "depths": exact,
                 "render_depth": jax.jit(lambda camera: scene.surface(camera).depth),
             }
-            audit["exact_depth"] = audit_labels(key_audit, exact, **labels | truth)
-            audit["trained_depth"] = audit_labels(key_audit, exact, **labels)
+            audit["exact_depth"] = audit_labels(key_audit, exact, **of_labels | truth)
+            audit["trained_depth"] = audit_labels(key_audit, exact, **of_labels)
     results = {
         "scene": scene.name,
         **names,
@@ -245,6 +295,7 @@ def run(
         "resolution": [size.width, size.height],
         "stages": stages,
         "labels": audit,
+        "gate": gate,
         "seconds": seconds,
         "history": history,
         "config": config(preset),

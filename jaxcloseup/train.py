@@ -14,7 +14,7 @@ import optax
 from flax import struct
 
 from jaxcloseup.batch import Batch, Views, sample_image, sample_pixels
-from jaxcloseup.field import RadianceField
+from jaxcloseup.field import RadianceField, Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.geometry.union_warp import SourceBlocks
 from jaxcloseup.pseudo import PseudoSettings, make_label, sample_virtual_camera
@@ -278,12 +278,24 @@ def render_depths(
     def one_view(view):
         camera, key = view
         seen = field.render(params, buffers, camera, None, key)
-        depth = seen.depth if divided else seen.depth * seen.alpha
-        defined = (seen.alpha >= min_alpha) & (depth >= near) & (depth <= far)
-        return jnp.where(defined, depth, 0)
+        return labelled_depth(seen, near=near, far=far, min_alpha=min_alpha, divided=divided)
 
     keys = None if key is None else jax.random.split(key, cameras.intrinsics.shape[0])
     return jax.lax.map(one_view, (cameras, keys))
+
+
+def labelled_depth(
+    rendering: Rendering,
+    *,
+    near: float,
+    far: float,
+    min_alpha: float = 0.5,
+    divided: bool = True,
+) -> jax.Array:
+    """Z-depth `[...]` of a rendering where it is fit for labels, else 0: see `render_depths`."""
+    depth = rendering.depth if divided else rendering.depth * rendering.alpha
+    defined = (rendering.alpha >= min_alpha) & (depth >= near) & (depth <= far)
+    return jnp.where(defined, depth, 0)
 
 
 def _sample_batch(key, views, config):

@@ -176,7 +176,7 @@ def test_training_that_never_is_finite_stops_with_one_sentence(capture_folder):
         )
         broken = scene.train.replace(rgb=jnp.full(scene.train.rgb.shape, jnp.nan))
         with pytest.raises(TrainingError, match="not finite in each of 3 steps"):
-            programs.run(state, broken, count=3)
+            programs.run("photographs", state, broken, count=3)
 
 
 def test_numbers_that_are_not_finite_become_null(tmp_path):

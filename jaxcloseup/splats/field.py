@@ -47,6 +47,7 @@ class SurfelConfig:
       scale_weight: of the mean scale.
       means_rate: learning rate of the means, first and at `decay_steps`.
       decay_steps: see `means_rate`; it stays there.
+      late_rate: factor on all learning rates from `decay_steps` on.
       sh_rate, opacity_rate, scale_rate, rotation_rate: Adam's; 1/20 of `sh_rate` for what depends
         on the direction.
       density: when surfels move, or None for never.
@@ -67,6 +68,7 @@ class SurfelConfig:
     scale_weight: float = 0.01
     means_rate: tuple[float, float] = (1.6e-4, 1.6e-6)
     decay_steps: int = 30_000
+    late_rate: float = 1.0
     sh_rate: float = 2.5e-3
     opacity_rate: float = 5e-2
     scale_rate: float = 5e-3
@@ -202,7 +204,8 @@ def surfel_optimizer(config: SurfelConfig, *, extent: float) -> optax.GradientTr
             opacity_logits=config.opacity_rate,
             sh=by_band[None, :, None],
         )
-        updates = jax.tree.map(lambda rate, update: -rate * update, rates, updates)
+        late = jnp.where(state.count < config.decay_steps, 1, config.late_rate)
+        updates = jax.tree.map(lambda rate, update: -late * rate * update, rates, updates)
         return updates, optax.ScaleByScheduleState(count=state.count + 1)
 
     rescale = optax.GradientTransformation(init, update)
