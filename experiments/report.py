@@ -12,8 +12,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from jaxcloseup.artifacts.files import write_file
 from jaxcloseup.artifacts.images import png_data_uri
+from jaxcloseup.files import write_file
 
 
 SPLIT_TITLES = {"test": "Close-ups", "test_far": "Ordinary views"}

@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxcloseup.artifacts.files import write_file
 from jaxcloseup.artifacts.images import (
     colorize_depth,
     colorize_error,
@@ -15,6 +14,7 @@ from jaxcloseup.artifacts.images import (
     to_uint8,
     write_png,
 )
+from jaxcloseup.files import write_file
 from jaxcloseup.metrics import quantize
 
 

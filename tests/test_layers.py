@@ -10,6 +10,7 @@ ROOT = pathlib.Path(__file__).parents[1]
 PACKAGE = ROOT / "jaxcloseup"
 MAY_IMPORT = {
     "version": set(),
+    "files": set(),
     "numerics": set(),
     "geometry": {"numerics"},
     "field": set(),
@@ -21,7 +22,7 @@ MAY_IMPORT = {
     "pseudo": {"geometry", "field", "batch"},
     "train": {"geometry", "field", "batch", "pseudo", "rendered_loss"},
     "scenes": {"numerics", "geometry", "batch"},
-    "artifacts": {"geometry", "batch"},
+    "artifacts": {"files", "geometry", "batch"},
 }
 LIBRARIES_OF_GEOMETRY = {"jax", "chex", "flax", "typing", "jaxcloseup"}
 

@@ -154,6 +154,8 @@ def surfel_field(config: SurfelConfig, *, extent: float) -> RadianceField:
         )
         typical = safe_divide(jnp.sum(image.alpha * image.depth), jnp.sum(image.alpha))
         distortion = scale_free_distortion(image.aux.distortion, jax.lax.stop_gradient(typical))
+        # Of what is right before a camera, in views that nobody took, it has no bound.
+        distortion = distortion / (1 + distortion)
         penalty = config.normal_weight * inconsistency + config.distortion_weight * distortion
         number = jnp.sum(buffers.alive, dtype=image.rgb.dtype)
 
