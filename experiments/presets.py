@@ -139,6 +139,7 @@ QUICK_SURFELS = dataclasses.replace(
     closeup_steps=200,
     downscale=8,
     leave_out_source=True,
+    label_share=0.2,
     gated=True,
 )
 

@@ -316,8 +316,15 @@ def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
 
 def config(preset: Preset) -> dict[str, Any]:
     """The configuration as JSON can hold it: what is infinite, and so off, becomes "inf"."""
-    values = dataclasses.asdict(preset) | {"magnification": list(preset.magnification)}
-    return {key: "inf" if value == np.inf else value for key, value in values.items()}
+
+    def plain(value):
+        if isinstance(value, dict):
+            return {key: plain(inner) for key, inner in value.items()}
+        if isinstance(value, tuple):
+            return list(value)
+        return "inf" if value == np.inf else value
+
+    return plain(dataclasses.asdict(preset))
 
 
 def versions() -> dict[str, str]:

@@ -13,11 +13,19 @@ from absl.testing import flagsaver
 from experiments import run as program
 from experiments.audit import blur_to_footprint
 from experiments.evaluation import Target, score, summarise
+from experiments.gate import choose_settings, print_gate
 from experiments.loop import Programs, TrainingError
-from experiments.presets import PRESETS, QUICK
+from experiments.presets import (
+    PRESETS,
+    QUICK,
+    QUICK_SURFELS,
+    initial_points,
+    pseudo_settings,
+)
 from experiments.report import write_json
 from jaxcloseup.field import Rendering
 from jaxcloseup.scenes import load_scene
+from jaxcloseup.splats import RasterizeConfig
 from jaxcloseup.train import TrainConfig, init_state
 from jaxcloseup.volume.nerf import NerfConfig
 
@@ -30,6 +38,20 @@ TINY = dataclasses.replace(
     train=TrainConfig(num_rays=64, num_label_rays=64),
     baseline_steps=30,
     closeup_steps=3,
+    downscale=1,
+)
+TINY_SURFELS = dataclasses.replace(
+    QUICK_SURFELS,
+    field=dataclasses.replace(
+        QUICK_SURFELS.field,
+        capacity=600,
+        decay_steps=20,
+        density=None,
+        raster=RasterizeConfig(capacity=2**14, tile=8, chunk=4, block=12),
+    ),
+    baseline_steps=20,
+    closeup_steps=2,
+    test_time_steps=2,
     downscale=1,
 )
 OPENGL = np.diag([1.0, -1, -1])
@@ -81,7 +103,7 @@ def test_a_run_scores_every_stage_on_every_split(finished):
     results, output_dir = finished
     assert json.loads((output_dir / "results.json").read_text()) == results
     assert results["resolution"] == [plane.WIDTH, plane.HEIGHT]
-    for stage in ("baseline", "control", "closeup"):
+    for stage in ("baseline", "control", "closeup", "test_time"):
         for split in ("test", "test_far"):
             scores = results["stages"][stage][split]
             assert scores["psnr"] == pytest.approx(scores["views"]["0"]["psnr"])
@@ -90,6 +112,73 @@ def test_a_run_scores_every_stage_on_every_split(finished):
             assert scores["lpips_vgg_reason"]
         assert results["seconds"][stage] > 0
     assert results["stages"]["control"] != results["stages"]["closeup"]
+
+
+def run_surfels(capture_folder, output_dir, **options):
+    with jax.numpy_dtype_promotion("standard"):
+        scene = load_scene(str(capture_folder))
+        names = {"method": "surfels", "preset": "tiny"}
+        return program.run(scene, TINY_SURFELS, 0, output_dir, names=names, **options)
+
+
+def test_surfels_run_through_all_stages_from_random_points(capture_folder, tmp_path, capsys):
+    stages = ["closeup", "test_time"]
+    results = run_surfels(capture_folder, tmp_path, to_run=stages)
+    assert "room for" not in capsys.readouterr().out
+    assert json.loads((tmp_path / "results.json").read_text()) == results
+    stages = results["stages"]
+    use_labels = results["gate"]["use_labels"]
+    # Without labels, control takes the place of closeup.
+    assert ("control" in stages) == (not use_labels)
+    assert {"baseline", "closeup", "test_time"} <= set(stages)
+    assert stages["baseline"]["test"]["psnr"] > 10
+    assert len(results["gate"]["left_out"]) == 6
+    if not use_labels:
+        assert stages["closeup"] == stages["control"]
+    assert [entry["step"] for entry in results["history"]["test_time"]] == [1, 2]
+
+
+def test_no_step_is_taken_on_a_truncated_image(capture_folder, capsys):
+    """The same steps with too little room and with plenty end alike."""
+    states = []
+    for capacity in (1800, 2**14):
+        raster = dataclasses.replace(TINY_SURFELS.field.raster, capacity=capacity)
+        field = dataclasses.replace(TINY_SURFELS.field, raster=raster)
+        with jax.numpy_dtype_promotion("standard"):
+            scene = load_scene(str(capture_folder))
+            programs = Programs(dataclasses.replace(TINY_SURFELS, field=field), scene)
+            points = initial_points(jax.random.key(1), scene, count=500)
+            bound = {"field": programs.field, "optimizer": programs.optimizer}
+            state = init_state(jax.random.key(0), *points, **bound)
+            after, metrics = programs.run("photographs", state, scene.train, count=3)
+        assert "overflow" not in metrics
+        states.append(after)
+    assert "room for 2 times more" in capsys.readouterr().out
+    assert states[0].step == states[1].step == 3
+    for small, large in zip(*(jax.tree.leaves(s.params) for s in states), strict=True):
+        np.testing.assert_allclose(small, large, atol=1e-5)
+
+
+@pytest.mark.parametrize("model", ["grey", "true"])
+def test_labels_are_used_where_they_beat_the_model(model):
+    cameras = [plane.camera_above(x, 0.1 * x, 3.0, tilt=0.1 * x) for x in (-0.6, -0.2, 0.2, 0.6)]
+    views, depths = plane.make_views(cameras)
+
+    def render(camera):
+        rgb, depth, _ = plane.photograph(camera)
+        rgb = jnp.full(rgb.shape, 0.5) if model == "grey" else jnp.asarray(rgb, jnp.float32)
+        return Rendering(rgb, jnp.asarray(depth, jnp.float32), jnp.ones(depth.shape))
+
+    chosen, found = choose_settings(views, depths, render, pseudo_settings(QUICK_SURFELS))
+    assert found["use_labels"] == (chosen is not None) == (model == "grey")
+    best = max(found["left_out"], key=lambda row: row["coverage"])
+    assert best["label_psnr"] > 30
+    assert best["coverage"] > 0.3
+    if model == "grey":
+        assert best["model_psnr"] < 15
+        # The loosest colours keep most of these labels, which are right.
+        assert chosen.rgb_tolerance == jnp.float32(0.08)
+    print_gate(found)
 
 
 def test_a_saved_render_reproduces_its_score(finished, capture_folder):
@@ -152,6 +241,11 @@ def test_flags_override_the_preset(parsed_flags):
     assert preset.baseline_steps == PRESETS["nerf"]["paper"].baseline_steps == 200_000
     assert program.config(preset)["depth_tolerance"] == "inf"
     json.dumps(program.config(preset), allow_nan=False)
+
+
+def test_an_unknown_stage_is_refused(parsed_flags):
+    with pytest.raises(flags.IllegalFlagValueError, match="--stages takes names of baseline"):
+        flags.FLAGS.stages = ["baseline", "polish"]
 
 
 def test_a_preset_of_the_other_method_is_one_sentence(parsed_flags, tmp_path):
