@@ -101,6 +101,8 @@ def write_report(
     ]
     if results["labels"]:
         parts.append(_labels_table(results["labels"]))
+    if results["gate"]:
+        parts.append(_gate_table(results["gate"]))
     section = None
     for picture in pictures:
         if picture.section != section:
@@ -127,6 +129,24 @@ def _labels_table(labels):
         "source photograph's pixels.</p><table><tr><th>depth<th>mean absolute error of kept "
         "labels<th>kept, of what the source sees<th>leaked: kept though the source does not see it"
         f"{lines}</table>"
+    )
+
+
+def _gate_table(gate):
+    verdict = "Labels are used" if gate["use_labels"] else "No labels are used"
+    lines = "".join(
+        f"<tr><td>{row['rgb_tolerance']}<td>{row['depth_tolerance']}<td>{row['coverage']:.0%}"
+        f"<td>{format_metric('psnr', row['label_psnr'])}"
+        f"<td>{format_metric('psnr', row['model_psnr'])}"
+        f"<td>{'chosen' if i == gate['chosen'] else ''}"
+        for i, row in enumerate(gate["left_out"])
+    )
+    return (
+        "<h2>Labels against left-out photographs</h2><p>Training photographs are left out one by "
+        "one and labelled from the others. Labels are used where they are nearer to the photograph "
+        f"than the model, which was trained on it, is on the same pixels. {verdict}.</p><table><tr>"
+        "<th>tolerance of colour<th>of depth<th>labelled<th>PSNR of labels (dB)"
+        f"<th>PSNR of the model (dB)<th>{lines}</table>"
     )
 
 

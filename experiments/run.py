@@ -39,10 +39,12 @@ from experiments.presets import (
     pseudo_settings,
 )
 from experiments.report import format_metric, print_table, write_json, write_report
+from jaxcloseup.artifacts.surfel_ply import write_surfels
 from jaxcloseup.batch import camera_at
 from jaxcloseup.geometry.union_warp import block_sources
 from jaxcloseup.pseudo import label_views
 from jaxcloseup.scenes import Scene, SceneError, load_scene
+from jaxcloseup.splats import Surfels
 from jaxcloseup.train import init_state, labelled_depth, render_depths
 
 
@@ -210,6 +212,9 @@ def run(
                 write_renders(folder, renderings[stage, split], scene)
                 psnr = format_metric("psnr", stages[stage][split]["psnr"])
                 print(f"{stage:>9} {split}: PSNR {psnr} dB", flush=True)
+            if isinstance(state.params, Surfels):
+                path = output_dir / "splats" / f"{stage}.ply"
+                write_surfels(path, state.params, state.buffers.alive)
 
     points = initial_points(key_points, scene)
     state = init_state(key_init, *points, field=programs.field, optimizer=programs.optimizer)

@@ -11,6 +11,7 @@ PACKAGE = ROOT / "jaxcloseup"
 MAY_IMPORT = {
     "version": set(),
     "files": set(),
+    "ply": {"files"},
     "numerics": set(),
     "geometry": {"numerics"},
     "field": set(),
@@ -21,8 +22,8 @@ MAY_IMPORT = {
     "splats": {"numerics", "geometry", "field", "metrics"},
     "pseudo": {"geometry", "field", "batch"},
     "train": {"geometry", "field", "batch", "pseudo", "rendered_loss"},
-    "scenes": {"numerics", "geometry", "batch"},
-    "artifacts": {"files", "geometry", "batch"},
+    "scenes": {"ply", "numerics", "geometry", "batch"},
+    "artifacts": {"files", "ply", "numerics", "geometry", "batch", "splats"},
 }
 LIBRARIES_OF_GEOMETRY = {"jax", "chex", "flax", "typing", "jaxcloseup"}
 

@@ -23,6 +23,7 @@ from experiments.presets import (
     pseudo_settings,
 )
 from experiments.report import write_json
+from jaxcloseup.artifacts.surfel_ply import read_surfels
 from jaxcloseup.field import Rendering
 from jaxcloseup.scenes import load_scene
 from jaxcloseup.splats import RasterizeConfig
@@ -136,6 +137,10 @@ def test_surfels_run_through_all_stages_from_random_points(capture_folder, tmp_p
     if not use_labels:
         assert stages["closeup"] == stages["control"]
     assert [entry["step"] for entry in results["history"]["test_time"]] == [1, 2]
+    assert "left-out photographs" in (tmp_path / "report.html").read_text()
+    for stage in stages:
+        splats = read_surfels(tmp_path / "splats" / f"{stage}.ply")
+        assert len(splats.means) == 600  # no more points were there
 
 
 def test_no_step_is_taken_on_a_truncated_image(capture_folder, capsys):

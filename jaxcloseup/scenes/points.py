@@ -5,15 +5,8 @@ import warnings
 
 import numpy as np
 
+from jaxcloseup.ply import PlyError, read_vertices
 from jaxcloseup.scenes.errors import PointsWarning, SceneError
-
-
-_TYPES = {
-    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
-    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
-    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
-}
-_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 def read_ply_points(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
@@ -27,61 +20,20 @@ def read_ply_points(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
       SceneError: not a PLY file, cut short, or vertices without x, y, z.
     """
     try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise SceneError(f"{path} cannot be read ({error.strerror}): restore the file.") from error
-    header, end, body = data.partition(b"end_header")
-    encoding, count, properties = _parse_header(path, header if end else b"")
-    body = body.partition(b"\n")[2]
-    dtype = np.dtype([(name, _ORDERS[encoding] + kind) for name, kind in properties])
-    short = f"{path} ends before its {count} vertices do: copy or export it again."
-    if encoding == "ascii":
-        rows = body.split(b"\n")[:count]
-        try:
-            vertices = np.array([tuple(map(float, row.split())) for row in rows], dtype)
-        except ValueError as error:
-            raise SceneError(short) from error
-        if len(rows) < count:
-            raise SceneError(short)
-    else:
-        if len(body) < count * dtype.itemsize:
-            raise SceneError(short)
-        vertices = np.frombuffer(body, dtype, count)
+        vertices = read_vertices(path)
+    except PlyError as error:
+        raise SceneError(str(error)) from error
     points = np.stack([vertices[axis] for axis in "xyz"], -1).astype(np.float32)
     rgb = _colours(vertices)
     finite = np.isfinite(points).all(-1) & np.isfinite(rgb).all(-1)
     if not finite.all():
-        dropped = count - finite.sum()
+        count, dropped = len(vertices), (~finite).sum()
         warnings.warn(
             f"{path}: {dropped} of {count} points are not finite and were dropped.",
             PointsWarning,
             stacklevel=2,
         )
     return points[finite], rgb[finite]
-
-
-def _parse_header(path: pathlib.Path, header: bytes) -> tuple[str, int, list[tuple[str, str]]]:
-    """Encoding, vertex count and the vertex's (name, type) pairs."""
-    lines = [line.split() for line in header.decode("latin-1").splitlines() if line.split()]
-    encodings = [line[1] for line in lines if line[0] == "format" and len(line) > 1]
-    elements = [index for index, line in enumerate(lines) if line[0] == "element"]
-    if not lines or lines[0] != ["ply"] or not encodings or encodings[0] not in _ORDERS:
-        raise SceneError(
-            f"{path} is not a PLY file: replace it, or remove it to do without points."
-        )
-    vertex = lines[elements[0] : [*elements, len(lines)][1]] if elements else [[""]]
-    try:
-        if vertex[0][:2] != ["element", "vertex"]:
-            raise KeyError("vertex")
-        properties = [(line[2], _TYPES[line[1]]) for line in vertex if line[0] == "property"]
-        if not {"x", "y", "z"} <= {name for name, _ in properties}:
-            raise KeyError("x, y, z")
-        return encodings[0], int(vertex[0][2]), properties
-    except (KeyError, IndexError, ValueError) as error:
-        raise SceneError(
-            f"{path} does not begin with vertices of plain properties x, y, z ({error}): export it "
-            "again as a point cloud."
-        ) from error
 
 
 def _colours(vertices: np.ndarray) -> np.ndarray:

@@ -1,0 +1,114 @@
+"""Surfels in the PLY layout that viewers and editors of Gaussian splats exchange.
+
+Values are those before activation: log scales, opacity logits, quaternions as they are. Spherical
+harmonics beyond the constant lie channel by channel, all of red first.
+"""
+
+import pathlib
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcloseup.geometry.rotations import quaternion_to_matrix
+from jaxcloseup.ply import PlyError, read_vertices, write_vertices
+from jaxcloseup.splats.surfels import Surfels
+
+
+_LEAST_LOG_SCALE = -20.0  # what compressed PLY can hold
+
+
+def write_surfels(
+    path: str | pathlib.Path, surfels: Surfels, alive: jax.Array, *, num_scales: int = 3
+) -> int:
+    """Write living surfels, in the coordinates they have, whole or not at all.
+
+    Args:
+      path: the file.
+      surfels: `N` surfels.
+      alive: `[N]` bool.
+      num_scales: 3, with a thickness of a thousandth of the smaller radius, for viewers of 3-D
+        Gaussians; 2 for those that know discs.
+
+    Returns:
+      How many living surfels were left out because a value of theirs is not finite.
+
+    Raises:
+      ValueError: `num_scales` is neither.
+      OSError: one sentence that names the path and the reason.
+    """
+    if num_scales not in (2, 3):
+        raise ValueError(f"num_scales is 2 or 3, not {num_scales}")
+    surfels, alive = jax.device_get((surfels, alive))
+    sh = np.asarray(surfels.sh, np.float32)
+    scales = np.asarray(surfels.log_scales, np.float32)
+    if num_scales == 3:
+        thin = scales.min(axis=1, keepdims=True) + np.float32(np.log(1e-3))
+        scales = np.concatenate([scales, np.maximum(thin, _LEAST_LOG_SCALE)], axis=1)
+    normals = np.asarray(quaternion_to_matrix(jnp.asarray(surfels.quaternions)))[..., 2]
+    columns = {
+        **dict(zip("xyz", np.asarray(surfels.means).T, strict=True)),
+        **dict(zip(("nx", "ny", "nz"), normals.T, strict=True)),
+        **_numbered("f_dc", sh[:, 0]),
+        **_numbered(
+            "f_rest",
+            sh[:, 1:].swapaxes(1, 2).reshape(len(sh), 3 * (sh.shape[1] - 1)),
+        ),
+        "opacity": surfels.opacity_logits,
+        **_numbered("scale", scales),
+        **_numbered("rot", np.asarray(surfels.quaternions)),
+    }
+    vertices = np.empty(len(sh), [(name, "<f4") for name in columns])
+    for name, column in columns.items():
+        vertices[name] = column
+    finite = np.all([np.isfinite(column) for column in columns.values()], axis=0)
+    write_vertices(path, vertices[alive & finite])
+    return int(np.sum(alive & ~finite))
+
+
+def read_surfels(path: str | pathlib.Path) -> Surfels:
+    """Surfels of a PLY file with two or three scales, of any degree of spherical harmonics.
+
+    Raises:
+      PlyError: not a PLY file of splats; one sentence that says what to do.
+    """
+    vertices = read_vertices(path)
+    constant, rest, scales, rotation = (
+        _columns(vertices, stem) for stem in ("f_dc", "f_rest", "scale", "rot")
+    )
+    found = constant.shape[1], scales.shape[1], rotation.shape[1]
+    bands = rest.shape[1] // 3
+    if (
+        found not in ((3, 2, 4), (3, 3, 4))
+        or bands not in (0, 3, 8, 15)
+        or rest.shape[1] % 3
+        or "opacity" not in vertices.dtype.names
+    ):
+        raise PlyError(
+            f"{path} does not hold splats (f_dc_*, f_rest_*, opacity, scale_*, rot_*): export it "
+            "again as Gaussian splats."
+        )
+    higher = rest.reshape(len(vertices), 3, bands).swapaxes(1, 2)
+    return Surfels(
+        means=jnp.asarray(np.stack([vertices[axis] for axis in "xyz"], axis=1), jnp.float32),
+        log_scales=jnp.asarray(scales[:, :2]),
+        quaternions=jnp.asarray(rotation),
+        opacity_logits=jnp.asarray(vertices["opacity"].astype(np.float32)),
+        sh=jnp.asarray(np.concatenate([constant[:, None], higher], axis=1)),
+    )
+
+
+def _numbered(stem, array):
+    return {f"{stem}_{i}": column for i, column in enumerate(np.asarray(array).T)}
+
+
+def _columns(vertices, stem):
+    """The properties `stem_0`, `stem_1`, ... as `[P, count]`, by number and not by place."""
+    numbers = sorted(
+        int(match[1])
+        for name in vertices.dtype.names
+        if (match := re.fullmatch(rf"{stem}_(\d+)", name))
+    )
+    columns = [vertices[f"{stem}_{i}"] for i in numbers]
+    return np.array(columns, np.float32).reshape(len(columns), len(vertices)).T

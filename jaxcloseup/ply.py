@@ -1,0 +1,86 @@
+"""PLY files of vertices, as NumPy structured arrays."""
+
+import pathlib
+
+import numpy as np
+
+from jaxcloseup.files import write_file
+
+
+_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
+}
+_NAMES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
+_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+class PlyError(ValueError):
+    """A PLY file that cannot be read. The message is one sentence that says what to do."""
+
+
+def read_vertices(path: str | pathlib.Path) -> np.ndarray:
+    """The vertices of a PLY file, of any encoding, order and number of plain properties.
+
+    Raises:
+      PlyError: not there, not a PLY file, cut short, or not beginning with vertices with x, y, z.
+    """
+    path = pathlib.Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise PlyError(f"{path} cannot be read ({error.strerror}): restore the file.") from error
+    header, end, body = data.partition(b"end_header")
+    encoding, count, properties = _parse_header(path, header if end else b"")
+    body = body.partition(b"\n")[2]
+    dtype = np.dtype([(name, _ORDERS[encoding] + kind) for name, kind in properties])
+    short = f"{path} ends before its {count} vertices do: copy or export it again."
+    if encoding == "ascii":
+        rows = body.split(b"\n")[:count]
+        try:
+            vertices = np.array([tuple(map(float, row.split())) for row in rows], dtype)
+        except ValueError as error:
+            raise PlyError(short) from error
+        if len(rows) < count:
+            raise PlyError(short)
+        return vertices
+    if len(body) < count * dtype.itemsize:
+        raise PlyError(short)
+    return np.frombuffer(body, dtype, count)
+
+
+def write_vertices(path: str | pathlib.Path, vertices: np.ndarray) -> None:
+    """Write a structured array `[P]` as a binary little-endian PLY file, whole or not at all.
+
+    Raises:
+      OSError: one sentence that names the path and the reason.
+    """
+    fields = [(name, vertices.dtype[name].str[1:]) for name in vertices.dtype.names]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    lines += [f"property {_NAMES[kind]} {name}" for name, kind in fields]
+    header = "\n".join([*lines, "end_header\n"]).encode()
+    packed = vertices.astype([(name, "<" + kind) for name, kind in fields])
+    write_file(path, header + packed.tobytes())
+
+
+def _parse_header(path: pathlib.Path, header: bytes) -> tuple[str, int, list[tuple[str, str]]]:
+    """Encoding, vertex count and the vertex's (name, type) pairs."""
+    lines = [line.split() for line in header.decode("latin-1").splitlines() if line.split()]
+    encodings = [line[1] for line in lines if line[0] == "format" and len(line) > 1]
+    elements = [index for index, line in enumerate(lines) if line[0] == "element"]
+    if not lines or lines[0] != ["ply"] or not encodings or encodings[0] not in _ORDERS:
+        raise PlyError(f"{path} is not a PLY file: replace it, or remove it to do without points.")
+    vertex = lines[elements[0] : [*elements, len(lines)][1]] if elements else [[""]]
+    try:
+        if vertex[0][:2] != ["element", "vertex"]:
+            raise KeyError("vertex")
+        properties = [(line[2], _TYPES[line[1]]) for line in vertex if line[0] == "property"]
+        if not {"x", "y", "z"} <= {name for name, _ in properties}:
+            raise KeyError("x, y, z")
+        return encodings[0], int(vertex[0][2]), properties
+    except (KeyError, IndexError, ValueError) as error:
+        raise PlyError(
+            f"{path} does not begin with vertices of plain properties x, y, z ({error}): export it "
+            "again as a point cloud."
+        ) from error
