@@ -9,6 +9,7 @@ import jax
 import optax
 
 from experiments.presets import Preset, make_field, make_optimizer, make_train_config
+from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.batch import Views
 from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import Camera
@@ -34,11 +35,11 @@ class Programs:
         """Compile for a preset's field on a scene."""
         self.preset, self.scene = preset, scene
         self.optimizer: optax.GradientTransformation = make_optimizer(preset, scene)
-        self._growth = 1
+        self.growth = 1
         self._compile()
 
     def _compile(self) -> None:
-        self.field = make_field(self.preset, self.scene, growth=self._growth)
+        self.field = make_field(self.preset, self.scene, growth=self.growth)
         bound = {
             "field": self.field,
             "optimizer": self.optimizer,
@@ -67,10 +68,15 @@ class Programs:
             lambda state, camera: self.field.render(state.params, state.buffers, camera, None, None)
         )
 
+    def make_room(self, growth: int) -> None:
+        """Have room for `growth` times as many pairs as the preset has, or more."""
+        if growth > self.growth:
+            self.growth = growth
+            self._compile()
+
     def _grow(self) -> None:
-        self._growth *= 2
-        print(f"an image has more (tile, splat) pairs than fit: room for {self._growth} times more")
-        self._compile()
+        self.make_room(2 * self.growth)
+        print(f"an image has more (tile, splat) pairs than fit: room for {self.growth} times more")
 
     def run(
         self, kind: str, state: TrainState, *data: Any, count: int
@@ -111,28 +117,59 @@ class Programs:
 
 
 def run_stage(
-    name: str, programs: Programs, kind: str, state: TrainState, *data: Any, steps: int
+    name: str,
+    programs: Programs,
+    kind: str,
+    state: TrainState,
+    *data: Any,
+    steps: int,
+    checkpoints: Checkpoints,
+    save_every: int,
 ) -> tuple[TrainState, list[dict[str, float]]]:
     """Take `steps` steps, reporting ten times or at least every 500 steps.
+
+    Goes on from the newest checkpoint of the stage, if there is one, with the same next steps.
+
+    Args:
+      name: of the stage.
+      programs: what is compiled.
+      kind: of step, as `Programs.run` knows it.
+      state: to begin with.
+      *data: as `Programs.run` takes it.
+      steps: how many.
+      checkpoints: where states are kept.
+      save_every: steps after which a state is kept, rounded up to when progress is reported; the
+        last one always is.
 
     Returns:
       The state, and for each chunk its metrics with `step`, counted within the stage.
     """
     chunk = max(1, min(-(-steps // 10), 500))
-    history = []
+    history: list[dict[str, float]] = []
+    begun = done = 0
+    kept = checkpoints.load(name, state)
+    if kept is not None:
+        begun, state, progress = kept
+        done, history = begun, progress["history"]
+        programs.make_room(progress["growth"])
+        print(f"{name:>9} {done}/{steps}  resumed")
+    saved = done
     start = time.perf_counter()
-    done = 0
     while done < steps:
         count = min(chunk, steps - done)
         state, values = programs.run(kind, state, *data, count=count)
         done += count
         history.append({"step": done} | values)
-        seconds = time.perf_counter() - start
-        left = seconds / done * (steps - done)
+        rate = (done - begun) / (time.perf_counter() - start)
+        left = (steps - done) / rate
         shown = "  ".join(f"{key} {value:.4g}" for key, value in values.items())
         print(
-            f"{name:>9} {done:>{len(str(steps))}}/{steps}  {done / seconds:6.1f} steps/s  "
+            f"{name:>9} {done:>{len(str(steps))}}/{steps}  {rate:6.1f} steps/s  "
             f"{int(left // 60)}:{int(left % 60):02d} left  {shown}",
             flush=True,
         )
+        if done == steps or done - saved >= save_every:
+            progress = {"history": history, "growth": programs.growth}
+            checkpoints.save(name, done, state, progress)
+            saved = done
     return state, history

@@ -39,6 +39,7 @@ from experiments.presets import (
     pseudo_settings,
 )
 from experiments.report import format_metric, print_table, write_json, write_report
+from jaxcloseup.artifacts.checkpoints import CheckpointError, Checkpoints
 from jaxcloseup.artifacts.surfel_ply import write_surfels
 from jaxcloseup.batch import camera_at
 from jaxcloseup.geometry.union_warp import block_sources
@@ -77,6 +78,10 @@ flags.DEFINE_integer(
 flags.DEFINE_integer(
     "closeup_steps", None, "steps of closeup and of control; default: the preset's", lower_bound=1
 )
+flags.DEFINE_integer(
+    "save_every", 1000, "steps between checkpoints; each stage's end is kept too", lower_bound=1
+)
+flags.DEFINE_bool("resume", False, "go on with the run in --output_dir where it was cut off")
 flags.DEFINE_list("stages", list(STAGES), "of the stages those to run; baseline always is")
 flags.DEFINE_enum(
     "compute_dtype",
@@ -104,15 +109,25 @@ def main(argv: list[str]) -> None:
     logging.getLogger("jax._src.xla_bridge").setLevel(logging.WARNING)
     try:
         preset = preset_from_flags()
-        output_dir = choose_output_dir(FLAGS.output_dir, FLAGS.scene, FLAGS.method)
+        output_dir = choose_output_dir(
+            FLAGS.output_dir, FLAGS.scene, FLAGS.method, resume=FLAGS.resume
+        )
         scene = load_scene(FLAGS.scene, downscale=preset.downscale, half_pixel=FLAGS.half_pixel)
         output_dir.mkdir(parents=True, exist_ok=True)
     except (SceneError, OSError, ValueError) as error:
         sys.exit(f"experiments.run: {error}")
     names = {"method": FLAGS.method, "preset": FLAGS.preset}
     try:
-        results = run(scene, preset, FLAGS.seed, output_dir, names=names, to_run=FLAGS.stages)
-    except TrainingError as error:
+        results = run(
+            scene,
+            preset,
+            FLAGS.seed,
+            output_dir,
+            names=names,
+            to_run=FLAGS.stages,
+            save_every=FLAGS.save_every,
+        )
+    except (TrainingError, CheckpointError) as error:
         sys.exit(f"experiments.run: {error}")
     print_table(results)
     print(f"report: {output_dir / 'report.html'}")
@@ -147,8 +162,17 @@ def set_up_compilation_cache(folder: str | None) -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
-def choose_output_dir(folder: str | None, scene: str, method: str) -> pathlib.Path:
-    """The output folder; never one that holds something."""
+def choose_output_dir(
+    folder: str | None, scene: str, method: str, *, resume: bool = False
+) -> pathlib.Path:
+    """The output folder; never one that holds something, unless that is to be resumed."""
+    if resume:
+        if folder is None or not (pathlib.Path(folder) / "checkpoints").is_dir():
+            raise FileNotFoundError(
+                f"--resume finds no run in --output_dir={folder or ''}: name the folder of one "
+                "that was cut off"
+            )
+        return pathlib.Path(folder)
     if folder is None:
         stamp = datetime.datetime.now().strftime("%Y-%m-%d_%H%M%S")
         folder = os.path.join("outputs", pathlib.Path(scene).name, method, stamp)
@@ -173,6 +197,7 @@ def run(
     *,
     names: dict[str, str],
     to_run: Sequence[str] = STAGES,
+    save_every: int = 1000,
 ) -> dict[str, Any]:
     """The stages on one scene; writes everything under `output_dir` and returns the results.
 
@@ -180,9 +205,10 @@ def run(
       scene: what is photographed.
       preset: how it is trained.
       seed: random seed.
-      output_dir: an empty folder.
+      output_dir: an empty folder, or that of the same run, cut off.
       names: of "method" and "preset", for the report.
       to_run: stages; `baseline` always runs.
+      save_every: steps between checkpoints. Those in `output_dir` are gone on from.
     """
     key_init, key_audit, key_pictures = jax.random.split(jax.random.key(seed), 3)
     key_depths, key_points = jax.random.fold_in(key_init, 1), jax.random.fold_in(key_init, 2)
@@ -193,13 +219,25 @@ def run(
         f"depth {scene.near:.3g} to {scene.far:.3g}"
     )
     programs = Programs(preset, scene)
+    identity = {"scene": scene.name, "seed": seed, "config": config(preset), **names}
+    identity |= {"resolution": [size.width, size.height], "version": jaxcloseup.__version__}
+    checkpoints = Checkpoints(output_dir / "checkpoints", identity)
     settings = pseudo_settings(preset)
     seconds: dict[str, float] = {}
     history, stages, renderings, targets = {}, {}, {}, {}
 
     def train(stage, kind, state, *data, steps):
         with timed(seconds, stage):
-            state, history[stage] = run_stage(stage, programs, kind, state, *data, steps=steps)
+            state, history[stage] = run_stage(
+                stage,
+                programs,
+                kind,
+                state,
+                *data,
+                steps=steps,
+                checkpoints=checkpoints,
+                save_every=save_every,
+            )
         return state
 
     def score(stage, state):

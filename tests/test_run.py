@@ -23,6 +23,7 @@ from experiments.presets import (
     pseudo_settings,
 )
 from experiments.report import write_json
+from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.artifacts.surfel_ply import read_surfels
 from jaxcloseup.field import Rendering
 from jaxcloseup.scenes import load_scene
@@ -97,7 +98,7 @@ def run_tiny(capture_folder, output_dir):
     with jax.numpy_dtype_promotion("standard"):
         scene = load_scene(str(capture_folder))
         names = {"method": "nerf", "preset": "tiny"}
-        return program.run(scene, TINY, 0, output_dir, names=names)
+        return program.run(scene, TINY, 0, output_dir, names=names, save_every=3)
 
 
 def test_a_run_scores_every_stage_on_every_split(finished):
@@ -205,10 +206,36 @@ def test_a_run_leaves_pictures_and_a_page_without_links(finished):
     assert "http" not in page
 
 
-def test_the_same_seed_gives_the_same_metrics(finished, capture_folder, tmp_path):
+def test_a_run_cut_off_and_resumed_ends_the_same(
+    finished, capture_folder, tmp_path, monkeypatch, capsys
+):
+    """Cut off in the middle of a stage, and once more between two stages."""
     results, _ = finished
+    save = Checkpoints.save
+    for saves in (4, 8):
+        left = iter(range(saves))
+
+        def save_some(self, *args, left=left):
+            if next(left, None) is None:
+                raise KeyboardInterrupt
+            save(self, *args)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Checkpoints, "save", save_some)
+            with pytest.raises(KeyboardInterrupt):
+                run_tiny(capture_folder, tmp_path)
     again = run_tiny(capture_folder, tmp_path)
+    assert "resumed" in capsys.readouterr().out
     assert again["stages"] == results["stages"]
+    assert again["history"] == results["history"]
+
+
+def test_nothing_to_resume_is_one_sentence(parsed_flags, tmp_path):
+    with (
+        flagsaver.flagsaver(scene="table", output_dir=str(tmp_path), resume=True),
+        pytest.raises(SystemExit, match="--resume finds no run in --output_dir="),
+    ):
+        program.main(["run"])
 
 
 @pytest.fixture

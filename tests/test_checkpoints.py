@@ -1,0 +1,70 @@
+"""Checkpoints: what was saved comes back, half of one never does, another run's is refused."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxcloseup.artifacts.checkpoints import CheckpointError, Checkpoints
+
+
+RUN = {"scene": "table", "seed": 0, "config": {"field": {"capacity": 100}, "steps": [1, 2]}}
+
+
+def state(value):
+    return {
+        "step": jnp.int32(value),
+        "alive": jnp.arange(5) < value,
+        "moments": (jnp.full((3, 2), value / 3, jnp.float32), ()),
+        "key": jax.random.key(value),
+    }
+
+
+def test_the_newest_state_comes_back_to_the_bit(tmp_path):
+    first = Checkpoints(tmp_path / "c", RUN)
+    assert first.load("baseline", state(0)) is None
+    for step in (2, 4, 6):
+        first.save("baseline", step, state(step), {"history": [{"loss": step / 7}]})
+    first.save("closeup", 1, state(9), {})
+    again = Checkpoints(tmp_path / "c", RUN)
+    step, found, progress = again.load("baseline", state(0))
+    assert step == 6
+    assert progress == {"history": [{"loss": 6 / 7}]}
+    expected = state(6)
+    np.testing.assert_array_equal(
+        jax.random.uniform(found.pop("key")), jax.random.uniform(expected.pop("key"))
+    )
+    jax.tree.map(np.testing.assert_array_equal, found, expected)
+    assert again.load("closeup", state(0))[0] == 1
+    kept = {path.name for path in (tmp_path / "c" / "baseline").iterdir()}
+    assert kept == {"4", "6"}
+
+
+def test_half_of_a_checkpoint_is_none(tmp_path):
+    checkpoints = Checkpoints(tmp_path, RUN)
+    checkpoints.save("baseline", 3, state(3), {})
+    # As a crash leaves it: still under the name that it is written under.
+    half = tmp_path / "baseline" / "5.orbax-checkpoint-tmp"
+    (half / "state").mkdir(parents=True)
+    (half / "state" / "data").write_bytes(b"half")
+    step, _, _ = Checkpoints(tmp_path, RUN).load("baseline", state(0))
+    assert step == 3
+
+
+def test_another_run_is_refused_by_the_first_difference(tmp_path):
+    Checkpoints(tmp_path, RUN)
+    other = RUN | {"config": {"field": {"capacity": 200}, "steps": [1, 2]}}
+    with pytest.raises(CheckpointError, match=r"whose config.field.capacity is 100 and not 200"):
+        Checkpoints(tmp_path, other)
+    with pytest.raises(CheckpointError, match=r"whose seed is 0 and not 1"):
+        Checkpoints(tmp_path, RUN | {"seed": 1})
+    (tmp_path / "run.json").write_text("{")
+    with pytest.raises(CheckpointError, match=r"run.json cannot be read"):
+        Checkpoints(tmp_path, RUN)
+
+
+def test_a_state_of_another_form_is_refused(tmp_path):
+    checkpoints = Checkpoints(tmp_path, RUN)
+    checkpoints.save("baseline", 3, state(3), {})
+    with pytest.raises(CheckpointError, match="does not hold this run's state"):
+        checkpoints.load("baseline", {"step": jnp.int32(0)})
