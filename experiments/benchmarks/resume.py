@@ -1,0 +1,65 @@
+"""A short run, killed at ten random moments and resumed each time, against one left in peace.
+
+All metrics and the history of every stage must be the same to the last bit.
+"""
+
+import json
+import pathlib
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+
+
+KILLS = 10
+COMMAND = (
+    "-m",
+    "experiments.run",
+    "--scene=table",
+    "--baseline_steps=100",
+    "--closeup_steps=20",
+    "--save_every=10",
+)
+
+
+def run() -> None:
+    """Print when runs were killed, and whether what they ended with is the same."""
+    with tempfile.TemporaryDirectory() as folder:
+        root = pathlib.Path(folder)
+        start = time.perf_counter()
+        _start(root / "peace", resume=False).wait()
+        expected = _outcome(root / "peace")
+        whole = time.perf_counter() - start
+        print(f"left in peace: {whole:.0f} s")
+        rng, killed, attempt = random.Random(0), 0, 0
+        while killed < KILLS:
+            target = root / f"killed_{attempt}"
+            while not (target / "report.html").exists():
+                process = _start(target, resume=(target / "checkpoints").is_dir())
+                if killed < KILLS:
+                    time.sleep(rng.uniform(0.1, 1.0) * whole)
+                    if process.poll() is None:
+                        process.send_signal(signal.SIGKILL)
+                        killed += 1
+                        steps = sorted(target.glob("checkpoints/*/[0-9]*"))
+                        last = "/".join(steps[-1].parts[-2:]) if steps else "nothing"
+                        print(f"kill {killed}: {last} was kept", flush=True)
+                if process.wait() not in (0, -signal.SIGKILL):
+                    raise AssertionError((root / "log.txt").read_text()[-2000:])
+            attempt += 1
+            if _outcome(target) != expected:
+                raise AssertionError("a run that was killed and resumed ended differently")
+        print(f"{killed} kills, {attempt} runs: the same metrics and history every time")
+
+
+def _start(folder, *, resume):
+    flags = [f"--output_dir={folder}", *(["--resume"] if resume else [])]
+    with (folder.parent / "log.txt").open("a") as log:
+        return subprocess.Popen([sys.executable, *COMMAND, *flags], stdout=log, stderr=log)
+
+
+def _outcome(folder):
+    results = json.loads((folder / "results.json").read_text())
+    return {name: results[name] for name in ("stages", "history", "labels", "gate")}
