@@ -15,6 +15,7 @@ from experiments.audit import blur_to_footprint
 from experiments.evaluation import Target, score, summarise
 from experiments.gate import choose_settings, print_gate
 from experiments.loop import Programs, TrainingError
+from experiments.pipeline import config, run
 from experiments.presets import (
     PRESETS,
     QUICK,
@@ -98,7 +99,7 @@ def run_tiny(capture_folder, output_dir):
     with jax.numpy_dtype_promotion("standard"):
         scene = load_scene(str(capture_folder))
         names = {"method": "nerf", "preset": "tiny"}
-        return program.run(scene, TINY, 0, output_dir, names=names, save_every=3)
+        return run(scene, TINY, 0, output_dir, names=names, save_every=3)
 
 
 def test_a_run_scores_every_stage_on_every_split(finished):
@@ -120,7 +121,7 @@ def run_surfels(capture_folder, output_dir, **options):
     with jax.numpy_dtype_promotion("standard"):
         scene = load_scene(str(capture_folder))
         names = {"method": "surfels", "preset": "tiny"}
-        return program.run(scene, TINY_SURFELS, 0, output_dir, names=names, **options)
+        return run(scene, TINY_SURFELS, 0, output_dir, names=names, **options)
 
 
 def test_surfels_run_through_all_stages_from_random_points(capture_folder, tmp_path, capsys):
@@ -271,8 +272,8 @@ def test_flags_override_the_preset(parsed_flags):
     assert preset.closeup_steps == 7
     assert preset.field.compute_dtype == "bfloat16"
     assert preset.baseline_steps == PRESETS["nerf"]["paper"].baseline_steps == 200_000
-    assert program.config(preset)["depth_tolerance"] == "inf"
-    json.dumps(program.config(preset), allow_nan=False)
+    assert config(preset)["depth_tolerance"] == "inf"
+    json.dumps(config(preset), allow_nan=False)
 
 
 def test_an_unknown_stage_is_refused(parsed_flags):

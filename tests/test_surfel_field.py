@@ -150,6 +150,19 @@ def test_first_step_moves_everything_by_its_learning_rate():
     np.testing.assert_allclose(size[:, 1:], 2e-2 / 20, rtol=1e-5)
 
 
+def test_late_steps_are_smaller():
+    config = dataclasses.replace(CONFIG, decay_steps=1, late_rate=0.1)
+    optimizer = surfel_optimizer(config, extent=EXTENT)
+    surfels = to_surfels(random_scene(0))
+    with jax.numpy_dtype_promotion("standard"):
+        first, state = optimizer.update(surfels, optimizer.init(surfels), surfels)
+        late, _ = optimizer.update(surfels, state, surfels)
+    for name in ("log_scales", "quaternions", "opacity_logits", "sh"):
+        np.testing.assert_allclose(getattr(late, name), 0.1 * getattr(first, name), rtol=1e-4)
+    # The means' rate has fallen to its last value besides.
+    np.testing.assert_allclose(late.means, 0.01 * first.means, rtol=1e-4)
+
+
 @pytest.fixture(scope="module")
 def image(trained, capture):
     state, views = trained[2], capture[0]

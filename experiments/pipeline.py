@@ -1,0 +1,227 @@
+"""All stages of one experiment on one scene, from photographs to the report."""
+
+import contextlib
+import dataclasses
+import functools
+import pathlib
+import platform
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxcloseup
+from experiments.audit import audit_labels
+from experiments.evaluation import evaluate, exact_depths, make_targets
+from experiments.gate import choose_settings, print_gate
+from experiments.loop import Programs, run_stage
+from experiments.pictures import comparisons, label_pictures, write_renders
+from experiments.presets import Preset, initial_points, pseudo_settings
+from experiments.report import format_metric, write_json, write_report
+from jaxcloseup.artifacts.checkpoints import Checkpoints
+from jaxcloseup.artifacts.surfel_ply import write_surfels
+from jaxcloseup.batch import camera_at
+from jaxcloseup.geometry.union_warp import block_sources
+from jaxcloseup.pseudo import label_views
+from jaxcloseup.scenes import Scene
+from jaxcloseup.splats import Surfels
+from jaxcloseup.train import init_state, labelled_depth, render_depths
+
+
+STAGES = ("baseline", "control", "closeup", "test_time")
+
+
+def run(
+    scene: Scene,
+    preset: Preset,
+    seed: int,
+    output_dir: pathlib.Path,
+    *,
+    names: dict[str, str],
+    to_run: Sequence[str] = STAGES,
+    save_every: int = 1000,
+) -> dict[str, Any]:
+    """The stages on one scene; writes everything under `output_dir` and returns the results.
+
+    Args:
+      scene: what is photographed.
+      preset: how it is trained.
+      seed: random seed.
+      output_dir: an empty folder, or that of the same run, cut off.
+      names: of "method" and "preset", for the report.
+      to_run: stages; `baseline` always runs.
+      save_every: steps between checkpoints. Those in `output_dir` are gone on from.
+    """
+    key_init, key_audit, key_pictures = jax.random.split(jax.random.key(seed), 3)
+    key_depths, key_points = jax.random.fold_in(key_init, 1), jax.random.fold_in(key_init, 2)
+    scene = dataclasses.replace(scene, train=jax.device_put(scene.train))
+    views, size = scene.train, scene.train.cameras
+    print(
+        f"{scene.name}: {len(views)} training photographs of {size.width} x {size.height}, "
+        f"depth {scene.near:.3g} to {scene.far:.3g}"
+    )
+    programs = Programs(preset, scene)
+    identity = {"scene": scene.name, "seed": seed, "config": config(preset), **names}
+    identity |= {"resolution": [size.width, size.height], "version": jaxcloseup.__version__}
+    checkpoints = Checkpoints(output_dir / "checkpoints", identity)
+    settings = pseudo_settings(preset)
+    seconds: dict[str, float] = {}
+    history, stages, renderings, targets = {}, {}, {}, {}
+
+    def train(stage, kind, state, *data, steps):
+        with timed(seconds, stage):
+            state, history[stage] = run_stage(
+                stage,
+                programs,
+                kind,
+                state,
+                *data,
+                steps=steps,
+                checkpoints=checkpoints,
+                save_every=save_every,
+            )
+        return state
+
+    def score(stage, state):
+        with timed(seconds, f"{stage}_evaluation"):
+            stages[stage] = {}
+            for split, of_split in targets.items():
+                rendered = functools.partial(programs.render, state)
+                stages[stage][split], renderings[stage, split] = evaluate(rendered, of_split)
+                folder = output_dir / "renders" / stage / split
+                write_renders(folder, renderings[stage, split], scene)
+                psnr = format_metric("psnr", stages[stage][split]["psnr"])
+                print(f"{stage:>9} {split}: PSNR {psnr} dB", flush=True)
+            if isinstance(state.params, Surfels):
+                path = output_dir / "splats" / f"{stage}.ply"
+                write_surfels(path, state.params, state.buffers.alive)
+
+    points = initial_points(key_points, scene)
+    state = init_state(key_init, *points, field=programs.field, optimizer=programs.optimizer)
+    baseline = train("baseline", "photographs", state, views, steps=preset.baseline_steps)
+    with timed(seconds, "depths"):
+        options = {
+            "near": scene.near,
+            "far": scene.far,
+            "key": key_depths if preset.train.perturbed_depth else None,
+            "divided": not preset.train.undivided_depth,
+        }
+        for i in range(len(views)):  # which makes room for every view
+            programs.render(baseline, camera_at(size, i))
+        render_all = jax.jit(functools.partial(render_depths, programs.field, **options))
+        depths = render_all(baseline.params, baseline.buffers, views.cameras)
+        sources = jax.jit(block_sources)(views.cameras, depths, views.weight)
+        exact = exact_depths(scene, views.cameras) if scene.surface else None
+        for split in scene.names:
+            if split != "train":
+                seen_from = depths if exact is None else exact
+                rendered = functools.partial(programs.render, baseline)
+                targets[split] = make_targets(scene, split, seen_from, rendered)
+    score("baseline", baseline)
+    gate = None
+    if preset.gated:
+        with timed(seconds, "gate"):
+            rendered = functools.partial(programs.render, baseline)
+            chosen, gate = choose_settings(views, depths, rendered, settings)
+            settings = settings if chosen is None else chosen
+            print_gate(gate)
+    use_labels = gate is None or gate["use_labels"]
+    steps = preset.closeup_steps
+    if "control" in to_run or not use_labels:
+        control = train("control", "photographs", baseline, views, steps=steps)
+        score("control", control)
+    if "closeup" in to_run:
+        if use_labels:
+            data = views, depths, settings, sources
+            closeup = train("closeup", "virtual", baseline, *data, steps=steps)
+        else:
+            closeup = control  # the same steps on the same photographs
+        score("closeup", closeup)
+    if "test_time" in to_run and scene.test is not None:
+        with timed(seconds, "test_time_labels"):
+            labels = _label_targets(programs, baseline, scene, depths, settings, sources)
+        per_view = len(scene.test) if names["method"] == "surfels" else 1
+        kind, data = (
+            ("targets", (views, labels, settings)) if use_labels else ("photographs", (views,))
+        )
+        steps = preset.test_time_steps * per_view
+        score("test_time", train("test_time", kind, baseline, *data, steps=steps))
+
+    with timed(seconds, "report"):
+        of_labels = {
+            "scene": scene,
+            "settings": settings,
+            "depths": depths,
+            "render_depth": lambda camera: programs.render(baseline, camera).depth,
+        }
+        pictures = comparisons(output_dir / "compare", targets, renderings)
+        shown = targets.get("test", [])
+        pictures += label_pictures(key_pictures, shown, output_dir / "labels", **of_labels)
+        audit = {}
+        if exact is not None:
+            truth = {
+                "depths": exact,
+                "render_depth": jax.jit(lambda camera: scene.surface(camera).depth),
+            }
+            audit["exact_depth"] = audit_labels(key_audit, exact, **of_labels | truth)
+            audit["trained_depth"] = audit_labels(key_audit, exact, **of_labels)
+    results = {
+        "scene": scene.name,
+        **names,
+        "seed": seed,
+        "resolution": [size.width, size.height],
+        "stages": stages,
+        "labels": audit,
+        "gate": gate,
+        "seconds": seconds,
+        "history": history,
+        "config": config(preset),
+        "versions": versions(),
+    }
+    write_json(output_dir / "results.json", results)
+    write_report(output_dir / "report.html", results, pictures)
+    return results
+
+
+def _label_targets(programs, state, scene, depths, settings, sources):
+    """Labels of the close-ups that are scored, made once from what `state` renders there."""
+    cameras = scene.test.cameras
+    seen = [programs.render(state, camera_at(cameras, i)) for i in range(len(scene.test))]
+    target_depths = jnp.stack([labelled_depth(s, near=scene.near, far=scene.far) for s in seen])
+    data = scene.train, depths, settings
+    return jax.jit(label_views)(cameras, target_depths, *data, sources=sources)
+
+
+@contextlib.contextmanager
+def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
+    """Record under `name` how long the body takes."""
+    start = time.perf_counter()
+    yield
+    seconds[name] = time.perf_counter() - start
+
+
+def config(preset: Preset) -> dict[str, Any]:
+    """The configuration as JSON can hold it: what is infinite, and so off, becomes "inf"."""
+
+    def plain(value):
+        if isinstance(value, dict):
+            return {key: plain(inner) for key, inner in value.items()}
+        if isinstance(value, tuple):
+            return list(value)
+        return "inf" if value == np.inf else value
+
+    return plain(dataclasses.asdict(preset))
+
+
+def versions() -> dict[str, str]:
+    """What made the numbers."""
+    return {
+        "jaxcloseup": jaxcloseup.__version__,
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "numpy": np.__version__,
+        "device": jax.devices()[0].device_kind,
+    }
