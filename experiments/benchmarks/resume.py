@@ -39,7 +39,7 @@ def run() -> None:
             while not (target / "report.html").exists():
                 process = _start(target, resume=(target / "checkpoints").is_dir())
                 if killed < KILLS:
-                    time.sleep(rng.uniform(0.1, 1.0) * whole)
+                    time.sleep(rng.uniform(0.1, 0.7) * whole)
                     if process.poll() is None:
                         process.send_signal(signal.SIGKILL)
                         killed += 1
