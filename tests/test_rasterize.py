@@ -161,6 +161,25 @@ def test_tiles_do_not_matter(precision):
             np.testing.assert_allclose(other[name], images[0][name], atol=atol, rtol=rtol)
 
 
+@pytest.mark.parametrize("name", ["in front", "far and small"])
+def test_tiles_and_crops_agree_to_a_millionth(name):
+    """All outputs, in float32, where nothing is cut by the near plane."""
+    surfels = to_surfels(SCENES[name])
+    whole = render(surfels, to_camera())
+    for tile, chunk, block in ((16, 3, 1), (32, 8, 2)):
+        config = RasterizeConfig(capacity=1024, near=NEAR, tile=tile, chunk=chunk, block=block)
+        other = render(surfels, to_camera(), config=config)
+        for output in OUTPUTS:
+            np.testing.assert_allclose(other[output], whole[output], atol=1e-6, rtol=0)
+    for top in (0, 12):
+        for left in (0, 16):
+            camera = to_camera(intrinsics=INTRINSICS - np.array([0, 0, left, top]), size=(12, 16))
+            crop = render(surfels, camera)
+            for output in OUTPUTS:
+                expected = whole[output][top : top + 12, left : left + 16]
+                np.testing.assert_allclose(crop[output], expected, atol=1e-6, rtol=0)
+
+
 def test_same_bits_every_time_and_in_any_order():
     scene = SCENES["in front"]
     order = np.random.default_rng(0).permutation(COUNT)
