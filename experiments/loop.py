@@ -65,7 +65,9 @@ class Programs:
             name: jax.jit(functools.partial(run_steps, step)) for name, step in steps.items()
         }
         self._render = jax.jit(
-            lambda state, camera: self.field.render(state.params, state.buffers, camera, None, None)
+            lambda state, camera, key: self.field.render(
+                state.params, state.buffers, camera, None, key
+            )
         )
 
     def make_room(self, growth: int) -> None:
@@ -106,10 +108,10 @@ class Programs:
                 return after, {key: v for key, v in metrics.items() if math.isfinite(v)}
             self._grow()
 
-    def render(self, state: TrainState, camera: Camera) -> Rendering:
-        """Render a whole image."""
+    def render(self, state: TrainState, camera: Camera, key: jax.Array | None = None) -> Rendering:
+        """Render a whole image; without a key, as ever, deterministically."""
         while True:
-            rendering = self._render(state, camera)
+            rendering = self._render(state, camera, key)
             surfels = getattr(rendering.aux, "surfels", None)
             if surfels is None or not int(surfels.overflow):
                 return rendering

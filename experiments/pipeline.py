@@ -28,7 +28,7 @@ from jaxcloseup.geometry.union_warp import block_sources
 from jaxcloseup.pseudo import label_views
 from jaxcloseup.scenes import Scene
 from jaxcloseup.splats import Surfels
-from jaxcloseup.train import init_state, labelled_depth, render_depths
+from jaxcloseup.train import init_state, labelled_depth
 
 
 STAGES = ("baseline", "control", "closeup", "test_time")
@@ -102,30 +102,26 @@ def run(
     points = initial_points(key_points, scene)
     state = init_state(key_init, *points, field=programs.field, optimizer=programs.optimizer)
     baseline = train("baseline", "photographs", state, views, steps=preset.baseline_steps)
+    render = functools.partial(programs.render, baseline)
     with timed(seconds, "depths"):
-        options = {
-            "near": scene.near,
-            "far": scene.far,
-            "key": key_depths if preset.train.perturbed_depth else None,
-            "divided": not preset.train.undivided_depth,
-        }
-        for i in range(len(views)):  # which makes room for every view
-            programs.render(baseline, camera_at(size, i))
-        render_all = jax.jit(functools.partial(render_depths, programs.field, **options))
-        depths = render_all(baseline.params, baseline.buffers, views.cameras)
+        depths = _depths(
+            render,
+            size,
+            scene,
+            key=key_depths if preset.train.perturbed_depth else None,
+            divided=not preset.train.undivided_depth,
+        )
         sources = jax.jit(block_sources)(views.cameras, depths, views.weight)
         exact = exact_depths(scene, views.cameras) if scene.surface else None
         for split in scene.names:
             if split != "train":
                 seen_from = depths if exact is None else exact
-                rendered = functools.partial(programs.render, baseline)
-                targets[split] = make_targets(scene, split, seen_from, rendered)
+                targets[split] = make_targets(scene, split, seen_from, render)
     score("baseline", baseline)
     gate = None
     if preset.gated:
         with timed(seconds, "gate"):
-            rendered = functools.partial(programs.render, baseline)
-            chosen, gate = choose_settings(views, depths, rendered, settings)
+            chosen, gate = choose_settings(views, depths, render, settings)
             settings = settings if chosen is None else chosen
             print_gate(gate)
     use_labels = gate is None or gate["use_labels"]
@@ -142,7 +138,9 @@ def run(
         score("closeup", closeup)
     if "test_time" in to_run and scene.test is not None:
         with timed(seconds, "test_time_labels"):
-            labels = _label_targets(programs, baseline, scene, depths, settings, sources)
+            cameras = scene.test.cameras
+            data = cameras, _depths(render, cameras, scene), views, depths, settings
+            labels = jax.jit(label_views)(*data, sources=sources)
         per_view = len(scene.test) if names["method"] == "surfels" else 1
         kind, data = (
             ("targets", (views, labels, settings)) if use_labels else ("photographs", (views,))
@@ -155,7 +153,7 @@ def run(
             "scene": scene,
             "settings": settings,
             "depths": depths,
-            "render_depth": lambda camera: programs.render(baseline, camera).depth,
+            "render_depth": lambda camera: render(camera).depth,
         }
         pictures = comparisons(output_dir / "compare", targets, renderings)
         shown = targets.get("test", [])
@@ -186,13 +184,13 @@ def run(
     return results
 
 
-def _label_targets(programs, state, scene, depths, settings, sources):
-    """Labels of the close-ups that are scored, made once from what `state` renders there."""
-    cameras = scene.test.cameras
-    seen = [programs.render(state, camera_at(cameras, i)) for i in range(len(scene.test))]
-    target_depths = jnp.stack([labelled_depth(s, near=scene.near, far=scene.far) for s in seen])
-    data = scene.train, depths, settings
-    return jax.jit(label_views)(cameras, target_depths, *data, sources=sources)
+def _depths(render, cameras, scene, *, key=None, divided=True):
+    """`render_depths` of stacked cameras, by a `render` that makes room where images need it."""
+    count = cameras.intrinsics.shape[0]
+    keys = [None] * count if key is None else jax.random.split(key, count)
+    seen = (render(camera_at(cameras, i), keys[i]) for i in range(count))
+    limits = {"near": scene.near, "far": scene.far, "divided": divided}
+    return jnp.stack([labelled_depth(one, **limits) for one in seen])
 
 
 @contextlib.contextmanager
