@@ -79,9 +79,11 @@ def main(argv: list[str]) -> None:
     if len(argv) > 1:
         raise app.UsageError(f"unexpected argument: {argv[1]}")
     set_up_compilation_cache(FLAGS.compilation_cache)
-    # Warnings are sentences for the user; jax's notes on absent accelerators are not.
+    # Warnings are sentences for the user; notes on absent accelerators and on every file of a
+    # checkpoint are not.
     warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
     logging.getLogger("jax._src.xla_bridge").setLevel(logging.WARNING)
+    logging.getLogger("absl").setLevel(logging.WARNING)
     try:
         preset = preset_from_flags()
         output_dir = choose_output_dir(
