@@ -127,51 +127,54 @@ def _disc_box(discs: Discs, cutoff: jax.Array, camera: Camera, near: float) -> j
     coordinate is stationary along the circle, and the ends of the chord at which z = near.
     """
     # Rounding must not cost a pixel that just reaches the cutoff.
-    radius = (1.001 * cutoff)[:, None, None]
-    along_u, along_v = jnp.split(discs.axes[..., :2] * discs.scales[:, None] * radius, 2, axis=-1)
-    circle = jnp.concatenate([along_u, along_v, discs.centre[..., None]], axis=-1)  # [N, xyz, 3]
-    depth = circle[:, 2]
-    chord, has_chord = _meet_circle(depth.at[:, 2].add(-near))
+    radii = (1.001 * cutoff)[:, None] * discs.scales
+    # Coordinates of the rim are a cos + b sin + c, with a triple of [N] for each of x, y, z.
+    circle = [
+        (axes[:, 0] * radii[:, 0], axes[:, 1] * radii[:, 1], discs.centre[:, i])
+        for i, axes in enumerate(jnp.moveaxis(discs.axes, 1, 0))
+    ]
+    depth = circle[2]
+    chord, has_chord = _meet_circle(depth[0], depth[1], depth[2] - near)
     low, high = [], []
     for axis in range(2):
-        a, b = circle[:, axis], depth
-        stationary = jnp.stack(
-            [
-                a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1],
-                a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2],
-                a[:, 1] * b[:, 0] - a[:, 0] * b[:, 1],
-            ],
-            axis=-1,
+        a, b = circle[axis], depth
+        rim, has_rim = _meet_circle(
+            a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[1] * b[0] - a[0] * b[1]
         )
-        rim, exists = _meet_circle(stationary)
-        rim_depth = jnp.sum(rim * b[:, None], axis=-1)
-        exists &= rim_depth >= near
-        rim_at = jnp.sum(rim * a[:, None], axis=-1) / jnp.where(exists, rim_depth, 1)
-        chord_at = jnp.sum(chord * a[:, None], axis=-1) / near
-        at = jnp.concatenate([rim_at, chord_at], axis=-1)
-        at = at * camera.intrinsics[axis] + camera.intrinsics[2 + axis]
-        exists = jnp.concatenate([exists, has_chord], axis=-1)
-        low.append(jnp.min(jnp.where(exists, at, jnp.inf), axis=-1) - 0.01)
-        high.append(jnp.max(jnp.where(exists, at, -jnp.inf), axis=-1) + 0.01)
+        candidates = [(point, near, has_chord) for point in chord]
+        for point in rim:
+            at_depth = _on_circle(b, point)
+            exists = has_rim & (at_depth >= near)
+            candidates.append((point, jnp.where(exists, at_depth, 1), exists))
+        least, most = jnp.inf, -jnp.inf
+        for point, at_depth, exists in candidates:
+            at = _on_circle(a, point) / at_depth
+            at = at * camera.intrinsics[axis] + camera.intrinsics[2 + axis]
+            least = jnp.minimum(least, jnp.where(exists, at, jnp.inf))
+            most = jnp.maximum(most, jnp.where(exists, at, -jnp.inf))
+        low.append(least - 0.01)
+        high.append(most + 0.01)
     return jnp.stack([*low, *high], axis=-1)
 
 
-def _meet_circle(line: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Points (cos, sin, 1) `[N, 2, 3]` with line . point = 0, and whether they exist `[N, 2]`."""
-    line = line / jnp.maximum(jnp.max(jnp.abs(line), axis=-1, keepdims=True), 1e-30)
-    a, b, c = (line[:, i] for i in range(3))
+def _on_circle(coordinate, point):
+    """A coordinate (a, b, c) `[N]` of the rim at (cos, sin)."""
+    return coordinate[0] * point[0] + coordinate[1] * point[1] + coordinate[2]
+
+
+def _meet_circle(a, b, c):
+    """Both points (cos, sin) `[N]` with a cos + b sin + c = 0, and whether they exist `[N]`."""
+    largest = jnp.maximum(jnp.maximum(jnp.abs(a), jnp.abs(b)), jnp.maximum(jnp.abs(c), 1e-30))
+    a, b, c = a / largest, b / largest, c / largest
     squared = a * a + b * b
     discriminant = squared - c * c
     root = jnp.sqrt(jnp.maximum(discriminant, 0))
     # A line that vanishes is met everywhere: a disc without extent, of which any point will do.
     divisor = jnp.where(squared == 0, 1, squared)
     points = [
-        jnp.stack([(-c * a - s * b * root) / divisor, (-c * b + s * a * root) / divisor], axis=-1)
-        for s in (-1, 1)
+        ((-c * a - s * b * root) / divisor, (-c * b + s * a * root) / divisor) for s in (-1, 1)
     ]
-    points = jnp.stack(points, axis=1)
-    points = jnp.concatenate([points, jnp.ones_like(points[..., :1])], axis=-1)
-    return points, jnp.broadcast_to((discriminant >= 0)[:, None], points.shape[:2])
+    return points, discriminant >= 0
 
 
 def _low_pass_box(centre: jax.Array, cutoff: jax.Array) -> jax.Array:
