@@ -7,12 +7,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.surface_error import (
+    Landmarks,
+    find_landmarks,
+    point_depth_error,
+    surface_error,
+)
 from jaxcloseup.batch import Views, camera_at, to_float
 from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.metrics import SSIM_TAPS, cc_psnr, psnr, quantize, ssim
 from jaxcloseup.pseudo import count_seen
 from jaxcloseup.scenes import Scene
+from jaxcloseup.scenes.scene import Surface
 
 
 SEEN_BY = (1, 3)
@@ -28,7 +35,8 @@ class Target(NamedTuple):
       rgb: `[H, W, 3]` the photograph, float.
       weight: `[H, W]` 0 in padding.
       seen: `[H, W]` how many training photographs saw the surface there.
-      depth: `[H, W]` exact z-depth, or None where it is not known.
+      surface: the exact one, or None where it is not known.
+      landmarks: points of the capture that it shows, where the surface is not known.
     """
 
     name: str
@@ -36,7 +44,8 @@ class Target(NamedTuple):
     rgb: jax.Array
     weight: jax.Array
     seen: jax.Array
-    depth: jax.Array | None
+    surface: Surface | None = None
+    landmarks: Landmarks | None = None
 
 
 def exact_depths(scene: Scene, cameras: Camera) -> jax.Array:
@@ -55,18 +64,19 @@ def make_targets(
     baseline, so that every stage is scored on the same pixels.
     """
     views: Views = getattr(scene, split)
-    exact = exact_depths(scene, views.cameras) if scene.surface else None
+    surface = jax.jit(scene.surface) if scene.surface else None
     count = jax.jit(count_seen)
     targets = []
     for i, name in enumerate(scene.names[split]):
         camera = camera_at(views.cameras, i)
-        depth = render(camera).depth if exact is None else exact[i]
+        exact = surface(camera) if surface else None
+        landmarks = None if exact else find_landmarks(camera, scene.points)
+        depth = exact.depth if exact else render(camera).depth
         pixels = pixel_grid(camera.height, camera.width)
         seen = count(camera, pixels, depth, scene.train, train_depths)
         rgb = to_float(jnp.asarray(views.rgb[i]))
         weight = jnp.asarray(views.weight[i])
-        known = None if exact is None else exact[i]
-        targets.append(Target(name, camera, rgb, weight, seen, known))
+        targets.append(Target(name, camera, rgb, weight, seen, exact, landmarks))
     return targets
 
 
@@ -87,8 +97,10 @@ def score(rendering: Rendering, target: Target) -> dict[str, float | str | None]
                 image, truth, np.where(seen >= least, weight, 0)
             ).items()
         }
-    if target.depth is not None:
-        values |= _depth_error(rendering.depth, target.depth)
+    if target.surface is not None:
+        values |= surface_error(target.camera, rendering, target.surface)
+    if target.landmarks is not None:
+        values |= point_depth_error(rendering.depth, target.landmarks)
     finite_image = np.isfinite(image).all()
     result = {}
     for key, value in values.items():
@@ -147,15 +159,6 @@ def _masked_metrics(image, truth, weight):
 
 def _ssim(image, truth, *, weight):
     return ssim(image, truth, weight=weight) if min(truth.shape[:2]) >= SSIM_TAPS else jnp.nan
-
-
-@jax.jit
-def _depth_error(depth, exact):
-    error = jnp.where(exact > 0, jnp.abs(depth - exact) / jnp.where(exact > 0, exact, 1), jnp.nan)
-    return {
-        "depth_error_median": jnp.nanmedian(error),
-        "depth_error_p90": jnp.nanpercentile(error, 90.0),
-    }
 
 
 def _frame(weight):

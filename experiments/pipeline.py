@@ -20,7 +20,7 @@ from experiments.gate import choose_settings, print_gate
 from experiments.loop import Programs, run_stage
 from experiments.pictures import comparisons, label_pictures, write_renders
 from experiments.presets import Preset, initial_points, pseudo_settings
-from experiments.report import format_metric, write_json, write_report
+from experiments.report import in_short, write_json, write_report
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.artifacts.surfel_ply import write_surfels
 from jaxcloseup.batch import camera_at
@@ -93,8 +93,7 @@ def run(
                 stages[stage][split], renderings[stage, split] = evaluate(rendered, of_split)
                 folder = output_dir / "renders" / stage / split
                 write_renders(folder, renderings[stage, split], scene)
-                psnr = format_metric("psnr", stages[stage][split]["psnr"])
-                print(f"{stage:>9} {split}: PSNR {psnr} dB", flush=True)
+                print(f"{stage:>9} {split}: {in_short(stages[stage][split])}", flush=True)
             if isinstance(state.params, Surfels):
                 path = output_dir / "splats" / f"{stage}.ply"
                 write_surfels(path, state.params, state.buffers.alive)

@@ -26,6 +26,10 @@ COLUMNS = {
     "coverage_seen1": "share seen by 1+",
     "coverage_seen3": "share seen by 3+",
     "depth_error_median": "median depth error (relative)",
+    "depth_error_p90": "90th percentile of it",
+    "normal_error_median": "median normal error (degrees)",
+    "point_depth_error_median": "median depth error at the capture's points (relative)",
+    "point_depth_error_p90": "90th percentile of it",
 }
 
 
@@ -150,11 +154,20 @@ def _gate_table(gate):
     )
 
 
+def in_short(split: Mapping[str, Any]) -> str:
+    """A split's PSNR, and how far its depth is off, in a line."""
+    text = f"PSNR {format_metric('psnr', split['psnr'])} dB"
+    for key in ("depth_error_median", "point_depth_error_median"):
+        if split.get(key) is not None:
+            text += f", depth off by {split[key]:.2%}"
+    return text
+
+
 def format_metric(key: str, value: float | None) -> str:
     """A metric as text, "-" where it could not be computed."""
     if value is None:
         return "-"
-    return f"{value:.2f}" if "psnr" in key else f"{value:.4f}"
+    return f"{value:.2f}" if "psnr" in key or "normal" in key else f"{value:.4f}"
 
 
 _STYLE = """

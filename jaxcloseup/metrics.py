@@ -67,15 +67,38 @@ def cc_psnr(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = N
     as in a grey image, the change of least norm is taken. Arguments as in `psnr`.
     """
     weight = _check(image, target, weight)
+    matrix, offset = fit_colours(image, target, weight)
+    fitted = matmul(image, matrix[None]) + offset[None, None]
+    return psnr(jnp.clip(fitted, 0, 1), target, weight=weight)
+
+
+def fit_colours(
+    image: jax.Array, target: jax.Array, weight: jax.Array, *, ridge: float = 0.0
+) -> tuple[jax.Array, jax.Array]:
+    """The affine change of an image's colours with the least weighted squared error.
+
+    Args:
+      image: `[H, W, 3]`.
+      target: `[H, W, 3]`.
+      weight: `[H, W]`.
+      ridge: weight of the change's squared distance from none, against the mean squared error.
+
+    Returns:
+      Matrix `[3, 3]` and offset `[3]`: rows of colours times the matrix, plus the offset. NaN where
+      the weights sum to 0; of least norm where the colours leave it open.
+    """
     share = safe_divide(weight, jnp.sum(weight), fill=jnp.nan)[..., None]
     mean = jnp.sum(share * image, axis=(0, 1), keepdims=True)
     target_mean = jnp.sum(share * target, axis=(0, 1), keepdims=True)
     # Centred colours take the offset out of the system and keep its condition low.
     colours, targets = (image - mean).reshape(-1, 3), (target - target_mean).reshape(-1, 3)
     weighted = colours.T * share.reshape(1, -1)
-    inverse = jnp.linalg.pinv(matmul(weighted, colours), rtol=1e-5, hermitian=True)
-    fitted = matmul(colours, matmul(inverse, matmul(weighted, targets)))
-    return psnr(jnp.clip(fitted.reshape(image.shape) + target_mean, 0, 1), target, weight=weight)
+    towards = ridge * jnp.eye(3, dtype=image.dtype)
+    inverse = jnp.linalg.pinv(matmul(weighted, colours) + towards, rtol=1e-5, hermitian=True)
+    matrix = matmul(inverse, matmul(weighted, targets) + towards)
+    mean, target_mean = mean[0, 0], target_mean[0, 0]
+    reached = mean + (target_mean - mean) / (1 + ridge)
+    return matrix, reached - matmul(mean[None], matrix)[0]
 
 
 def _check(image: jax.Array, target: jax.Array, weight: jax.Array | None) -> jax.Array:

@@ -15,8 +15,8 @@ from flax import struct
 
 from jaxcloseup.field import RadianceField, Rendering
 from jaxcloseup.geometry.cameras import Camera
-from jaxcloseup.metrics import ssim
-from jaxcloseup.numerics import safe_divide
+from jaxcloseup.metrics import fit_colours, ssim
+from jaxcloseup.numerics import matmul, safe_divide
 from jaxcloseup.splats.density_control import DensityConfig, relocate, wander
 from jaxcloseup.splats.rasterize import RasterizeConfig
 from jaxcloseup.splats.regularizers import (
@@ -39,6 +39,8 @@ class SurfelConfig:
       initial_opacity: of surfels at the initial points.
       depth: "median" or "expected": what the field calls depth, and labels are made with.
       background: grey level in [0, 1] behind the scene; None is black.
+      colour_ridge: in training each image may change its colours by an affine map, to which this
+        is the resistance, see `fit_colours`; None allows none. Rendered images have no such change.
       ssim_weight: share of 1 - SSIM in the loss; the rest is the absolute difference.
       normal_weight: of the disagreement between normals and depth.
       distortion_weight: of the spread of light along a ray, for a mean depth of 1.
@@ -60,6 +62,7 @@ class SurfelConfig:
     initial_opacity: float = 0.5
     depth: str = "median"
     background: float | None = None
+    colour_ridge: float | None = None
     ssim_weight: float = 0.2
     normal_weight: float = 0.05
     distortion_weight: float = 1.0
@@ -171,7 +174,7 @@ def surfel_field(config: SurfelConfig, *, extent: float) -> RadianceField:
     def loss(
         rendering: Rendering, target_rgb: jax.Array, weight: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        return _loss(rendering, target_rgb, weight, config.ssim_weight)
+        return _loss(rendering, target_rgb, weight, config)
 
     def adapt(key: jax.Array, state: Any) -> Any:
         return _adapt(key, state, config, extent)
@@ -221,7 +224,7 @@ def means_rate(config: SurfelConfig, step: jax.Array) -> jax.Array:
     return first * (last / first) ** share
 
 
-def _loss(rendering, target_rgb, weight, ssim_weight):
+def _loss(rendering, target_rgb, weight, config):
     chex.assert_equal_shape([rendering.rgb, target_rgb])
     chex.assert_shape(weight, target_rgb.shape[:-1])
     total = jnp.sum(weight)
@@ -231,13 +234,19 @@ def _loss(rendering, target_rgb, weight, ssim_weight):
 
     # What weighs nothing must not show in windows beside it either.
     counts = weight[..., None] > 0
-    target_rgb = jnp.where(counts, target_rgb, jax.lax.stop_gradient(rendering.rgb))
-    difference = mean(jnp.mean(jnp.abs(rendering.rgb - target_rgb), axis=-1))
-    similarity = ssim(rendering.rgb, target_rgb, weight=weight)
+    seen = rendering.rgb
+    if config.colour_ridge is not None:
+        data = jax.lax.stop_gradient(seen), target_rgb, weight
+        matrix, offset = fit_colours(*data, ridge=config.colour_ridge)
+        matrix = jnp.where(total > 0, matrix, jnp.eye(3, dtype=matrix.dtype))
+        seen = matmul(seen, matrix[None]) + jnp.where(total > 0, offset, 0)[None, None]
+    target_rgb = jnp.where(counts, target_rgb, jax.lax.stop_gradient(seen))
+    difference = mean(jnp.mean(jnp.abs(seen - target_rgb), axis=-1))
+    similarity = ssim(seen, target_rgb, weight=weight)
     dissimilarity = jnp.where(jnp.isnan(similarity), 0, 1 - similarity)
-    image = (1 - ssim_weight) * difference + ssim_weight * dissimilarity
+    image = (1 - config.ssim_weight) * difference + config.ssim_weight * dissimilarity
     prior = jnp.where(total > 0, rendering.aux.prior, 0)
-    squared = mean(jnp.mean((jnp.clip(rendering.rgb, 0, 1) - target_rgb) ** 2, axis=-1))
+    squared = mean(jnp.mean((jnp.clip(seen, 0, 1) - target_rgb) ** 2, axis=-1))
     metrics = {
         "psnr": -10 * jnp.log10(squared),
         "overflow": rendering.aux.surfels.overflow.astype(jnp.float32),
