@@ -67,9 +67,7 @@ def surface_error(camera: Camera, rendering: Rendering, surface: Surface) -> dic
     length = jnp.linalg.norm(normal, axis=-1)
     cosine = jnp.sum(normal * surface.normal, axis=-1) / jnp.where(length > 0, length, 1)
     hit = surface.depth > 0
-    angle = jnp.where(
-        hit & (length > 0), jnp.rad2deg(jnp.arccos(jnp.clip(cosine, -1, 1))), jnp.nan
-    )
+    angle = jnp.where(hit & (length > 0), jnp.rad2deg(jnp.arccos(jnp.clip(cosine, -1, 1))), jnp.nan)
     error = jnp.abs(rendering.depth - surface.depth) / jnp.where(hit, surface.depth, 1)
     error = jnp.where(hit, error, jnp.nan)
     return {
