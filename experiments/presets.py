@@ -17,6 +17,7 @@ from jaxcloseup.field import RadianceField
 from jaxcloseup.geometry.poses import PoseSettings
 from jaxcloseup.pseudo import PseudoSettings
 from jaxcloseup.scenes import Scene
+from jaxcloseup.splats.adaptive_density import AdaptiveDensityConfig
 from jaxcloseup.splats.density_control import DensityConfig
 from jaxcloseup.splats.field import SurfelConfig, camera_extent, surfel_field, surfel_optimizer
 from jaxcloseup.splats.rasterize import RasterizeConfig
@@ -143,10 +144,27 @@ QUICK_SURFELS = dataclasses.replace(
     gated=True,
 )
 
+# Instead of Monte Carlo moves; what it needs beside it is in `with_classic_density`.
+CLASSIC_DENSITY = {
+    "quick": AdaptiveDensityConfig(start=200, stop=1200),
+    "paper": AdaptiveDensityConfig(),
+}
+
 PRESETS = {
     "nerf": {"quick": QUICK, "paper": PAPER, "released": RELEASED},
     "surfels": {"quick": QUICK_SURFELS, "paper": PAPER_SURFELS},
 }
+
+
+def with_classic_density(field: SurfelConfig, preset: str) -> SurfelConfig:
+    """The field with clone, split and prune, which starts fainter and needs no pull to fade."""
+    return dataclasses.replace(
+        field,
+        density=CLASSIC_DENSITY[preset],
+        initial_opacity=0.1,
+        opacity_weight=0.0,
+        scale_weight=0.0,
+    )
 
 
 def make_field(preset: Preset, scene: Scene, *, growth: int = 1) -> RadianceField:

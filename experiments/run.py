@@ -20,7 +20,7 @@ from absl import app, flags
 
 from experiments.loop import TrainingError
 from experiments.pipeline import STAGES, run
-from experiments.presets import PRESETS, Preset
+from experiments.presets import PRESETS, Preset, with_classic_density
 from experiments.report import print_table
 from jaxcloseup.artifacts.checkpoints import CheckpointError
 from jaxcloseup.scenes import SceneError, load_scene
@@ -64,6 +64,19 @@ flags.DEFINE_enum(
     ["float32", "bfloat16"],
     "operands of the products of a NeRF's network; bfloat16 is faster and less exact",
 )
+flags.DEFINE_enum(
+    "density",
+    "mcmc",
+    ["mcmc", "classic"],
+    "how surfels are added: Monte Carlo moves, or clone, split and prune",
+)
+flags.DEFINE_float(
+    "colour_ridge",
+    None,
+    "let each photograph change the colours of surfels by an affine map while training, against "
+    "this resistance, say 0.01; default: no such change",
+    lower_bound=0.0,
+)
 flags.DEFINE_bool(
     "half_pixel", False, "the capture has pixel centres at integers: add 0.5 to cx, cy"
 )
@@ -72,6 +85,9 @@ flags.DEFINE_string(
     None,
     "folder of compiled programs, kept between runs; empty: none; default: under ~/.cache",
 )
+
+
+_OF_METHOD = {"nerf": ("compute_dtype",), "surfels": ("density", "colour_ridge")}
 
 
 def main(argv: list[str]) -> None:
@@ -118,6 +134,10 @@ def preset_from_flags() -> Preset:
             f"--preset={FLAGS.preset} is not for --method={FLAGS.method}: choose "
             + " or ".join(of_method)
         )
+    for method, names in _OF_METHOD.items():
+        for name in names:
+            if method != FLAGS.method and FLAGS[name].value != FLAGS[name].default:
+                raise ValueError(f"--{name} is for --method={method}: leave it out")
     preset = of_method[FLAGS.preset]
     given = {
         name: getattr(FLAGS, name)
@@ -126,6 +146,11 @@ def preset_from_flags() -> Preset:
     }
     if FLAGS.method == "nerf":
         given["field"] = dataclasses.replace(preset.field, compute_dtype=FLAGS.compute_dtype)
+    else:
+        field = dataclasses.replace(preset.field, colour_ridge=FLAGS.colour_ridge)
+        if FLAGS.density == "classic":
+            field = with_classic_density(field, FLAGS.preset)
+        given["field"] = field
     return dataclasses.replace(preset, **given)
 
 

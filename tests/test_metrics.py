@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import reference
 
-from jaxcloseup.metrics import cc_psnr, psnr, quantize, ssim
+from jaxcloseup.metrics import cc_psnr, fit_colours, psnr, quantize, ssim
 
 
 METRICS = {"psnr": psnr, "ssim": ssim, "cc_psnr": cc_psnr}
@@ -91,6 +91,22 @@ def test_cc_psnr_agrees_with_least_squares(pair, weight):
     result = cc_psnr(image, target, weight=weight)
     np.testing.assert_allclose(result, expected, rtol=1e-4)
     assert result > psnr(image, target, weight=weight) + 1
+
+
+@pytest.mark.parametrize("ridge", [1e-4, 0.1, 1e6])
+def test_a_ridge_holds_colours_back(pair, weight, ridge):
+    """Least squares with the distance from no change as further rows."""
+    image, target = (np.asarray(x, np.float64).reshape(-1, 3) for x in pair)
+    share = weight.ravel() / weight.sum()
+    mean = share @ image
+    rows = np.concatenate([image - mean, np.ones((len(image), 1))], -1) * np.sqrt(share)[:, None]
+    rows = np.concatenate([rows, np.sqrt(ridge) * np.eye(4)])
+    no_change = np.concatenate([np.eye(3), mean[None]])
+    wanted = np.concatenate([target * np.sqrt(share)[:, None], np.sqrt(ridge) * no_change])
+    fit = np.linalg.lstsq(rows, wanted, rcond=None)[0]
+    matrix, offset = fit_colours(*pair, weight, ridge=ridge)
+    np.testing.assert_allclose(matrix, fit[:3], atol=2e-4)
+    np.testing.assert_allclose(offset, fit[3] - mean @ fit[:3], atol=2e-4)
 
 
 def test_cc_psnr_of_degenerate_colours(pair):

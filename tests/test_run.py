@@ -29,6 +29,7 @@ from jaxcloseup.artifacts.surfel_ply import read_surfels
 from jaxcloseup.field import Rendering
 from jaxcloseup.scenes import load_scene
 from jaxcloseup.splats import RasterizeConfig
+from jaxcloseup.splats.adaptive_density import AdaptiveDensityConfig
 from jaxcloseup.train import TrainConfig, init_state
 from jaxcloseup.volume.nerf import NerfConfig
 
@@ -288,6 +289,31 @@ def test_a_preset_of_the_other_method_is_one_sentence(parsed_flags, tmp_path):
     ):
         program.main(["run"])
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("method", "flag", "value"),
+    [
+        ("nerf", "density", "classic"),
+        ("nerf", "colour_ridge", 0.1),
+        ("surfels", "compute_dtype", "bfloat16"),
+    ],
+)
+def test_a_flag_of_the_other_method_is_one_sentence(parsed_flags, tmp_path, method, flag, value):
+    out = str(tmp_path / "out")
+    with (
+        flagsaver.flagsaver(method=method, output_dir=out, **{flag: value}),
+        pytest.raises(SystemExit, match=f"--{flag} is for --method=(?!{method})"),
+    ):
+        program.main(["run"])
+
+
+def test_surfels_can_be_cloned_and_split(parsed_flags):
+    with flagsaver.flagsaver(method="surfels", density="classic", colour_ridge=0.01):
+        field = program.preset_from_flags().field
+    assert isinstance(field.density, AdaptiveDensityConfig)
+    assert field.colour_ridge == 0.01
+    assert field.opacity_weight == 0
 
 
 def test_training_that_never_is_finite_stops_with_one_sentence(capture_folder):

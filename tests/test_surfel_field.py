@@ -99,6 +99,28 @@ def test_training_finds_the_plane(trained, capture):
     assert after < 0.7 * before
 
 
+def test_colours_of_an_image_may_change_as_a_whole(trained, capture):
+    """A photograph in other light costs nothing more with the affine change, and much without."""
+    state, camera = trained[2], jax.tree.map(lambda leaf: leaf[0], capture[0].cameras)
+    image = render(state.params, state.buffers, camera)
+    change = jnp.array([[0.8, 0.1, 0.0], [0.0, 0.7, 0.1], [0.1, 0.0, 0.9]])
+    target = jnp.matmul(image.rgb, change[None], precision="highest") + 0.05
+    free = surfel_field(dataclasses.replace(CONFIG, colour_ridge=1e-6), extent=EXTENT)
+    ones = jnp.ones(target.shape[:2])
+
+    def loss_of(field, weight):
+        return jax.value_and_grad(
+            lambda rgb: field.loss(image._replace(rgb=rgb), target, weight)[0]
+        )(image.rgb)
+
+    same, _ = FIELD.loss(image, image.rgb, ones)
+    assert float(loss_of(free, ones)[0] - same) < 1e-3
+    assert float(loss_of(FIELD, ones)[0] - same) > 0.05
+    value, gradient = loss_of(free, 0 * ones)
+    assert np.isfinite(value)
+    assert np.all(np.asarray(gradient) == 0)
+
+
 def test_schedules_follow_the_step(trained):
     start, middle, end, _ = trained
     for state, degree, regularise in ((start, 0, 0), (middle, 1, 1), (end, 1, 1)):

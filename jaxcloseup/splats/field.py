@@ -17,6 +17,16 @@ from jaxcloseup.field import RadianceField, Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.metrics import fit_colours, ssim
 from jaxcloseup.numerics import matmul, safe_divide
+from jaxcloseup.splats.adaptive_density import (
+    AdaptiveDensityConfig,
+    ProbedSurfels,
+    PullState,
+    apply_probe,
+    measure_pull,
+    refine,
+    reset_opacities,
+    with_probe,
+)
 from jaxcloseup.splats.density_control import DensityConfig, relocate, wander
 from jaxcloseup.splats.rasterize import RasterizeConfig
 from jaxcloseup.splats.regularizers import (
@@ -52,7 +62,7 @@ class SurfelConfig:
       late_rate: factor on all learning rates from `decay_steps` on.
       sh_rate, opacity_rate, scale_rate, rotation_rate: Adam's; 1/20 of `sh_rate` for what depends
         on the direction.
-      density: when surfels move, or None for never.
+      density: when surfels move, appear and vanish, by either rule; None for never.
       raster: static sizes of the rasteriser.
     """
 
@@ -76,7 +86,9 @@ class SurfelConfig:
     opacity_rate: float = 5e-2
     scale_rate: float = 5e-3
     rotation_rate: float = 1e-3
-    density: DensityConfig | None = dataclasses.field(default_factory=DensityConfig)
+    density: DensityConfig | AdaptiveDensityConfig | None = dataclasses.field(
+        default_factory=DensityConfig
+    )
     raster: RasterizeConfig = dataclasses.field(default_factory=RasterizeConfig)
 
 
@@ -133,6 +145,8 @@ def surfel_field(config: SurfelConfig, *, extent: float) -> RadianceField:
             sh_degree=config.sh_degree,
             opacity=config.initial_opacity,
         )
+        if isinstance(config.density, AdaptiveDensityConfig):
+            surfels = with_probe(surfels)
         return surfels, SurfelBuffers(alive, *_schedule(config, jnp.zeros((), jnp.int32)))
 
     def render(
@@ -148,6 +162,8 @@ def surfel_field(config: SurfelConfig, *, extent: float) -> RadianceField:
         band = jnp.repeat(jnp.arange(4), jnp.array([1, 3, 5, 7]), total_repeat_length=16)
         drawn = (band[: params.sh.shape[1]] <= buffers.degree)[None, :, None]
         surfels = params.replace(sh=jnp.where(drawn, params.sh, 0))
+        if isinstance(surfels, ProbedSurfels):
+            surfels = apply_probe(surfels, camera)
         background = None if config.background is None else jnp.full(3, config.background)
         image = render_surfels(surfels, buffers.alive, camera, config.raster, background=background)
         depth = image.aux.median_depth if config.depth == "median" else image.depth
@@ -202,7 +218,7 @@ def surfel_optimizer(config: SurfelConfig, *, extent: float) -> optax.GradientTr
     def update(updates, state, params=None):
         del params
         by_band = jnp.full(updates.sh.shape[1], config.sh_rate / 20).at[0].set(config.sh_rate)
-        rates = Surfels(
+        rates = jax.tree.map(lambda leaf: 0.0, updates).replace(
             means=means_rate(config, state.count) * extent,
             log_scales=config.scale_rate,
             quaternions=config.rotation_rate,
@@ -214,7 +230,10 @@ def surfel_optimizer(config: SurfelConfig, *, extent: float) -> optax.GradientTr
         return updates, optax.ScaleByScheduleState(count=state.count + 1)
 
     rescale = optax.GradientTransformation(init, update)
-    return optax.chain(optax.scale_by_adam(eps=1e-15), rescale)
+    adam = optax.chain(optax.scale_by_adam(eps=1e-15), rescale)
+    if isinstance(config.density, AdaptiveDensityConfig):
+        return optax.chain(measure_pull(), adam)
+    return adam
 
 
 def means_rate(config: SurfelConfig, step: jax.Array) -> jax.Array:
@@ -266,25 +285,64 @@ def _adapt(key, state, config, extent):
     density = config.density
     if density is None:
         return state
+    due = (state.step % density.every == 0) & (state.step > density.start)
+    due &= state.step < density.stop
+    if isinstance(density, AdaptiveDensityConfig):
+        return _adapt_classically(key, state, density, due, extent)
     key_relocate, key_wander = jax.random.split(key)
 
     def move(state):
         surfels, alive, changed = relocate(key_relocate, state.params, state.buffers.alive, density)
+        return _replace_surfels(state, surfels, alive, changed)
 
-        def forget(leaf):
-            if leaf.ndim == 0 or leaf.shape[0] != changed.shape[0]:
-                return leaf
-            return jnp.where(changed.reshape(-1, *(1,) * (leaf.ndim - 1)), 0, leaf)
-
-        return state.replace(
-            params=surfels,
-            buffers=state.buffers.replace(alive=alive),
-            opt_state=jax.tree.map(forget, state.opt_state),
-        )
-
-    due = (state.step % density.every == 0) & (state.step > density.start)
-    due &= state.step < density.stop
     state = jax.lax.cond(due, move, lambda state: state, state)
     rate = means_rate(config, state.step) * extent
     surfels = wander(key_wander, state.params, state.buffers.alive, rate, density)
     return state.replace(params=surfels)
+
+
+def _adapt_classically(key, state, density, due, extent):
+    def grow(state):
+        pull, adam = state.opt_state
+        remove_huge = state.step > density.reset_every
+        surfels, alive, new = refine(
+            key,
+            state.params,
+            state.buffers.alive,
+            pull,
+            density,
+            extent=extent,
+            remove_huge=remove_huge,
+        )
+        none = PullState(jnp.zeros_like(pull.total), jnp.zeros_like(pull.views))
+        return _replace_surfels(state.replace(opt_state=(none, adam)), surfels, alive, new)
+
+    def fade(state):
+        pull, (moments, rates) = state.opt_state
+        mu, nu = (
+            moment.replace(opacity_logits=jnp.zeros_like(moment.opacity_logits))
+            for moment in (moments.mu, moments.nu)
+        )
+        return state.replace(
+            params=reset_opacities(state.params, density),
+            opt_state=(pull, (moments._replace(mu=mu, nu=nu), rates)),
+        )
+
+    state = jax.lax.cond(due, grow, lambda state: state, state)
+    faded = (state.step % density.reset_every == 0) & (state.step < density.stop) & (state.step > 0)
+    return jax.lax.cond(faded, fade, lambda state: state, state)
+
+
+def _replace_surfels(state, surfels, alive, changed):
+    """The state with other surfels, of which the optimizer forgets those that changed."""
+
+    def forget(leaf):
+        if leaf.ndim == 0 or leaf.shape[0] != changed.shape[0]:
+            return leaf
+        return jnp.where(changed.reshape(-1, *(1,) * (leaf.ndim - 1)), 0, leaf)
+
+    return state.replace(
+        params=surfels,
+        buffers=state.buffers.replace(alive=alive),
+        opt_state=jax.tree.map(forget, state.opt_state),
+    )
