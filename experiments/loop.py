@@ -6,7 +6,9 @@ import time
 from typing import Any
 
 import jax
+import numpy as np
 import optax
+from jax.sharding import Mesh, PartitionSpec
 
 from experiments.presets import Preset, make_field, make_optimizer, make_train_config
 from jaxcloseup.artifacts.checkpoints import Checkpoints
@@ -61,9 +63,26 @@ class Programs:
             "targets": functools.partial(labelled_step, **bound),
         }
         # The number of steps is traced; the input state is left alone.
-        self._runners = {
-            name: jax.jit(functools.partial(run_steps, step)) for name, step in steps.items()
-        }
+        runners = {name: functools.partial(run_steps, step) for name, step in steps.items()}
+        # The arms of a sweep share the step, so that what is due at a step is no question of arms,
+        # and the views. Each device has arms of its own and nothing to say to the others.
+        arms_states = TrainState(step=None, params=0, buffers=0, opt_state=0, key=0)
+        arms_step = jax.vmap(
+            label_step, in_axes=(arms_states, None, 0, 0, 0), out_axes=(arms_states, 0)
+        )
+        shared, split = PartitionSpec(), PartitionSpec("arms")
+        states = TrainState(step=shared, params=split, buffers=split, opt_state=split, key=split)
+
+        def run_arms(states_now: TrainState, *data: Any, count: jax.Array | int) -> Any:
+            return jax.shard_map(
+                lambda *args: run_steps(arms_step, *args[:-1], count=args[-1]),
+                mesh=Mesh(np.array(jax.devices()), ("arms",)),
+                in_specs=(states, shared, split, split, split, shared),
+                out_specs=(states, split),
+                check_vma=False,
+            )(states_now, *data, count)
+
+        self._runners = {name: jax.jit(run) for name, run in (runners | {"arms": run_arms}).items()}
         self._render = jax.jit(
             lambda state, camera, key: self.field.render(
                 state.params, state.buffers, camera, None, key
@@ -82,30 +101,35 @@ class Programs:
 
     def run(
         self, kind: str, state: TrainState, *data: Any, count: int
-    ) -> tuple[TrainState, dict[str, float]]:
+    ) -> tuple[TrainState, dict[str, Any]]:
         """Take `count` steps on "photographs", and with labels of "virtual" or "targets" views.
 
         `data` is what `train_step`, `pseudo_step` (with its sources) and `labelled_step` take.
+        "arms" are those of a sweep, one on each device or several: all of the state but its step,
+        and all data but the views, have a leading axis of arms. Metrics are then means over arms,
+        but for `skipped`, the list of how many steps each one skipped.
 
         Raises:
           TrainingError: no step had a finite loss and gradient.
         """
         while True:
             after, metrics = self._runners[kind](state, *data, count=count)
-            metrics = {key: float(v) for key, v in metrics.items()}
+            metrics = jax.device_get(metrics)
             # Means of counts: positive if any step had an overflow.
-            overflow = [metrics.pop(key, 0) for key in ("overflow", "label_overflow")]
-            if not any(overflow):
-                skipped = round(metrics.pop("skipped") * count)
-                if skipped == count:
+            overflow = [metrics.pop(key, np.zeros(())) for key in ("overflow", "label_overflow")]
+            if not any(np.any(values) for values in overflow):
+                skipped = np.round(metrics.pop("skipped") * count).astype(int)
+                if kind != "arms" and skipped == count:
                     raise TrainingError(
                         f"loss or gradient was not finite in each of {count} steps: lower the "
                         "learning rate, or look for broken photographs or poses"
                     )
-                if skipped:
-                    print(f"warning: {skipped} of {count} steps skipped, not finite")
+                if skipped.any():
+                    print(f"warning: {skipped.sum()} of {count} steps skipped, not finite")
                 # The PSNR of no label at all is infinite.
-                return after, {key: v for key, v in metrics.items() if math.isfinite(v)}
+                values = {key: float(np.mean(v)) for key, v in metrics.items()}
+                values = {key: v for key, v in values.items() if math.isfinite(v)}
+                return after, values | ({"skipped": skipped.tolist()} if kind == "arms" else {})
             self._grow()
 
     def render(self, state: TrainState, camera: Camera, key: jax.Array | None = None) -> Rendering:
@@ -127,7 +151,7 @@ def run_stage(
     steps: int,
     checkpoints: Checkpoints,
     save_every: int,
-) -> tuple[TrainState, list[dict[str, float]]]:
+) -> tuple[TrainState, list[dict[str, Any]]]:
     """Take `steps` steps, reporting ten times or at least every 500 steps.
 
     Goes on from the newest checkpoint of the stage, if there is one, with the same next steps.
@@ -147,7 +171,7 @@ def run_stage(
       The state, and for each chunk its metrics with `step`, counted within the stage.
     """
     chunk = max(1, min(-(-steps // 10), 500))
-    history: list[dict[str, float]] = []
+    history: list[dict[str, Any]] = []
     begun = done = 0
     kept = checkpoints.load(name, state)
     if kept is not None:
@@ -164,7 +188,8 @@ def run_stage(
         history.append({"step": done} | values)
         rate = (done - begun) / (time.perf_counter() - start)
         left = (steps - done) / rate
-        shown = "  ".join(f"{key} {value:.4g}" for key, value in values.items())
+        numbers = {key: value for key, value in values.items() if isinstance(value, float)}
+        shown = "  ".join(f"{key} {value:.4g}" for key, value in numbers.items())
         print(
             f"{name:>9} {done:>{len(str(steps))}}/{steps}  {rate:6.1f} steps/s  "
             f"{int(left // 60)}:{int(left % 60):02d} left  {shown}",

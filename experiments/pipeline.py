@@ -6,7 +6,7 @@ import functools
 import pathlib
 import platform
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -24,6 +24,8 @@ from experiments.report import in_short, write_json, write_report
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.artifacts.surfel_ply import write_surfels
 from jaxcloseup.batch import camera_at
+from jaxcloseup.field import Rendering
+from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.geometry.union_warp import block_sources
 from jaxcloseup.pseudo import label_views
 from jaxcloseup.scenes import Scene
@@ -103,7 +105,7 @@ def run(
     baseline = train("baseline", "photographs", state, views, steps=preset.baseline_steps)
     render = functools.partial(programs.render, baseline)
     with timed(seconds, "depths"):
-        depths = _depths(
+        depths = rendered_depths(
             render,
             size,
             scene,
@@ -138,7 +140,7 @@ def run(
     if "test_time" in to_run and scene.test is not None:
         with timed(seconds, "test_time_labels"):
             cameras = scene.test.cameras
-            data = cameras, _depths(render, cameras, scene), views, depths, settings
+            data = cameras, rendered_depths(render, cameras, scene), views, depths, settings
             labels = jax.jit(label_views)(*data, sources=sources)
         per_view = len(scene.test) if names["method"] == "surfels" else 1
         kind, data = (
@@ -183,7 +185,14 @@ def run(
     return results
 
 
-def _depths(render, cameras, scene, *, key=None, divided=True):
+def rendered_depths(
+    render: Callable[..., Rendering],
+    cameras: Camera,
+    scene: Scene,
+    *,
+    key: jax.Array | None = None,
+    divided: bool = True,
+) -> jax.Array:
     """`render_depths` of stacked cameras, by a `render` that makes room where images need it."""
     count = cameras.intrinsics.shape[0]
     keys = [None] * count if key is None else jax.random.split(key, count)

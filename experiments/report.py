@@ -93,7 +93,7 @@ def write_report(
     parts = [
         "<!doctype html><html lang=en><meta charset=utf-8>",
         "<meta name=viewport content='width=device-width'>",
-        f"<title>{html.escape(title)}</title><style>{_STYLE}</style>",
+        f"<title>{html.escape(title)}</title><style>{STYLE}</style>",
         f"<h1>{html.escape(title)}</h1>",
         f"<p>{width} x {height} pixels, seed {results['seed']}. Metrics are means over views, on "
         "8-bit images. <i>control</i> is the baseline after as many further steps as "
@@ -170,7 +170,7 @@ def format_metric(key: str, value: float | None) -> str:
     return f"{value:.2f}" if "psnr" in key or "normal" in key else f"{value:.4f}"
 
 
-_STYLE = """
+STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 1200px; margin: 2em auto; padding: 0 1em }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums }
 th, td { padding: .25em .8em; text-align: right; border-bottom: 1px solid #ccc }

@@ -7,20 +7,13 @@ same number of steps, without and with pseudo-labels of random close-ups; `test_
 it with labels of the very close-ups that are scored. The scene is a built-in one or a folder.
 """
 
-import dataclasses
-import datetime
-import logging
-import os
-import pathlib
 import sys
-import warnings
 
-import jax
 from absl import app, flags
 
+from experiments import command_line
 from experiments.loop import TrainingError
 from experiments.pipeline import STAGES, run
-from experiments.presets import PRESETS, Preset, with_classic_density
 from experiments.report import print_table
 from jaxcloseup.artifacts.checkpoints import CheckpointError
 from jaxcloseup.scenes import SceneError, load_scene
@@ -30,79 +23,21 @@ FLAGS = flags.FLAGS
 flags.DEFINE_string(
     "scene", "table", "a built-in scene (counter, table, room, bench, stairs) or a folder"
 )
-flags.DEFINE_enum("method", "surfels", list(PRESETS), "radiance field")
-flags.DEFINE_enum(
-    "preset",
-    "quick",
-    ["quick", "paper", "released"],
-    "hyper-parameters; flags below override them; released: of NeRF alone",
-)
 flags.DEFINE_integer("seed", 0, "random seed; the same seed gives the same metrics", lower_bound=0)
-flags.DEFINE_string(
-    "output_dir", None, "where results go; default outputs/<scene>/<method>/<date_time>"
-)
-flags.DEFINE_integer(
-    "downscale",
-    None,
-    "reduce photographs by this factor, by area; default: the preset's",
-    lower_bound=1,
-)
-flags.DEFINE_integer(
-    "baseline_steps", None, "steps of stage 1; default: the preset's", lower_bound=1
-)
-flags.DEFINE_integer(
-    "closeup_steps", None, "steps of closeup and of control; default: the preset's", lower_bound=1
-)
 flags.DEFINE_integer(
     "save_every", 1000, "steps between checkpoints; each stage's end is kept too", lower_bound=1
 )
-flags.DEFINE_bool("resume", False, "go on with the run in --output_dir where it was cut off")
 flags.DEFINE_list("stages", list(STAGES), "of the stages those to run; baseline always is")
-flags.DEFINE_enum(
-    "compute_dtype",
-    "float32",
-    ["float32", "bfloat16"],
-    "operands of the products of a NeRF's network; bfloat16 is faster and less exact",
-)
-flags.DEFINE_enum(
-    "density",
-    "mcmc",
-    ["mcmc", "classic"],
-    "how surfels are added: Monte Carlo moves, or clone, split and prune",
-)
-flags.DEFINE_float(
-    "colour_ridge",
-    None,
-    "let each photograph change the colours of surfels by an affine map while training, against "
-    "this resistance, say 0.01; default: no such change",
-    lower_bound=0.0,
-)
-flags.DEFINE_bool(
-    "half_pixel", False, "the capture has pixel centres at integers: add 0.5 to cx, cy"
-)
-flags.DEFINE_string(
-    "compilation_cache",
-    None,
-    "folder of compiled programs, kept between runs; empty: none; default: under ~/.cache",
-)
-
-
-_OF_METHOD = {"nerf": ("compute_dtype",), "surfels": ("density", "colour_ridge")}
 
 
 def main(argv: list[str]) -> None:
     """Run all stages with the settings of the flags."""
     if len(argv) > 1:
         raise app.UsageError(f"unexpected argument: {argv[1]}")
-    set_up_compilation_cache(FLAGS.compilation_cache)
-    # Warnings are sentences for the user; notes on absent accelerators and on every file of a
-    # checkpoint are not.
-    warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
-    logging.getLogger("jax._src.xla_bridge").setLevel(logging.WARNING)
-    logging.getLogger("absl").setLevel(logging.WARNING)
+    command_line.set_up()
     try:
-        preset = preset_from_flags()
-        output_dir = choose_output_dir(
+        preset = command_line.preset_from_flags()
+        output_dir = command_line.choose_output_dir(
             FLAGS.output_dir, FLAGS.scene, FLAGS.method, resume=FLAGS.resume
         )
         scene = load_scene(FLAGS.scene, downscale=preset.downscale, half_pixel=FLAGS.half_pixel)
@@ -124,66 +59,6 @@ def main(argv: list[str]) -> None:
         sys.exit(f"experiments.run: {error}")
     print_table(results)
     print(f"report: {output_dir / 'report.html'}")
-
-
-def preset_from_flags() -> Preset:
-    """The preset, with the flags that were given in place of its values."""
-    of_method = PRESETS[FLAGS.method]
-    if FLAGS.preset not in of_method:
-        raise ValueError(
-            f"--preset={FLAGS.preset} is not for --method={FLAGS.method}: choose "
-            + " or ".join(of_method)
-        )
-    for method, names in _OF_METHOD.items():
-        for name in names:
-            if method != FLAGS.method and FLAGS[name].value != FLAGS[name].default:
-                raise ValueError(f"--{name} is for --method={method}: leave it out")
-    preset = of_method[FLAGS.preset]
-    given = {
-        name: getattr(FLAGS, name)
-        for name in ("downscale", "baseline_steps", "closeup_steps")
-        if getattr(FLAGS, name) is not None
-    }
-    if FLAGS.method == "nerf":
-        given["field"] = dataclasses.replace(preset.field, compute_dtype=FLAGS.compute_dtype)
-    else:
-        field = dataclasses.replace(preset.field, colour_ridge=FLAGS.colour_ridge)
-        if FLAGS.density == "classic":
-            field = with_classic_density(field, FLAGS.preset)
-        given["field"] = field
-    return dataclasses.replace(preset, **given)
-
-
-def set_up_compilation_cache(folder: str | None) -> None:
-    """Keep compiled programs on disk, so that the next run starts at once."""
-    if folder is None:
-        cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-        folder = os.path.join(cache, "jaxcloseup", "xla")
-    if folder:
-        jax.config.update("jax_compilation_cache_dir", folder)
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
-
-
-def choose_output_dir(
-    folder: str | None, scene: str, method: str, *, resume: bool = False
-) -> pathlib.Path:
-    """The output folder; never one that holds something, unless that is to be resumed."""
-    if resume:
-        if folder is None or not (pathlib.Path(folder) / "checkpoints").is_dir():
-            raise FileNotFoundError(
-                f"--resume finds no run in --output_dir={folder or ''}: name the folder of one "
-                "that was cut off"
-            )
-        return pathlib.Path(folder)
-    if folder is None:
-        stamp = datetime.datetime.now().strftime("%Y-%m-%d_%H%M%S")
-        folder = os.path.join("outputs", pathlib.Path(scene).name, method, stamp)
-    path = pathlib.Path(folder)
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise FileExistsError(
-            f"--output_dir={folder} already holds something: name a new folder, or remove it first"
-        )
-    return path
 
 
 @flags.multi_flags_validator(["stages"], message=f"--stages takes names of {', '.join(STAGES)}")

@@ -4,6 +4,7 @@ import pathlib
 
 import jax
 import pytest
+from tiny_runs import write_plane
 
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -24,3 +25,9 @@ def shared():
 def key(request):
     """A key that differs from test to test and never from run to run."""
     return jax.random.key(sum(map(ord, request.node.name)) % 2**31)
+
+
+@pytest.fixture(scope="session")
+def capture_folder(tmp_path_factory):
+    """The plane as photographs in the paper's layout."""
+    return write_plane(tmp_path_factory.mktemp("plane"))

@@ -9,7 +9,9 @@ import plane
 import pytest
 from absl import flags
 from absl.testing import flagsaver
+from tiny_runs import TINY, TINY_SURFELS
 
+from experiments import command_line
 from experiments import run as program
 from experiments.audit import blur_to_footprint
 from experiments.evaluation import Target, score, summarise
@@ -18,7 +20,6 @@ from experiments.loop import Programs, TrainingError
 from experiments.pipeline import config, run
 from experiments.presets import (
     PRESETS,
-    QUICK,
     QUICK_SURFELS,
     initial_points,
     pseudo_settings,
@@ -28,64 +29,8 @@ from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.artifacts.surfel_ply import read_surfels
 from jaxcloseup.field import Rendering
 from jaxcloseup.scenes import load_scene
-from jaxcloseup.splats import RasterizeConfig
 from jaxcloseup.splats.adaptive_density import AdaptiveDensityConfig
-from jaxcloseup.train import TrainConfig, init_state
-from jaxcloseup.volume.nerf import NerfConfig
-
-
-TINY = dataclasses.replace(
-    QUICK,
-    field=NerfConfig(
-        depth=2, width=16, skip_after=0, direction_width=8, num_coarse=8, num_fine=8, chunk=512
-    ),
-    train=TrainConfig(num_rays=64, num_label_rays=64),
-    baseline_steps=30,
-    closeup_steps=3,
-    downscale=1,
-)
-TINY_SURFELS = dataclasses.replace(
-    QUICK_SURFELS,
-    field=dataclasses.replace(
-        QUICK_SURFELS.field,
-        capacity=600,
-        decay_steps=20,
-        density=None,
-        raster=RasterizeConfig(capacity=2**14, tile=8, chunk=4, block=12),
-    ),
-    baseline_steps=20,
-    closeup_steps=2,
-    test_time_steps=2,
-    downscale=1,
-)
-OPENGL = np.diag([1.0, -1, -1])
-
-
-@pytest.fixture(scope="session")
-def capture_folder(tmp_path_factory):
-    """The plane as photographs in the paper's layout."""
-    folder = tmp_path_factory.mktemp("plane")
-    splits = {
-        "train": [plane.camera_above(x, 0.1 * x, 4.0, tilt=0.1 * x) for x in (-1, -0.5, 0, 0.5, 1)],
-        "test": [plane.camera_above(0.2, 0.1, 1.5, tilt=0.3)],
-        "test_far": [plane.camera_above(0.3, 0.0, 4.0)],
-    }
-    for split, cameras in splits.items():
-        (folder / split).mkdir()
-        frames = []
-        for i, camera in enumerate(cameras):
-            rgb, _, _ = plane.photograph(camera)
-            name = f"{split}/{i}.png"
-            cv2.imwrite(str(folder / name), np.rint(rgb[..., ::-1] * 255).astype(np.uint8))
-            pose = np.eye(4)
-            pose[:3] = camera.camtoworld
-            pose[:3, :3] = pose[:3, :3] @ OPENGL
-            fx, fy, cx, cy = map(float, camera.intrinsics)
-            intrinsics = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
-            frames.append({"file_path": name, "transform_matrix": pose.tolist()} | intrinsics)
-        text = json.dumps({"near": 1.0, "far": 8.0, "frames": frames})
-        (folder / f"transforms_{split}.json").write_text(text)
-    return folder
+from jaxcloseup.train import init_state
 
 
 @pytest.fixture(scope="session")
@@ -269,7 +214,7 @@ def test_a_folder_that_holds_something_is_refused_before_any_work(parsed_flags, 
 def test_flags_override_the_preset(parsed_flags):
     given = {"preset": "paper", "closeup_steps": 7, "compute_dtype": "bfloat16"}
     with flagsaver.flagsaver(method="nerf", **given):
-        preset = program.preset_from_flags()
+        preset = command_line.preset_from_flags()
     assert preset.closeup_steps == 7
     assert preset.field.compute_dtype == "bfloat16"
     assert preset.baseline_steps == PRESETS["nerf"]["paper"].baseline_steps == 200_000
@@ -310,7 +255,7 @@ def test_a_flag_of_the_other_method_is_one_sentence(parsed_flags, tmp_path, meth
 
 def test_surfels_can_be_cloned_and_split(parsed_flags):
     with flagsaver.flagsaver(method="surfels", density="classic", colour_ridge=0.01):
-        field = program.preset_from_flags().field
+        field = command_line.preset_from_flags().field
     assert isinstance(field.density, AdaptiveDensityConfig)
     assert field.colour_ridge == 0.01
     assert field.opacity_weight == 0

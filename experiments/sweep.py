@@ -1,0 +1,329 @@
+"""Arms of an ablation, over seeds, trained as one vmapped program.
+
+    python -m experiments.sweep --scenes=table,room --seeds=3
+
+Stage 1 is trained once for each seed and copied to every arm; arms of a seed draw the same random
+numbers, so that they differ by their settings alone. Interrupted, the same command with --resume
+goes on to the same tables.
+"""
+
+import functools
+import pathlib
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from absl import app, flags
+
+import jaxcloseup
+from experiments import command_line
+from experiments.evaluation import Target, evaluate, exact_depths, make_targets
+from experiments.loop import Programs, TrainingError, run_stage
+from experiments.pipeline import config, rendered_depths, versions
+from experiments.presets import Preset, initial_points, pseudo_settings
+from experiments.sweep_report import print_sweep, write_sweep
+from jaxcloseup.artifacts.checkpoints import CheckpointError, Checkpoints
+from jaxcloseup.batch import Views
+from jaxcloseup.geometry.cameras import Camera, pixel_grid
+from jaxcloseup.geometry.union_warp import SourceBlocks, block_sources
+from jaxcloseup.pseudo import (
+    PseudoSettings,
+    count_seen,
+    label_views,
+    sample_virtual_camera,
+)
+from jaxcloseup.scenes import Scene, SceneError, load_scene
+from jaxcloseup.splats.field import SurfelConfig
+from jaxcloseup.train import TrainState, init_state
+
+
+class _Start(NamedTuple):
+    """Where the arms of a seed begin."""
+
+    state: TrainState
+    depths: jax.Array
+    sources: SourceBlocks
+
+
+# The paper's Table 1, its two test-time rows, and what they are to be held against.
+NAMED_ARMS: dict[str, dict[str, float]] = {
+    "control": {"label_share": 0.0},
+    "labels": {"use_mask": 0.0, "fixed_anchors": 1.0},
+    "mask": {"fixed_anchors": 1.0},
+    "diverse": {},
+}
+ARMS_IN_TURN = ("oracle", "test_time")  # labelled once, before their first step
+ORACLE_VIEWS = 64
+
+FLAGS = flags.FLAGS
+flags.DEFINE_list("scenes", ["table"], "built-in scenes or folders")
+flags.DEFINE_integer("seeds", 3, "random seeds 0, 1, ...", lower_bound=1)
+flags.DEFINE_list(
+    "arms",
+    ["baseline", *NAMED_ARMS, *ARMS_IN_TURN],
+    "arms: baseline, control, labels (no mask, four anchors), mask, diverse (the preset), oracle "
+    "(true pixels of close-ups), test_time, and the preset with other settings, as in "
+    "rgb_tolerance=0.02+label_share=0.5 or magnification=2:4",
+)
+flags.DEFINE_integer(
+    "max_parallel", 8, "arms and seeds trained at once, which bounds memory", lower_bound=1
+)
+
+
+class Arm(NamedTuple):
+    """An arm's name and settings."""
+
+    name: str
+    settings: PseudoSettings
+
+    @property
+    def in_turn(self) -> bool:
+        """Whether it is trained alone."""
+        return self.name in ARMS_IN_TURN
+
+
+def make_arm(name: str, settings: PseudoSettings) -> Arm:
+    """An arm by its name, with the preset's settings changed as the name says.
+
+    Raises:
+      ValueError: the name is none, with what it could be.
+    """
+    if name == "baseline" or name in ARMS_IN_TURN:
+        return Arm(name, settings)
+    changes = NAMED_ARMS[name] if name in NAMED_ARMS else _parse(name)
+    for field, value in changes.items():
+        settings = _change(settings, name, field, value)
+    return Arm(name, settings)
+
+
+def _parse(name):
+    changes = {}
+    for change in name.split("+"):
+        field, equals, text = change.partition("=")
+        try:
+            values = [float(value) for value in text.split(":")]
+        except ValueError:
+            equals = ""
+        if not equals:
+            known = ", ".join(["baseline", *NAMED_ARMS, *ARMS_IN_TURN])
+            raise ValueError(f"--arms={name} is not an arm: name {known}, or setting=number")
+        changes[field] = values[0] if len(values) == 1 else values
+    return changes
+
+
+def _change(settings, arm, field, value):
+    holder = settings if hasattr(settings, field) else settings.pose
+    old = getattr(holder, field, None)
+    if field == "pose" or old is None or jnp.shape(old) != np.shape(value):
+        known = [*vars(settings), *vars(settings.pose)]
+        raise ValueError(
+            f"--arms={arm}: {field} takes no such value; settings are "
+            + ", ".join(sorted(set(known) - {"pose"}))
+            + ", of which magnification is a range as in 2:8"
+        )
+    changed = holder.replace(**{field: jnp.asarray(value, old.dtype)})
+    return changed if holder is settings else settings.replace(pose=changed)
+
+
+def run_sweep(
+    scene: Scene,
+    preset: Preset,
+    arms: Sequence[str],
+    seeds: int,
+    folder: pathlib.Path,
+    *,
+    names: Mapping[str, str],
+    max_parallel: int = 8,
+) -> dict[str, Any]:
+    """All arms of one scene; returns, for each arm, the metrics of each seed and split.
+
+    Args:
+      scene: what is photographed.
+      preset: of stage 1, and of all that an arm does not change.
+      arms: their names.
+      seeds: how many.
+      folder: for checkpoints; those of the same sweep are gone on from.
+      names: of "method" and "preset".
+      max_parallel: arms and seeds trained at once.
+    """
+    chosen = [make_arm(name, pseudo_settings(preset)) for name in arms]
+    if scene.surface is None:
+        chosen = [arm for arm in chosen if arm.name != "oracle"]  # nobody knows the true pixels
+    programs = Programs(preset, scene)
+    identity = {"scene": scene.name, "config": config(preset), "arms": list(arms), "seeds": seeds}
+    identity |= {"max_parallel": max_parallel, "version": jaxcloseup.__version__, **names}
+    checkpoints = Checkpoints(folder, identity)
+    stage = functools.partial(run_stage, checkpoints=checkpoints, save_every=1000)
+    views = jax.device_put(scene.train)
+
+    starts = []
+    for seed in range(seeds):
+        key_init, _, _ = jax.random.split(jax.random.key(seed), 3)
+        points = initial_points(jax.random.fold_in(key_init, 2), scene)
+        state = init_state(key_init, *points, field=programs.field, optimizer=programs.optimizer)
+        steps = preset.baseline_steps
+        state, _ = stage(f"baseline_{seed}", programs, "photographs", state, views, steps=steps)
+        depths = _depths(programs, state, views.cameras)
+        sources = jax.jit(block_sources)(views.cameras, depths, views.weight)
+        starts.append(_Start(state, depths, sources))
+    targets = _make_targets(scene, programs, starts[0])
+
+    together = [(arm, seed) for arm in chosen for seed in range(seeds)]
+    in_turn = [(arm, seed) for arm, seed in together if arm.in_turn]
+    together = [pair for pair in together if not pair[0].in_turn and pair[0].name != "baseline"]
+    results: dict[str, Any] = {arm.name: {} for arm in chosen}
+
+    def score(arm, seed, state, skipped):
+        splits = {
+            split: evaluate(functools.partial(programs.render, state), of_split)[0]
+            for split, of_split in targets.items()
+        }
+        results[arm][str(seed)] = {"skipped": skipped, "splits": splits}
+
+    for seed, start in enumerate(starts):
+        if "baseline" in results:
+            score("baseline", seed, start.state, 0)
+    for first in range(0, len(together), max_parallel):
+        group = together[first : first + max_parallel]
+        name = f"arms_{first // max_parallel}"
+        states, history = _train_together(stage, name, programs, views, group, starts)
+        for i, (arm, seed) in enumerate(group):
+            state = jax.tree.map(lambda leaf, i=i: leaf[i], states.replace(step=states.step[None]))
+            skipped = sum(chunk["skipped"][i] for chunk in history)
+            score(arm.name, seed, state.replace(step=states.step), skipped)
+    for arm, seed in in_turn:
+        start = starts[seed]
+        if arm.name == "oracle":
+            labels = true_close_ups(jax.random.key(seed), scene, start.depths, arm.settings)
+            steps = preset.closeup_steps
+        else:
+            labels = _label_targets(scene, programs, start, arm.settings)
+            whole = isinstance(preset.field, SurfelConfig)
+            steps = preset.test_time_steps * (len(scene.test) if whole else 1)
+        name = f"{arm.name}_{seed}"
+        data = views, labels, arm.settings
+        state, _ = stage(name, programs, "targets", start.state, *data, steps=steps)
+        score(arm.name, seed, state, 0)
+    return results
+
+
+def stack_arms(
+    group: Sequence[tuple[PseudoSettings, TrainState, jax.Array, SourceBlocks]], devices: int
+) -> tuple[TrainState, jax.Array, PseudoSettings, SourceBlocks]:
+    """States, depths, settings and sources with a leading axis of arms, as `Programs.run` takes.
+
+    The last arm is repeated until each device has as many.
+    """
+    group = [*group, *[group[-1]] * (-len(group) % devices)]
+    settings, states, depths, sources = (
+        jax.tree.map(lambda *leaves: jnp.stack(leaves), *column)
+        for column in zip(*group, strict=True)
+    )
+    return states.replace(step=states.step[0]), depths, settings, sources
+
+
+def _train_together(stage, name, programs, views, group, starts):
+    begun = [
+        (arm.settings, starts[seed].state, starts[seed].depths, starts[seed].sources)
+        for arm, seed in group
+    ]
+    states, *data = stack_arms(begun, len(jax.devices()))
+    print(f"{name}: " + ", ".join(f"{arm.name} {seed}" for arm, seed in group))
+    steps = programs.preset.closeup_steps
+    return stage(name, programs, "arms", states, views, *data, steps=steps)
+
+
+def true_close_ups(
+    key: jax.Array, scene: Scene, depths: jax.Array, settings: PseudoSettings
+) -> Views:
+    """Random virtual close-ups with their true pixels, where a training view sees the surface.
+
+    The ceiling of what labels can do: no photograph holds so much detail.
+    """
+    exact = exact_depths(scene, scene.train.cameras)
+
+    @jax.jit
+    def one(key):
+        camera, _ = sample_virtual_camera(key, scene.train, depths, settings)
+        truth = scene.surface(camera)
+        pixels = pixel_grid(camera.height, camera.width)
+        seen = count_seen(camera, pixels, truth.depth, scene.train, exact)
+        return Views(camera, truth.rgb, (seen > 0).astype(jnp.float32))
+
+    images = [one(k) for k in jax.random.split(key, ORACLE_VIEWS)]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *images)
+
+
+def _depths(programs: Programs, state: TrainState, cameras: Camera) -> jax.Array:
+    train = programs.preset.train
+    return rendered_depths(
+        functools.partial(programs.render, state),
+        cameras,
+        programs.scene,
+        key=jax.random.key(0) if train.perturbed_depth else None,
+        divided=not train.undivided_depth,
+    )
+
+
+def _label_targets(scene, programs, start, settings):
+    seen = _depths(programs, start.state, scene.test.cameras)
+    data = scene.test.cameras, seen, scene.train, start.depths, settings
+    return jax.jit(label_views)(*data, sources=start.sources)
+
+
+def _make_targets(scene, programs, start) -> dict[str, list[Target]]:
+    exact = exact_depths(scene, scene.train.cameras) if scene.surface else None
+    seen_from = start.depths if exact is None else exact
+    render = functools.partial(programs.render, start.state)
+    return {
+        split: make_targets(scene, split, seen_from, render)
+        for split in scene.names
+        if split != "train"
+    }
+
+
+def main(argv: list[str]) -> None:
+    """Run the sweep of the flags on every scene."""
+    if len(argv) > 1:
+        raise app.UsageError(f"unexpected argument: {argv[1]}")
+    command_line.set_up()
+    names = {"method": FLAGS.method, "preset": FLAGS.preset}
+    try:
+        preset = command_line.preset_from_flags()
+        for arm in FLAGS.arms:
+            make_arm(arm, pseudo_settings(preset))
+        captures = [
+            load_scene(name, downscale=preset.downscale, half_pixel=FLAGS.half_pixel)
+            for name in FLAGS.scenes
+        ]
+        output_dir = command_line.choose_output_dir(
+            FLAGS.output_dir, "sweep", FLAGS.method, resume=FLAGS.resume
+        )
+        output_dir.mkdir(parents=True, exist_ok=True)
+    except (SceneError, OSError, ValueError) as error:
+        sys.exit(f"experiments.sweep: {error}")
+    about = {**names, "config": config(preset), "versions": versions()}
+    found: dict[str, Any] = {}
+    try:
+        for scene in captures:
+            found[scene.name] = run_sweep(
+                scene,
+                preset,
+                FLAGS.arms,
+                FLAGS.seeds,
+                output_dir / "checkpoints" / scene.name,
+                names=names,
+                max_parallel=FLAGS.max_parallel,
+            )
+            write_sweep(output_dir, found, about)
+    except (TrainingError, CheckpointError) as error:
+        sys.exit(f"experiments.sweep: {error}")
+    print_sweep(found)
+    print(f"report: {output_dir / 'report.html'}")
+
+
+if __name__ == "__main__":
+    app.run(main)

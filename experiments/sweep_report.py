@@ -1,0 +1,179 @@
+"""Tables of a sweep: means over seeds and scenes, and how sure a difference from control is."""
+
+import csv
+import html
+import io
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from experiments.report import SPLIT_TITLES, STYLE, write_json
+from jaxcloseup.files import write_file
+
+
+RESAMPLES = 4000
+
+
+class Row(NamedTuple):
+    """One arm on one kind of views.
+
+    Attributes:
+      arm: its name.
+      split: of the views.
+      psnr: mean over scenes, seeds and views, dB.
+      spread: standard deviation over seeds of the mean over scenes and views; None of one seed.
+      ssim: mean.
+      gain: mean difference of PSNR from control, or None without one.
+      low, high: its 95 % interval.
+      skipped: steps that were not finite, of all seeds and scenes.
+    """
+
+    arm: str
+    split: str
+    psnr: float
+    spread: float | None
+    ssim: float | None
+    gain: float | None
+    low: float | None
+    high: float | None
+    skipped: int
+
+
+def paired_bootstrap(
+    differences: Sequence[np.ndarray], *, resamples: int = RESAMPLES, share: float = 0.95
+) -> tuple[float, float]:
+    """Interval of the mean of paired differences, by resampling groups of them.
+
+    Args:
+      differences: of each group, which is drawn as a whole: the seeds of a view, for these resemble
+        each other.
+      resamples: how often.
+      share: of the resampled means that lie within.
+    """
+    means = np.array([np.mean(group) for group in differences])
+    chosen = np.random.default_rng(0).integers(0, len(means), (resamples, len(means)))
+    low, high = np.quantile(means[chosen].mean(axis=1), [(1 - share) / 2, (1 + share) / 2])
+    return float(low), float(high)
+
+
+def rows(scenes: Mapping[str, Mapping[str, Any]]) -> list[Row]:
+    """A row for each split and arm.
+
+    Args:
+      scenes: for each scene what `run_sweep` returns.
+    """
+    table = []
+    arms = list(dict.fromkeys(arm for of_scene in scenes.values() for arm in of_scene))
+    for split in SPLIT_TITLES:
+        psnr = {arm: _by_view(scenes, arm, split, "psnr") for arm in arms}
+        control = psnr.get("control", {})
+        for arm in arms:
+            if not psnr[arm]:
+                continue
+            by_seed: dict[str, list[float]] = {}
+            for (_, seed, _), value in psnr[arm].items():
+                by_seed.setdefault(seed, []).append(value)
+            seeds = [float(np.mean(values)) for values in by_seed.values()]
+            pairs: dict[tuple[str, str], list[float]] = {}
+            for (scene, seed, view), value in psnr[arm].items():
+                if (scene, seed, view) in control:
+                    difference = value - control[scene, seed, view]
+                    pairs.setdefault((scene, view), []).append(difference)
+            gain = low = high = None
+            if pairs and arm != "control":
+                groups = [np.array(group) for group in pairs.values()]
+                gain = float(np.mean([group.mean() for group in groups]))
+                low, high = paired_bootstrap(groups)
+            ssim = list(_by_view(scenes, arm, split, "ssim").values())
+            skipped = sum(
+                result["skipped"]
+                for of_scene in scenes.values()
+                for result in of_scene.get(arm, {}).values()
+            )
+            table.append(
+                Row(
+                    arm,
+                    split,
+                    float(np.mean(list(psnr[arm].values()))),
+                    float(np.std(seeds, ddof=1)) if len(seeds) > 1 else None,
+                    float(np.mean(ssim)) if ssim else None,
+                    gain,
+                    low,
+                    high,
+                    skipped,
+                )
+            )
+    return table
+
+
+def print_sweep(scenes: Mapping[str, Mapping[str, Any]]) -> None:
+    """Print the table."""
+    header, *body = _cells(rows(scenes))
+    table = Table(*header)
+    for line in body:
+        table.add_row(*line)
+    Console().print(table)
+
+
+def write_sweep(folder: pathlib.Path, scenes: Mapping[str, Any], about: Mapping[str, Any]) -> None:
+    """Write sweep.json, table.md, table.csv and report.html; `about` is how it was made."""
+    found = rows(scenes)
+    write_json(folder / "sweep.json", {"scenes": scenes, **about})
+    header, *body = _cells(found)
+    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
+    lines += ["| " + " | ".join(line) + " |" for line in body]
+    write_file(folder / "table.md", "\n".join([*lines, ""]).encode())
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(Row._fields)
+    writer.writerows(found)
+    write_file(folder / "table.csv", text.getvalue().encode())
+    title = f"Sweep: {about['method']}, preset {about['preset']}, {', '.join(scenes)}"
+    parts = [
+        "<!doctype html><html lang=en><meta charset=utf-8>",
+        "<meta name=viewport content='width=device-width'>",
+        f"<title>{html.escape(title)}</title><style>{STYLE}</style><h1>{html.escape(title)}</h1>",
+        "<p>Means over scenes, seeds and views, and the standard deviation over seeds. The gain is "
+        "the difference from <i>control</i>, as many further steps without labels, on the same "
+        "views, with its 95 % interval over views drawn again.</p><div class=wide><table><tr>",
+        *(f"<th>{html.escape(cell)}" for cell in header),
+        *("<tr>" + "".join(f"<td>{html.escape(cell)}" for cell in line) for line in body),
+        "</table></div></html>",
+    ]
+    write_file(folder / "report.html", "\n".join(parts).encode())
+
+
+def _by_view(scenes, arm, split, metric):
+    """A metric by (scene, seed, view), where it is known."""
+    return {
+        (scene, seed, view): values[metric]
+        for scene, of_scene in scenes.items()
+        for seed, result in of_scene.get(arm, {}).items()
+        for view, values in result["splits"].get(split, {"views": {}})["views"].items()
+        if values.get(metric) is not None
+    }
+
+
+def _cells(found):
+    def number(value, pattern="{:.2f}"):
+        return "-" if value is None else pattern.format(value)
+
+    body = [
+        [
+            SPLIT_TITLES[row.split],
+            row.arm,
+            number(row.psnr),
+            number(row.spread),
+            number(row.ssim, "{:.4f}"),
+            number(row.gain, "{:+.3f}"),
+            "-" if row.gain is None else f"{row.low:+.3f} to {row.high:+.3f}",
+            str(row.skipped),
+        ]
+        for row in found
+    ]
+    header = ["views", "arm", "PSNR (dB)", "s.d.", "SSIM", "gain (dB)", "95 %", "skipped steps"]
+    return [header, *body]

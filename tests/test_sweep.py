@@ -1,0 +1,231 @@
+"""Sweeps: arms are runs of their own, together; neither a failing one nor a stop costs others."""
+
+import csv
+import dataclasses
+import functools
+import json
+import os
+import pathlib
+import shutil
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tiny_runs import TINY, TINY_SURFELS
+
+from experiments.loop import Programs
+from experiments.pipeline import rendered_depths
+from experiments.presets import initial_points, pseudo_settings
+from experiments.sweep import make_arm, run_sweep, stack_arms
+from experiments.sweep_report import paired_bootstrap, rows, write_sweep
+from jaxcloseup.geometry.union_warp import block_sources
+from jaxcloseup.scenes import load_scene
+from jaxcloseup.train import init_state
+
+
+ARMS = ["control", "labels", "diverse", "rgb_tolerance=0.5+magnification=2:3"]
+TINY_STEPS = dataclasses.replace(TINY, closeup_steps=2, test_time_steps=2)
+
+
+@functools.cache
+def begin(preset, capture_folder):
+    """Programs, and for each arm its settings, state, depths and sources after a few steps."""
+    scene = load_scene(str(capture_folder))
+    programs = Programs(preset, scene)
+    points = initial_points(jax.random.key(1), scene)
+    state = init_state(
+        jax.random.key(0), *points, field=programs.field, optimizer=programs.optimizer
+    )
+    state, _ = programs.run("photographs", state, scene.train, count=3)
+    depths = rendered_depths(functools.partial(programs.render, state), scene.train.cameras, scene)
+    sources = jax.jit(block_sources)(scene.train.cameras, depths, scene.train.weight)
+    settings = [make_arm(name, pseudo_settings(preset)).settings for name in ARMS]
+    return programs, scene.train, [(s, state, depths, sources) for s in settings]
+
+
+# SSIM's derivative jumps where a window is flat, on whichever side of 0 rounding falls.
+TINY_SMOOTH = dataclasses.replace(
+    TINY_SURFELS, field=dataclasses.replace(TINY_SURFELS.field, ssim_weight=0.0)
+)
+
+
+def assert_same_step(arm, alone, before):
+    """Gradients agree to 1e-4 of the largest, and parameters with a clear gradient to 1e-5.
+
+    Adam divides by the gradient's size: of what is only rounding it makes a whole step.
+    """
+
+    def compare(new, old, new_moment, old_moment):
+        new_moment, old_moment = np.asarray(new_moment), np.asarray(old_moment)
+        largest = np.abs(old_moment).max()
+        np.testing.assert_allclose(new_moment, old_moment, rtol=0, atol=1e-4 * largest)
+        clear = np.abs(old_moment) > 0.01 * largest
+        np.testing.assert_allclose(
+            np.asarray(new)[clear], np.asarray(old)[clear], rtol=1e-5, atol=1e-5
+        )
+
+    jax.tree.map(compare, arm.params, alone.params, arm.opt_state[0].mu, alone.opt_state[0].mu)
+    changed = jax.tree.map(lambda x, y: float(jnp.abs(x - y).max()), alone.params, before.params)
+    assert max(jax.tree.leaves(changed)) > 1e-3
+
+
+@pytest.mark.parametrize("preset", [TINY_STEPS, TINY_SMOOTH], ids=["nerf", "surfels"])
+def test_an_arm_is_the_run_alone(preset, capture_folder):
+    with jax.numpy_dtype_promotion("standard"):
+        programs, views, arms = begin(preset, capture_folder)
+        states, *data = stack_arms(arms, len(jax.devices()))
+        together, metrics = programs.run("arms", states, views, *data, count=1)
+        for i, (settings, state, depths, sources) in enumerate(arms):
+            if ARMS[i] == "control":
+                alone, _ = programs.run("photographs", state, views, count=1)
+            else:
+                data = views, depths, settings, sources
+                alone, _ = programs.run("virtual", state, *data, count=1)
+            arm = jax.tree.map(lambda leaf, i=i: leaf[i], together.replace(step=alone.step[None]))
+            assert_same_step(arm.replace(step=alone.step), alone, state)
+            assert int(together.step) == int(alone.step)
+    assert metrics["skipped"] == [0] * len(ARMS)
+    different = [float(jnp.abs(x[0] - x[2]).max()) for x in jax.tree.leaves(together.params)]
+    assert max(different) > 1e-4  # control and labels
+
+
+def test_an_arm_that_diverges_takes_no_other_down(capture_folder, capsys):
+    with jax.numpy_dtype_promotion("standard"):
+        programs, views, arms = begin(TINY_STEPS, capture_folder)
+        broken = (arms[1][0].replace(label_share=jnp.float32(jnp.nan)), *arms[1][1:])
+        both = []
+        for second in (arms[1], broken):
+            states, *data = stack_arms([arms[0], second, arms[2]], len(jax.devices()))
+            both.append(programs.run("arms", states, views, *data, count=2))
+    (healthy, _), (after, metrics) = both
+    assert metrics["skipped"] == [0, 2, 0]
+    assert "skipped, not finite" in capsys.readouterr().out
+    for i in (0, 2):
+        pick = functools.partial(jax.tree.map, lambda leaf, i=i: leaf[i])
+        jax.tree.map(np.testing.assert_array_equal, pick(after.params), pick(healthy.params))
+    first = jax.tree.map(lambda leaf: leaf[1], after.params)
+    jax.tree.map(np.testing.assert_array_equal, first, arms[1][1].params)
+
+
+def sweep_tiny(scene, folder):
+    arms = ["baseline", "control", "diverse", "test_time"]
+    names = {"method": "nerf", "preset": "tiny"}
+    with jax.numpy_dtype_promotion("standard"):
+        return run_sweep(scene, TINY_STEPS, arms, 2, folder, names=names, max_parallel=3)
+
+
+def test_a_sweep_cut_off_and_resumed_ends_the_same(capture_folder, tmp_path, capsys):
+    scene = load_scene(str(capture_folder))
+    whole = sweep_tiny(scene, tmp_path / "sweep")
+    assert list(whole) == ["baseline", "control", "diverse", "test_time"]
+    assert all(list(of_arm) == ["0", "1"] for of_arm in whole.values())
+    psnr = {arm: whole[arm]["0"]["splits"]["test"]["psnr"] for arm in whole}
+    assert len({psnr["baseline"], psnr["control"], psnr["diverse"]}) == 3
+    other = whole["control"]["1"]["splits"]["test"]["psnr"]
+    assert psnr["control"] != other
+
+    for stage in ("arms_1", "test_time_0", "test_time_1"):  # as if stopped after the first arms
+        shutil.rmtree(tmp_path / "sweep" / stage)
+    capsys.readouterr()
+    assert sweep_tiny(scene, tmp_path / "sweep") == whole
+    assert capsys.readouterr().out.count("resumed") == 3  # both baselines and the first arms
+
+    write_sweep(tmp_path, {scene.name: whole}, {"method": "nerf", "preset": "tiny"})
+    table = list(csv.DictReader((tmp_path / "table.csv").read_text().splitlines()))
+    assert [row["arm"] for row in table[:4]] == list(whole)
+    expected = np.mean([psnr["control"], other])
+    assert float(table[1]["psnr"]) == pytest.approx(expected)
+    assert json.loads((tmp_path / "sweep.json").read_text())["scenes"][scene.name] == whole
+    assert "test_time" in (tmp_path / "table.md").read_text()
+    assert "95 %" in (tmp_path / "report.html").read_text()
+
+
+def result(values):
+    views = {str(i): {"psnr": v, "ssim": 0.5} for i, v in enumerate(values)}
+    return {"skipped": 1, "splits": {"test": {"views": views}}}
+
+
+def test_rows_are_means_over_everything_and_gains_are_paired():
+    scenes = {
+        "a": {
+            "control": {"0": result([10.0, 30.0]), "1": result([12.0, 32.0])},
+            "better": {"0": result([11.0, 31.0]), "1": result([13.0, 33.0])},
+        },
+        "b": {
+            "control": {"0": result([20.0, None]), "1": result([20.0, None])},
+            "better": {"0": result([23.0, 5.0]), "1": result([23.0, 5.0])},
+        },
+    }
+    control, better = rows(scenes)
+    assert control.psnr == pytest.approx((10 + 30 + 12 + 32 + 20 + 20) / 6)
+    assert control.spread == pytest.approx(np.std([20, 64 / 3], ddof=1))
+    assert control.gain is None
+    # Views of which control knows nothing do not count: 1, 1 and 3 dB.
+    assert better.gain == pytest.approx(5 / 3)
+    assert better.low == pytest.approx(1)
+    assert better.high == pytest.approx(3)
+    assert better.skipped == 4
+
+
+def test_the_interval_is_that_of_the_mean():
+    noise = np.random.default_rng(1).normal(0.3, 1.0, 400)
+    low, high = paired_bootstrap([np.array([x]) for x in noise])
+    half = 1.96 * noise.std() / np.sqrt(400)
+    assert low == pytest.approx(noise.mean() - half, abs=0.03)
+    assert high == pytest.approx(noise.mean() + half, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("warm", "--arms=warm is not an arm: name baseline"),
+        ("rgb_tolerance=high", "not an arm"),
+        ("sharpness=3", "sharpness takes no such value; settings are .*rgb_tolerance"),
+        ("magnification=3", "magnification is a range"),
+        ("pose=1", "pose takes no such value"),
+    ],
+)
+def test_a_name_that_is_no_arm_is_one_sentence(name, message):
+    with pytest.raises(ValueError, match=message):
+        make_arm(name, pseudo_settings(TINY))
+
+
+def test_names_change_settings():
+    settings = make_arm("rgb_tolerance=0.5+magnification=2:3", pseudo_settings(TINY)).settings
+    assert float(settings.rgb_tolerance) == 0.5
+    np.testing.assert_array_equal(settings.pose.magnification, [2, 3])
+    assert float(settings.label_share) == 0.5
+    assert float(make_arm("control", pseudo_settings(TINY)).settings.label_share) == 0
+
+
+DEVICES = """
+import sys
+sys.path.insert(0, {tests!r})
+import jax
+import test_sweep
+from tiny_runs import write_plane
+import pathlib, tempfile
+assert len(jax.devices()) == 8
+folder = write_plane(pathlib.Path(tempfile.mkdtemp()))
+test_sweep.test_an_arm_is_the_run_alone(test_sweep.TINY_STEPS, folder)
+"""
+
+
+def test_arms_are_spread_over_all_devices():
+    """On eight devices of the host, four arms and four copies of the last give what one gives."""
+    tests = pathlib.Path(__file__).parent
+    environment = os.environ | {
+        "XLA_FLAGS": "--xla_force_host_platform_device_count=8",
+        "PYTHONPATH": f"{tests.parent}",
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", DEVICES.format(tests=str(tests))],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]

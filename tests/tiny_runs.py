@@ -1,0 +1,65 @@
+"""Presets and a capture on which a whole run takes seconds."""
+
+import dataclasses
+import json
+
+import cv2
+import numpy as np
+import plane
+
+from experiments.presets import QUICK, QUICK_SURFELS
+from jaxcloseup.splats import RasterizeConfig
+from jaxcloseup.train import TrainConfig
+from jaxcloseup.volume.nerf import NerfConfig
+
+
+TINY = dataclasses.replace(
+    QUICK,
+    field=NerfConfig(
+        depth=2, width=16, skip_after=0, direction_width=8, num_coarse=8, num_fine=8, chunk=512
+    ),
+    train=TrainConfig(num_rays=64, num_label_rays=64),
+    baseline_steps=30,
+    closeup_steps=3,
+    downscale=1,
+)
+TINY_SURFELS = dataclasses.replace(
+    QUICK_SURFELS,
+    field=dataclasses.replace(
+        QUICK_SURFELS.field,
+        capacity=600,
+        decay_steps=20,
+        density=None,
+        raster=RasterizeConfig(capacity=2**14, tile=8, chunk=4, block=12),
+    ),
+    baseline_steps=20,
+    closeup_steps=2,
+    test_time_steps=2,
+    downscale=1,
+)
+OPENGL = np.diag([1.0, -1, -1])
+
+
+def write_plane(folder):
+    """The plane as photographs in the paper's layout."""
+    splits = {
+        "train": [plane.camera_above(x, 0.1 * x, 4.0, tilt=0.1 * x) for x in (-1, -0.5, 0, 0.5, 1)],
+        "test": [plane.camera_above(0.2, 0.1, 1.5, tilt=0.3)],
+        "test_far": [plane.camera_above(0.3, 0.0, 4.0)],
+    }
+    for split, cameras in splits.items():
+        (folder / split).mkdir()
+        frames = []
+        for i, camera in enumerate(cameras):
+            rgb, _, _ = plane.photograph(camera)
+            name = f"{split}/{i}.png"
+            cv2.imwrite(str(folder / name), np.rint(rgb[..., ::-1] * 255).astype(np.uint8))
+            pose = np.eye(4)
+            pose[:3] = camera.camtoworld
+            pose[:3, :3] = pose[:3, :3] @ OPENGL
+            fx, fy, cx, cy = map(float, camera.intrinsics)
+            intrinsics = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
+            frames.append({"file_path": name, "transform_matrix": pose.tolist()} | intrinsics)
+        text = json.dumps({"near": 1.0, "far": 8.0, "frames": frames})
+        (folder / f"transforms_{split}.json").write_text(text)
+    return folder
