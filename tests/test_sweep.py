@@ -87,7 +87,7 @@ def test_an_arm_is_the_run_alone(preset, capture_folder):
             arm = jax.tree.map(lambda leaf, i=i: leaf[i], together.replace(step=alone.step[None]))
             assert_same_step(arm.replace(step=alone.step), alone, state)
             assert int(together.step) == int(alone.step)
-    assert metrics["skipped"] == [0] * len(ARMS)
+    assert not any(metrics["skipped"])
     different = [float(jnp.abs(x[0] - x[2]).max()) for x in jax.tree.leaves(together.params)]
     assert max(different) > 1e-4  # control and labels
 
