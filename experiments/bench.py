@@ -9,7 +9,7 @@ import importlib
 from absl import app, flags
 
 
-SUITES = ("nerf", "warp", "labels", "splats", "resume")
+SUITES = ("nerf", "warp", "labels", "splats", "sweep", "resume")
 
 _SUITE = flags.DEFINE_list("suite", ["nerf", "warp"], f"suites to run, of {', '.join(SUITES)}")
 
