@@ -120,6 +120,12 @@ def union_warp(
       A `ForwardWarp` with `[...]` in place of `[H, W]`. Nothing is differentiated.
     """
     chex.assert_rank([values, sources.depth], [4, 2])
+    return _union_warp(sources, cameras, values, camera, pixels, jnp.asarray(exclude, jnp.int32))
+
+
+# How much there is to do depends on the data: a batch that is done at once waits for the most.
+@jax.custom_batching.sequential_vmap
+def _union_warp(sources, cameras, values, camera, pixels, exclude):
     sources, cameras, camera = jax.lax.stop_gradient((sources, cameras, camera))
     chosen = jnp.floor(pixels.reshape(-1, 2)).astype(jnp.int32)
     chosen = jnp.clip(chosen, 0, jnp.array([[camera.width - 1, camera.height - 1]]))

@@ -121,6 +121,79 @@ def composite(config, table: jax.Array, lists: TileLists) -> tuple[jax.Array, ja
 
 
 def _composite_forward(config, table, lists):
+    sums, median, trace = _batched_forward(config)(table, lists)
+    return (sums, median), (table, lists, trace)
+
+
+def _composite_backward(config, residuals, cotangents):
+    return _batched_backward(config)(*residuals, cotangents), None
+
+
+@functools.cache
+def _batched_forward(config):
+    """`_forward` that composites a batch of images as one with so many more tiles.
+
+    In loops that are batched as such, all images wait for the slowest at every chunk.
+    """
+    forward = jax.custom_batching.custom_vmap(functools.partial(_forward, config))
+
+    @forward.def_vmap
+    def _(size, batched, table, lists):
+        table, lists = _merge(*_broadcast(size, batched, (table, lists)))
+        return _unmerge(size, forward(table, lists)), (True, True, _Trace(True, True, True))
+
+    return forward
+
+
+@functools.cache
+def _batched_backward(config):
+    """`_backward`, batched like `_batched_forward`."""
+    backward = jax.custom_batching.custom_vmap(functools.partial(_backward, config))
+
+    @backward.def_vmap
+    def _(size, batched, table, lists, trace, cotangents):
+        arguments = _broadcast(size, batched, (table, lists, trace, cotangents))
+        table, lists = _merge(*arguments[:2])
+        more = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), arguments[2:])
+        return _unmerge(size, backward(table, lists, *more)), True
+
+    return backward
+
+
+def _broadcast(size, batched, arguments):
+    return jax.tree.map(
+        lambda leaf, has_axis: leaf if has_axis else jnp.broadcast_to(leaf, (size, *leaf.shape)),
+        arguments,
+        tuple(batched),
+    )
+
+
+def _merge(table, lists):
+    """Tables `[M, N, C]` and lists of M images as the table and the lists of one."""
+    count, capacity, tiles = table.shape[1], lists.splats.shape[1], lists.slot.shape[1]
+    slots = lists.tile[0].size
+
+    def flat(leaf, shift=0):
+        image = jnp.arange(leaf.shape[0], dtype=leaf.dtype)
+        leaf = leaf + shift * image.reshape(-1, *(1,) * (leaf.ndim - 1))
+        return leaf.reshape(-1, *leaf.shape[2:])
+
+    return table.reshape(-1, table.shape[-1]), TileLists(
+        splats=flat(lists.splats, count),
+        starts=flat(lists.starts, capacity),
+        counts=flat(lists.counts),
+        origins=flat(lists.origins),
+        tile=flat(lists.tile, tiles),
+        slot=flat(lists.slot, slots),
+        overflow=lists.overflow.sum(),
+    )
+
+
+def _unmerge(size, tree):
+    return jax.tree.map(lambda leaf: leaf.reshape(size, -1, *leaf.shape[1:]), tree)
+
+
+def _forward(config, table, lists):
     features = table.shape[1] - _PAYLOAD
     x, y = _pixels(config.tile, table.dtype)
 
@@ -174,11 +247,10 @@ def _composite_forward(config, table, lists):
 
     sums, median, trace = lax.map(block, (lists.starts, lists.counts, lists.origins))
     in_order = lambda tiles: tiles.reshape((-1, *tiles.shape[2:]))[lists.slot]  # noqa: E731
-    return (in_order(sums), in_order(median)), (table, lists, trace)
+    return in_order(sums), in_order(median), trace
 
 
-def _composite_backward(config, residuals, cotangents):
-    table, lists, trace = residuals
+def _backward(config, table, lists, trace, cotangents):
     columns = table.shape[1]
     features = columns - _PAYLOAD
     x, y = _pixels(config.tile, table.dtype)
@@ -258,7 +330,7 @@ def _composite_backward(config, residuals, cotangents):
         return lax.while_loop(lambda state: state[0] >= 0, step, state)[-1], None
 
     tiles = (lists.starts, lists.counts, lists.origins, cotangents, trace)
-    return lax.scan(block, jnp.zeros_like(table), tiles)[0], None
+    return lax.scan(block, jnp.zeros_like(table), tiles)[0]
 
 
 def _assemble(rows, middle, *, u, v, w, low_pass, clip, scaled, payload):
