@@ -44,6 +44,32 @@ def blur_to_footprint(image: np.ndarray, footprint: np.ndarray) -> np.ndarray:
     return (1 - share) * stack[low, rows, columns] + share * stack[low + 1, rows, columns]
 
 
+def resolved_by_photographs(
+    scene: Scene, camera: Camera, exact_depths: jax.Array
+) -> tuple[np.ndarray, np.ndarray]:
+    """The true image of a camera as the training photograph nearest to each point resolves it.
+
+    What labels could be at best, with exact depth and every photograph at hand.
+
+    Args:
+      scene: with `surface`.
+      camera: of the image.
+      exact_depths: `[V, H, W]` of the training views.
+
+    Returns:
+      `[H, W, 3]` the blurred truth, and `[H, W]` whether any photograph sees the point.
+    """
+    truth = jax.jit(scene.surface)(camera)
+    pixels = pixel_grid(camera.height, camera.width)
+    finest = np.full(pixels.shape[:2], np.inf)
+    for index, depth in enumerate(exact_depths):
+        source = camera_at(scene.train.cameras, index)
+        visible, footprint = _seen_by(camera, pixels, truth.depth, source, depth)
+        finest = np.where(visible, np.minimum(finest, footprint), finest)
+    seen = np.isfinite(finest)
+    return blur_to_footprint(np.asarray(truth.rgb), np.where(seen, finest, 1)), seen
+
+
 def audit_labels(
     key: jax.Array,
     exact_depths: jax.Array,

@@ -20,6 +20,7 @@ from absl import app, flags
 
 import jaxcloseup
 from experiments import command_line
+from experiments.audit import resolved_by_photographs
 from experiments.evaluation import Target, evaluate, exact_depths, make_targets
 from experiments.loop import Programs, TrainingError, run_stage
 from experiments.pipeline import config, rendered_depths, versions
@@ -27,11 +28,10 @@ from experiments.presets import Preset, initial_points, pseudo_settings
 from experiments.sweep_report import print_sweep, write_sweep
 from jaxcloseup.artifacts.checkpoints import CheckpointError, Checkpoints
 from jaxcloseup.batch import Views
-from jaxcloseup.geometry.cameras import Camera, pixel_grid
+from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.geometry.union_warp import SourceBlocks, block_sources
 from jaxcloseup.pseudo import (
     PseudoSettings,
-    count_seen,
     label_views,
     sample_virtual_camera,
 )
@@ -55,7 +55,7 @@ NAMED_ARMS: dict[str, dict[str, float]] = {
     "mask": {"fixed_anchors": 1.0},
     "diverse": {},
 }
-ARMS_IN_TURN = ("oracle", "test_time")  # labelled once, before their first step
+ARMS_IN_TURN = ("oracle", "resolved", "test_time")  # labelled once, before their first step
 ORACLE_VIEWS = 64
 
 FLAGS = flags.FLAGS
@@ -65,8 +65,8 @@ flags.DEFINE_list(
     "arms",
     ["baseline", *NAMED_ARMS, *ARMS_IN_TURN],
     "arms: baseline, control, labels (no mask, four anchors), mask, diverse (the preset), oracle "
-    "(true pixels of close-ups), test_time, and the preset with other settings, as in "
-    "rgb_tolerance=0.02+label_share=0.5 or magnification=2:4",
+    "(true pixels of close-ups), resolved (these, as sharp as the photographs are), test_time, and "
+    "the preset with other settings, as in rgb_tolerance=0.02+label_share=0.5 or magnification=2:4",
 )
 flags.DEFINE_integer(
     "max_parallel", 8, "arms and seeds trained at once, which bounds memory", lower_bound=1
@@ -151,7 +151,8 @@ def run_sweep(
     """
     chosen = [make_arm(name, pseudo_settings(preset)) for name in arms]
     if scene.surface is None:
-        chosen = [arm for arm in chosen if arm.name != "oracle"]  # nobody knows the true pixels
+        # Nobody knows the true pixels.
+        chosen = [arm for arm in chosen if arm.name not in ("oracle", "resolved")]
     programs = Programs(preset, scene)
     identity = {"scene": scene.name, "config": config(preset), "arms": list(arms), "seeds": seeds}
     identity |= {"max_parallel": max_parallel, "version": jaxcloseup.__version__, **names}
@@ -196,9 +197,10 @@ def run_sweep(
             score(arm.name, seed, state.replace(step=states.step), skipped)
     for arm, seed in in_turn:
         start = starts[seed]
-        if arm.name == "oracle":
-            labels = true_close_ups(jax.random.key(seed), scene, start.depths, arm.settings)
-            steps = preset.closeup_steps
+        steps = preset.closeup_steps
+        if arm.name != "test_time":
+            key, blurred = jax.random.key(seed), arm.name == "resolved"
+            labels = true_close_ups(key, scene, start.depths, arm.settings, blurred=blurred)
         else:
             labels = _label_targets(scene, programs, start, arm.settings)
             whole = isinstance(preset.field, SurfelConfig)
@@ -237,23 +239,21 @@ def _train_together(stage, name, programs, views, group, starts):
 
 
 def true_close_ups(
-    key: jax.Array, scene: Scene, depths: jax.Array, settings: PseudoSettings
+    key: jax.Array, scene: Scene, depths: jax.Array, settings: PseudoSettings, *, blurred: bool
 ) -> Views:
     """Random virtual close-ups with their true pixels, where a training view sees the surface.
 
-    The ceiling of what labels can do: no photograph holds so much detail.
+    The ceiling of what labels can do: no photograph holds so much detail, unless `blurred` leaves
+    of it what the nearest one resolves.
     """
     exact = exact_depths(scene, scene.train.cameras)
-
-    @jax.jit
-    def one(key):
-        camera, _ = sample_virtual_camera(key, scene.train, depths, settings)
-        truth = scene.surface(camera)
-        pixels = pixel_grid(camera.height, camera.width)
-        seen = count_seen(camera, pixels, truth.depth, scene.train, exact)
-        return Views(camera, truth.rgb, (seen > 0).astype(jnp.float32))
-
-    images = [one(k) for k in jax.random.split(key, ORACLE_VIEWS)]
+    sample, surface = jax.jit(sample_virtual_camera), jax.jit(scene.surface)
+    images = []
+    for one in jax.random.split(key, ORACLE_VIEWS):
+        camera, _ = sample(one, scene.train, depths, settings)
+        resolved, seen = resolved_by_photographs(scene, camera, exact)
+        rgb = resolved if blurred else surface(camera).rgb
+        images.append(Views(camera, jnp.asarray(rgb, jnp.float32), jnp.asarray(seen, jnp.float32)))
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *images)
 
 

@@ -1,8 +1,10 @@
-"""How right pseudo-labels are when depth is exact, on the built-in scenes.
+"""How right pseudo-labels are when depth is exact, on the built-in scenes, and their ceiling.
 
 Random virtual close-ups, magnified 2 to 8 times; error is the mean absolute difference of kept
 labels from the true close-up blurred to the source photograph's pixels, kept is the share of the
-pixels that the source sees. What training leaves of these figures is in each run's results.json.
+pixels that the source sees. The ceiling is the PSNR, on the close-ups that runs are scored on, of
+the truth as sharp as the nearest photograph shows it. What training leaves of these figures is in
+each run's results.json.
 """
 
 import dataclasses
@@ -10,12 +12,14 @@ import pathlib
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from experiments.audit import audit_labels
+from experiments.audit import audit_labels, resolved_by_photographs
 from experiments.evaluation import exact_depths
 from experiments.pictures import label_pictures
 from experiments.presets import PRESETS, pseudo_settings
-from jaxcloseup.scenes import load_scene
+from jaxcloseup.batch import camera_at, to_float
+from jaxcloseup.scenes import Scene, load_scene
 from jaxcloseup.scenes.procedural import PROCEDURAL_SCENES
 
 
@@ -53,6 +57,7 @@ def run() -> None:
                 f"  {found['leaked']:>6.1%}",
                 flush=True,
             )
+        print(f"{name:>8}  ceiling on close-ups: {_ceiling(scene, exact):.2f} dB", flush=True)
         label_pictures(
             jax.random.key(1),
             [],
@@ -63,3 +68,14 @@ def run() -> None:
             render_depth=render_depth,
         )
     print(f"pictures: {PICTURES}")
+
+
+def _ceiling(scene: Scene, exact: jax.Array) -> float:
+    """Mean PSNR of the test close-ups as photographs resolve them, where any sees the surface."""
+    views = scene.test
+    psnr = []
+    for i in range(len(views)):
+        best, seen = resolved_by_photographs(scene, camera_at(views.cameras, i), exact)
+        squared = ((best - to_float(views.rgb[i])) ** 2).mean(axis=-1)
+        psnr.append(-10 * np.log10(squared[seen].mean()))
+    return float(np.mean(psnr))
