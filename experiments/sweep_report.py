@@ -3,6 +3,7 @@
 import csv
 import html
 import io
+import itertools
 import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -111,12 +112,13 @@ def rows(scenes: Mapping[str, Mapping[str, Any]]) -> list[Row]:
 
 
 def print_sweep(scenes: Mapping[str, Mapping[str, Any]]) -> None:
-    """Print the table."""
+    """Print a table for each kind of views."""
     header, *body = _cells(rows(scenes))
-    table = Table(*header)
-    for line in body:
-        table.add_row(*line)
-    Console().print(table)
+    for title, lines in itertools.groupby(body, key=lambda line: line[0]):
+        table = Table(*header[1:], title=title)
+        for line in lines:
+            table.add_row(*line[1:])
+        Console().print(table)
 
 
 def write_sweep(folder: pathlib.Path, scenes: Mapping[str, Any], about: Mapping[str, Any]) -> None:
