@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 import optax
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from experiments.presets import Preset, make_field, make_optimizer, make_train_config
 from jaxcloseup.artifacts.checkpoints import Checkpoints
@@ -73,10 +73,17 @@ class Programs:
         shared, split = PartitionSpec(), PartitionSpec("arms")
         states = TrainState(step=shared, params=split, buffers=split, opt_state=split, key=split)
 
+        mesh = Mesh(np.array(jax.devices()), ("arms",))
+        self._on_devices = jax.tree.map(
+            lambda spec: NamedSharding(mesh, spec),
+            (states, shared, split),
+            is_leaf=lambda leaf: isinstance(leaf, PartitionSpec),
+        )
+
         def run_arms(states_now: TrainState, *data: Any, count: jax.Array | int) -> Any:
             return jax.shard_map(
                 lambda *args: run_steps(arms_step, *args[:-1], count=args[-1]),
-                mesh=Mesh(np.array(jax.devices()), ("arms",)),
+                mesh=mesh,
                 in_specs=(states, shared, split, split, split, shared),
                 out_specs=(states, split),
                 check_vma=False,
@@ -107,11 +114,19 @@ class Programs:
         `data` is what `train_step`, `pseudo_step` (with its sources) and `labelled_step` take.
         "arms" are those of a sweep, one on each device or several: all of the state but its step,
         and all data but the views, have a leading axis of arms. Metrics are then means over arms,
-        but for `skipped`, the list of how many steps each one skipped.
+        but for `skipped`, how many steps were skipped, a list of all arms' numbers.
 
         Raises:
           TrainingError: no step had a finite loss and gradient.
         """
+        if kind == "arms":
+            # What comes out of a checkpoint lies on one device.
+            views, *of_arms = data
+            state = jax.device_put(state, self._on_devices[0])
+            data = (
+                jax.device_put(views, self._on_devices[1]),
+                *jax.device_put(of_arms, self._on_devices[2]),
+            )
         while True:
             after, metrics = self._runners[kind](state, *data, count=count)
             metrics = jax.device_get(metrics)
@@ -125,11 +140,12 @@ class Programs:
                         "learning rate, or look for broken photographs or poses"
                     )
                 if skipped.any():
-                    print(f"warning: {skipped.sum()} of {count} steps skipped, not finite")
+                    whose = f", by arm: {skipped.tolist()}" if kind == "arms" else ""
+                    print(f"warning: {skipped.max()} of {count} steps skipped, not finite{whose}")
                 # The PSNR of no label at all is infinite.
                 values = {key: float(np.mean(v)) for key, v in metrics.items()}
                 values = {key: v for key, v in values.items() if math.isfinite(v)}
-                return after, values | ({"skipped": skipped.tolist()} if kind == "arms" else {})
+                return after, values | {"skipped": skipped.tolist()}
             self._grow()
 
     def render(self, state: TrainState, camera: Camera, key: jax.Array | None = None) -> Rendering:

@@ -145,6 +145,7 @@ QUICK_SURFELS = dataclasses.replace(
 )
 
 # Instead of Monte Carlo moves; what it needs beside it is in `with_classic_density`.
+# The quick training is too short for a reset of opacities.
 CLASSIC_DENSITY = {
     "quick": AdaptiveDensityConfig(start=200, stop=1200),
     "paper": AdaptiveDensityConfig(),

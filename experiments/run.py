@@ -55,7 +55,7 @@ def main(argv: list[str]) -> None:
             to_run=FLAGS.stages,
             save_every=FLAGS.save_every,
         )
-    except (TrainingError, CheckpointError) as error:
+    except (TrainingError, CheckpointError, OSError) as error:
         sys.exit(f"experiments.run: {error}")
     print_table(results)
     print(f"report: {output_dir / 'report.html'}")

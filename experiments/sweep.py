@@ -46,13 +46,15 @@ class _Start(NamedTuple):
     state: TrainState
     depths: jax.Array
     sources: SourceBlocks
+    skipped: int
 
 
 # The paper's Table 1, its two test-time rows, and what they are to be held against.
-NAMED_ARMS: dict[str, dict[str, float]] = {
+_FIXED_POSES = {"fixed_anchors": 1.0, "magnification": [4.0, 4.0], "max_angle": 0.0}
+NAMED_ARMS: dict[str, dict[str, Any]] = {
     "control": {"label_share": 0.0},
-    "labels": {"use_mask": 0.0, "fixed_anchors": 1.0},
-    "mask": {"fixed_anchors": 1.0},
+    "labels": {"use_mask": 0.0, **_FIXED_POSES},
+    "mask": _FIXED_POSES,
     "diverse": {},
 }
 ARMS_IN_TURN = ("oracle", "resolved", "test_time")  # labelled once, before their first step
@@ -64,7 +66,7 @@ flags.DEFINE_integer("seeds", 3, "random seeds 0, 1, ...", lower_bound=1)
 flags.DEFINE_list(
     "arms",
     ["baseline", *NAMED_ARMS, *ARMS_IN_TURN],
-    "arms: baseline, control, labels (no mask, four anchors), mask, diverse (the preset), oracle "
+    "arms: baseline, control, labels (no mask, four poses), mask, diverse (the preset's), oracle "
     "(true pixels of close-ups), resolved (these, as sharp as the photographs are), test_time, and "
     "the preset with other settings, as in rgb_tolerance=0.02+label_share=0.5 or magnification=2:4",
 )
@@ -115,13 +117,14 @@ def _parse(name):
 
 
 def _change(settings, arm, field, value):
-    holder = settings if hasattr(settings, field) else settings.pose
-    old = getattr(holder, field, None)
-    if field == "pose" or old is None or jnp.shape(old) != np.shape(value):
-        known = [*vars(settings), *vars(settings.pose)]
+    holder = settings if field in vars(settings) else settings.pose
+    old = vars(holder).get(field)
+    known = field != "pose" and old is not None and jnp.shape(old) == np.shape(value)
+    if not known or not np.all(np.diff(np.atleast_1d(value)) >= 0) or np.any(np.isnan(value)):
+        fields = {*vars(settings), *vars(settings.pose)} - {"pose"}
         raise ValueError(
             f"--arms={arm}: {field} takes no such value; settings are "
-            + ", ".join(sorted(set(known) - {"pose"}))
+            + ", ".join(sorted(fields))
             + ", of which magnification is a range as in 2:8"
         )
     changed = holder.replace(**{field: jnp.asarray(value, old.dtype)})
@@ -150,15 +153,19 @@ def run_sweep(
       max_parallel: arms and seeds trained at once.
     """
     chosen = [make_arm(name, pseudo_settings(preset)) for name in arms]
-    if scene.surface is None:
-        # Nobody knows the true pixels.
-        chosen = [arm for arm in chosen if arm.name not in ("oracle", "resolved")]
+    for name, reason in _impossible(scene).items():
+        if name in arms:
+            print(f"no {name} of {scene.name}: {reason}")
+    chosen = [arm for arm in chosen if arm.name not in _impossible(scene)]
     programs = Programs(preset, scene)
-    identity = {"scene": scene.name, "config": config(preset), "arms": list(arms), "seeds": seeds}
-    identity |= {"max_parallel": max_parallel, "version": jaxcloseup.__version__, **names}
+    views = jax.device_put(scene.train)
+    identity = {"scene": scene.name, "config": config(preset), "seeds": seeds, **names}
+    identity |= {"arms": {arm.name: str(jax.device_get(arm.settings)) for arm in chosen}}
+    identity |= {"resolution": [views.cameras.width, views.cameras.height]}
+    identity |= {"max_parallel": max_parallel, "devices": len(jax.devices())}
+    identity |= {"version": jaxcloseup.__version__}
     checkpoints = Checkpoints(folder, identity)
     stage = functools.partial(run_stage, checkpoints=checkpoints, save_every=1000)
-    views = jax.device_put(scene.train)
 
     starts = []
     for seed in range(seeds):
@@ -166,10 +173,11 @@ def run_sweep(
         points = initial_points(jax.random.fold_in(key_init, 2), scene)
         state = init_state(key_init, *points, field=programs.field, optimizer=programs.optimizer)
         steps = preset.baseline_steps
-        state, _ = stage(f"baseline_{seed}", programs, "photographs", state, views, steps=steps)
+        name = f"baseline_{seed}"
+        state, history = stage(name, programs, "photographs", state, views, steps=steps)
         depths = _depths(programs, state, views.cameras)
         sources = jax.jit(block_sources)(views.cameras, depths, views.weight)
-        starts.append(_Start(state, depths, sources))
+        starts.append(_Start(state, depths, sources, _skipped(history)))
     targets = _make_targets(scene, programs, starts[0])
 
     together = [(arm, seed) for arm in chosen for seed in range(seeds)]
@@ -186,7 +194,7 @@ def run_sweep(
 
     for seed, start in enumerate(starts):
         if "baseline" in results:
-            score("baseline", seed, start.state, 0)
+            score("baseline", seed, start.state, start.skipped)
     for first in range(0, len(together), max_parallel):
         group = together[first : first + max_parallel]
         name = f"arms_{first // max_parallel}"
@@ -207,9 +215,27 @@ def run_sweep(
             steps = preset.test_time_steps * (len(scene.test) if whole else 1)
         name = f"{arm.name}_{seed}"
         data = views, labels, arm.settings
-        state, _ = stage(name, programs, "targets", start.state, *data, steps=steps)
-        score(arm.name, seed, state, 0)
+        try:
+            state, history = stage(name, programs, "targets", start.state, *data, steps=steps)
+        except TrainingError as error:
+            print(f"{name} is left out: {error}")
+            continue
+        score(arm.name, seed, state, _skipped(history))
     return results
+
+
+def _impossible(scene: Scene) -> dict[str, str]:
+    """Arms that this scene cannot have, and why."""
+    reasons = {}
+    if scene.surface is None:
+        reasons |= dict.fromkeys(("oracle", "resolved"), "nobody knows the true pixels")
+    if scene.test is None:
+        reasons["test_time"] = "it has no close-ups to label"
+    return reasons
+
+
+def _skipped(history: Sequence[Mapping[str, Any]]) -> int:
+    return sum(chunk["skipped"] for chunk in history)
 
 
 def stack_arms(
@@ -258,14 +284,7 @@ def true_close_ups(
 
 
 def _depths(programs: Programs, state: TrainState, cameras: Camera) -> jax.Array:
-    train = programs.preset.train
-    return rendered_depths(
-        functools.partial(programs.render, state),
-        cameras,
-        programs.scene,
-        key=jax.random.key(0) if train.perturbed_depth else None,
-        divided=not train.undivided_depth,
-    )
+    return rendered_depths(functools.partial(programs.render, state), cameras, programs.scene)
 
 
 def _label_targets(scene, programs, start, settings):
@@ -285,6 +304,22 @@ def _make_targets(scene, programs, start) -> dict[str, list[Target]]:
     }
 
 
+def _check_flags(preset: Preset) -> None:
+    for flag in ("scenes", "arms"):
+        values = getattr(FLAGS, flag)
+        if not values or len(set(values)) < len(values):
+            raise ValueError(f"--{flag}={','.join(values)} must name one or more, each once")
+    for arm in FLAGS.arms:
+        changes = make_arm(arm, pseudo_settings(preset)).settings
+        if preset.train.pooled_loss and 0 < float(changes.label_share) != preset.label_share:
+            raise ValueError(
+                f"--arms={arm}: this preset pools the losses of photographs and labels, which have "
+                "no shares then; only label_share=0 makes a difference"
+            )
+    if "control" not in FLAGS.arms:
+        print("warning: without the arm control there are no gains in the tables")
+
+
 def main(argv: list[str]) -> None:
     """Run the sweep of the flags on every scene."""
     if len(argv) > 1:
@@ -293,15 +328,18 @@ def main(argv: list[str]) -> None:
     names = {"method": FLAGS.method, "preset": FLAGS.preset}
     try:
         preset = command_line.preset_from_flags()
-        for arm in FLAGS.arms:
-            make_arm(arm, pseudo_settings(preset))
+        _check_flags(preset)
+        output_dir = command_line.choose_output_dir(
+            FLAGS.output_dir, "sweep", FLAGS.method, resume=FLAGS.resume
+        )
         captures = [
             load_scene(name, downscale=preset.downscale, half_pixel=FLAGS.half_pixel)
             for name in FLAGS.scenes
         ]
-        output_dir = command_line.choose_output_dir(
-            FLAGS.output_dir, "sweep", FLAGS.method, resume=FLAGS.resume
-        )
+        if len({scene.name for scene in captures}) < len(captures):
+            raise ValueError(
+                f"--scenes={','.join(FLAGS.scenes)} has two of one name: sweep them one at a time"
+            )
         output_dir.mkdir(parents=True, exist_ok=True)
     except (SceneError, OSError, ValueError) as error:
         sys.exit(f"experiments.sweep: {error}")
@@ -319,7 +357,7 @@ def main(argv: list[str]) -> None:
                 max_parallel=FLAGS.max_parallel,
             )
             write_sweep(output_dir, found, about)
-    except (TrainingError, CheckpointError) as error:
+    except (TrainingError, CheckpointError, OSError) as error:
         sys.exit(f"experiments.sweep: {error}")
     print_sweep(found)
     print(f"report: {output_dir / 'report.html'}")

@@ -1,4 +1,8 @@
-"""Tables of a sweep: means over seeds and scenes, and how sure a difference from control is."""
+"""Tables of a sweep: means over seeds and scenes, and intervals of differences from control.
+
+An interval says how the mean difference of these trained models varies with the views that happen
+to be looked at; how it varies with the seed is for the standard deviation.
+"""
 
 import csv
 import html
@@ -140,8 +144,10 @@ def write_sweep(folder: pathlib.Path, scenes: Mapping[str, Any], about: Mapping[
         "<meta name=viewport content='width=device-width'>",
         f"<title>{html.escape(title)}</title><style>{STYLE}</style><h1>{html.escape(title)}</h1>",
         "<p>Means over scenes, seeds and views, and the standard deviation over seeds. The gain is "
-        "the difference from <i>control</i>, as many further steps without labels, on the same "
-        "views, with its 95 % interval over views drawn again.</p><div class=wide><table><tr>",
+        "the difference from <i>control</i>, further steps without labels, on the same views, with "
+        "its 95 % interval over views drawn again. All take as many steps, but for "
+        "<i>baseline</i>, which takes none, and <i>test_time</i>, which has its own number.</p>",
+        "<div class=wide><table><tr>",
         *(f"<th>{html.escape(cell)}" for cell in header),
         *("<tr>" + "".join(f"<td>{html.escape(cell)}" for cell in line) for line in body),
         "</table></div></html>",

@@ -31,7 +31,8 @@ class PseudoSettings:
       fixed_anchors: `[]` 1 draws only the four fixed anchors of the paper's ablation.
       forward_label: `[]` 1 takes the colour from the forward warps (released), 0 the backward one.
       leave_out_source: `[]` 1 keeps the source view out of the union that checks its label.
-      label_share: `[]` share of the labels' loss in a step's, 1/2 in the paper; 0: no labels.
+      label_share: `[]` share of the labels' loss in a step's, 1/2 in the paper; 0: no labels. Where
+        both losses are pooled, any other share is as good.
     """
 
     pose: PoseSettings

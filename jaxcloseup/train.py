@@ -177,7 +177,8 @@ def pseudo_step(
             coverage = jnp.mean(label.weight)
             virtual = Batch(camera, pixels, label.rgb, label.weight)
             if config.pooled_loss:
-                pooled = _pool(batch, virtual)
+                some = (settings.label_share > 0).astype(label.weight.dtype)
+                pooled = _pool(batch, virtual._replace(weight=some * label.weight))
                 value, metrics = loss_of(params, state.buffers, pooled, key_render)
                 return value, metrics | {"label_coverage": coverage}
             virtual_loss, virtual_metrics = loss_of(

@@ -14,8 +14,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from absl import flags
+from absl.testing import flagsaver
 from tiny_runs import TINY, TINY_SURFELS
 
+from experiments import sweep
 from experiments.loop import Programs
 from experiments.pipeline import rendered_depths
 from experiments.presets import initial_points, pseudo_settings
@@ -89,7 +92,9 @@ def test_an_arm_is_the_run_alone(preset, capture_folder):
             assert int(together.step) == int(alone.step)
     assert not any(metrics["skipped"])
     different = [float(jnp.abs(x[0] - x[2]).max()) for x in jax.tree.leaves(together.params)]
-    assert max(different) > 1e-4  # control and labels
+    assert max(different) > 1e-4  # control and diverse
+    for leaf in jax.tree.leaves(together.params):
+        assert len({shard.device for shard in leaf.addressable_shards}) == len(jax.devices())
 
 
 def test_an_arm_that_diverges_takes_no_other_down(capture_folder, capsys):
@@ -186,11 +191,41 @@ def test_the_interval_is_that_of_the_mean():
         ("sharpness=3", "sharpness takes no such value; settings are .*rgb_tolerance"),
         ("magnification=3", "magnification is a range"),
         ("pose=1", "pose takes no such value"),
+        ("replace=1", "replace takes no such value"),
+        ("rgb_tolerance=nan", "rgb_tolerance takes no such value"),
+        ("magnification=8:2", "magnification is a range"),
     ],
 )
 def test_a_name_that_is_no_arm_is_one_sentence(name, message):
     with pytest.raises(ValueError, match=message):
         make_arm(name, pseudo_settings(TINY))
+
+
+@pytest.fixture
+def parsed_flags():
+    flags.FLAGS(["sweep"])
+    with flagsaver.flagsaver(compilation_cache=""):
+        yield
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"arms": ["control", "control"]}, "--arms=control,control must name one or more"),
+        ({"scenes": []}, "--scenes= must name one or more"),
+        ({"arms": ["warm"]}, "--arms=warm is not an arm"),
+        ({"method": "nerf", "arms": ["label_share=0.3"]}, "this preset pools the losses"),
+        ({"scenes": ["nowhere"]}, "nowhere"),
+    ],
+)
+def test_flags_that_make_no_sense_are_one_sentence(parsed_flags, tmp_path, changes, message):
+    out = str(tmp_path / "out")
+    with (
+        flagsaver.flagsaver(output_dir=out, **changes),
+        pytest.raises(SystemExit, match=message),
+    ):
+        sweep.main(["sweep"])
+    assert not (tmp_path / "out").exists()
 
 
 def test_names_change_settings():
@@ -218,6 +253,7 @@ def test_arms_are_spread_over_all_devices():
     """On eight devices of the host, four arms and four copies of the last give what one gives."""
     tests = pathlib.Path(__file__).parent
     environment = os.environ | {
+        "JAX_PLATFORMS": "cpu",
         "XLA_FLAGS": "--xla_force_host_platform_device_count=8",
         "PYTHONPATH": f"{tests.parent}",
     }

@@ -159,6 +159,17 @@ def test_the_control_sees_the_same_photographs(capture):
     np.testing.assert_allclose(unlabelled.params - state.params, half_way, atol=1e-6)
 
 
+@pytest.mark.parametrize("pooled", [False, True])
+def test_a_share_of_nothing_is_the_control(capture, pooled):
+    views, depths = capture
+    state = fresh_state()
+    step = bind(pseudo_step, num_rays=64, num_label_rays=256, pooled_loss=pooled)
+    arm, metrics = step(state, views, depths, settings(label_share=0.0, use_mask=0.0))
+    assert metrics["label_coverage"] > 0
+    control, _ = bind(train_step, num_rays=64)(state, views)
+    np.testing.assert_allclose(arm.params, control.params, atol=1e-6)
+
+
 @pytest.mark.parametrize("count", [64, None])
 @pytest.mark.parametrize("share", [0.0, 0.25])
 def test_labelled_views_count_with_their_share(capture, count, share):

@@ -3,7 +3,8 @@
 Surfels whose images are pulled about hard are too few there: small ones are cloned, large ones
 split in two. Faint and huge ones are removed, and all opacities lowered now and then, so that what
 is not needed fades. What is added goes where there is room; when there is none, the surfels pulled
-hardest come first.
+hardest come first. Unlike in the published code, the pull has the low-pass filter's share and that
+of colours that depend on the direction, and views in which it is 0 do not count.
 """
 
 import dataclasses
@@ -32,7 +33,7 @@ class AdaptiveDensityConfig:
       small: scale up to which a surfel is cloned; a larger one is split.
       shrink: a split surfel's scales over its halves'.
       min_opacity: fainter surfels are removed.
-      huge: larger surfels are removed, from the first reset on.
+      huge: larger surfels are removed, unless they are split, from the first reset on.
       reset_every: steps between resets of the opacities.
       reset_opacity: what a reset leaves at most.
     """
@@ -132,10 +133,9 @@ def refine(
     count = alive.shape[0]
     scale = jnp.max(jnp.exp(surfels.log_scales), axis=-1) / extent
     mean_pull = pull.total / jnp.maximum(pull.views, 1)
-    keep = alive & (jax.nn.sigmoid(surfels.opacity_logits) >= config.min_opacity)
-    keep &= ~(remove_huge & (scale > config.huge))
-
-    wanted = keep & (mean_pull >= config.gradient)
+    opaque = alive & (jax.nn.sigmoid(surfels.opacity_logits) >= config.min_opacity)
+    wanted = opaque & (mean_pull >= config.gradient)
+    keep = opaque & (wanted | ~(remove_huge & (scale > config.huge)))
     hardest = jnp.argsort(jnp.where(wanted, -mean_pull, 1), stable=True)
     room = jnp.argsort(keep, stable=True)
     number = jnp.minimum(jnp.sum(wanted), jnp.sum(~keep))

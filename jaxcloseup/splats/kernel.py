@@ -88,7 +88,8 @@ def _gather(table, lists: TileLists, tiles, position, chunk):
     starts, counts, origins = tiles
     place = position + jnp.arange(chunk, dtype=jnp.int32)[:, None]
     inside = place < counts[None]
-    index = lists.splats[jnp.where(inside, starts[None] + place, 0)]
+    # Past a list's end anything of the same image will do: it is given the opacity 0.
+    index = lists.splats[starts[None] + jnp.where(inside, place, 0)]
     rows = table[index]
     anchor = rows[..., :_ROWS] - origins[None].astype(table.dtype)
     opacity = jnp.where(inside, rows[..., _OPACITY], 0)[..., None]
