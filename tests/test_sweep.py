@@ -122,8 +122,10 @@ def sweep_tiny(scene, folder):
         return run_sweep(scene, TINY_STEPS, arms, 2, folder, names=names, max_parallel=3)
 
 
-def test_a_sweep_cut_off_and_resumed_ends_the_same(capture_folder, tmp_path, capsys):
+def test_a_sweep_cut_off_and_resumed_ends_the_same(capture_folder, tmp_path, monkeypatch, capsys):
     scene = load_scene(str(capture_folder))
+    programs = Programs(TINY_STEPS, scene)  # compiled once for both
+    monkeypatch.setattr(sweep, "Programs", lambda preset, scene: programs)
     whole = sweep_tiny(scene, tmp_path / "sweep")
     assert list(whole) == ["baseline", "control", "diverse", "test_time"]
     assert all(list(of_arm) == ["0", "1"] for of_arm in whole.values())
