@@ -80,6 +80,21 @@ def make_targets(
     return targets
 
 
+def targets_by_split(
+    scene: Scene,
+    train_depths: jax.Array,
+    exact: jax.Array | None,
+    render: Callable[[Camera], Rendering],
+) -> dict[str, list[Target]]:
+    """`make_targets` of all splits but the training one; with `exact` depths where there are."""
+    seen_from = train_depths if exact is None else exact
+    return {
+        split: make_targets(scene, split, seen_from, render)
+        for split in scene.names
+        if split != "train"
+    }
+
+
 def score(rendering: Rendering, target: Target) -> dict[str, float | str | None]:
     """Metrics of one view, on 8-bit colours; what cannot be computed is None beside its reason."""
     rows, columns = _frame(np.asarray(target.weight))

@@ -15,7 +15,7 @@ import numpy as np
 
 import jaxcloseup
 from experiments.audit import audit_labels
-from experiments.evaluation import evaluate, exact_depths, make_targets
+from experiments.evaluation import evaluate, exact_depths, targets_by_split
 from experiments.gate import choose_settings, print_gate
 from experiments.loop import Programs, run_stage
 from experiments.pictures import comparisons, label_pictures, write_renders
@@ -71,7 +71,7 @@ def run(
     checkpoints = Checkpoints(output_dir / "checkpoints", identity)
     settings = pseudo_settings(preset)
     seconds: dict[str, float] = {}
-    history, stages, renderings, targets = {}, {}, {}, {}
+    history, stages, renderings = {}, {}, {}
 
     def train(stage, kind, state, *data, steps):
         with timed(seconds, stage):
@@ -114,10 +114,7 @@ def run(
         )
         sources = jax.jit(block_sources)(views.cameras, depths, views.weight)
         exact = exact_depths(scene, views.cameras) if scene.surface else None
-        for split in scene.names:
-            if split != "train":
-                seen_from = depths if exact is None else exact
-                targets[split] = make_targets(scene, split, seen_from, render)
+        targets = targets_by_split(scene, depths, exact, render)
     score("baseline", baseline)
     gate = None
     if preset.gated:

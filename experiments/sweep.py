@@ -21,7 +21,7 @@ from absl import app, flags
 import jaxcloseup
 from experiments import command_line
 from experiments.audit import resolved_by_photographs
-from experiments.evaluation import Target, evaluate, exact_depths, make_targets
+from experiments.evaluation import evaluate, exact_depths, targets_by_split
 from experiments.loop import Programs, TrainingError, run_stage
 from experiments.pipeline import config, rendered_depths, versions
 from experiments.presets import Preset, initial_points, pseudo_settings
@@ -178,7 +178,9 @@ def run_sweep(
         depths = _depths(programs, state, views.cameras)
         sources = jax.jit(block_sources)(views.cameras, depths, views.weight)
         starts.append(_Start(state, depths, sources, _skipped(history)))
-    targets = _make_targets(scene, programs, starts[0])
+    exact = exact_depths(scene, views.cameras) if scene.surface else None
+    render = functools.partial(programs.render, starts[0].state)
+    targets = targets_by_split(scene, starts[0].depths, exact, render)
 
     together = [(arm, seed) for arm in chosen for seed in range(seeds)]
     in_turn = [(arm, seed) for arm, seed in together if arm.in_turn]
@@ -208,7 +210,8 @@ def run_sweep(
         steps = preset.closeup_steps
         if arm.name != "test_time":
             key, blurred = jax.random.key(seed), arm.name == "resolved"
-            labels = true_close_ups(key, scene, start.depths, arm.settings, blurred=blurred)
+            data = scene, start.depths, exact, arm.settings
+            labels = true_close_ups(key, *data, blurred=blurred)
         else:
             labels = _label_targets(scene, programs, start, arm.settings)
             whole = isinstance(preset.field, SurfelConfig)
@@ -265,14 +268,19 @@ def _train_together(stage, name, programs, views, group, starts):
 
 
 def true_close_ups(
-    key: jax.Array, scene: Scene, depths: jax.Array, settings: PseudoSettings, *, blurred: bool
+    key: jax.Array,
+    scene: Scene,
+    depths: jax.Array,
+    exact: jax.Array,
+    settings: PseudoSettings,
+    *,
+    blurred: bool,
 ) -> Views:
     """Random virtual close-ups with their true pixels, where a training view sees the surface.
 
     The ceiling of what labels can do: no photograph holds so much detail, unless `blurred` leaves
     of it what the nearest one resolves.
     """
-    exact = exact_depths(scene, scene.train.cameras)
     sample, surface = jax.jit(sample_virtual_camera), jax.jit(scene.surface)
     images = []
     for one in jax.random.split(key, ORACLE_VIEWS):
@@ -291,17 +299,6 @@ def _label_targets(scene, programs, start, settings):
     seen = _depths(programs, start.state, scene.test.cameras)
     data = scene.test.cameras, seen, scene.train, start.depths, settings
     return jax.jit(label_views)(*data, sources=start.sources)
-
-
-def _make_targets(scene, programs, start) -> dict[str, list[Target]]:
-    exact = exact_depths(scene, scene.train.cameras) if scene.surface else None
-    seen_from = start.depths if exact is None else exact
-    render = functools.partial(programs.render, start.state)
-    return {
-        split: make_targets(scene, split, seen_from, render)
-        for split in scene.names
-        if split != "train"
-    }
 
 
 def _check_flags(preset: Preset) -> None:

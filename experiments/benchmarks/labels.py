@@ -19,6 +19,7 @@ from experiments.evaluation import exact_depths
 from experiments.pictures import label_pictures
 from experiments.presets import PRESETS, pseudo_settings
 from jaxcloseup.batch import camera_at, to_float
+from jaxcloseup.metrics import psnr
 from jaxcloseup.scenes import Scene, load_scene
 from jaxcloseup.scenes.procedural import PROCEDURAL_SCENES
 
@@ -73,9 +74,9 @@ def run() -> None:
 def _ceiling(scene: Scene, exact: jax.Array) -> float:
     """Mean PSNR of the test close-ups as photographs resolve them, where any sees the surface."""
     views = scene.test
-    psnr = []
+    found = []
     for i in range(len(views)):
         best, seen = resolved_by_photographs(scene, camera_at(views.cameras, i), exact)
-        squared = ((best - to_float(views.rgb[i])) ** 2).mean(axis=-1)
-        psnr.append(-10 * np.log10(squared[seen].mean()))
-    return float(np.mean(psnr))
+        best, weight = (jnp.asarray(array, jnp.float32) for array in (best, seen))
+        found.append(float(psnr(best, to_float(jnp.asarray(views.rgb[i])), weight=weight)))
+    return float(np.mean(found))

@@ -20,7 +20,6 @@ from jaxcloseup.numerics import matmul, safe_divide
 from jaxcloseup.splats.adaptive_density import (
     AdaptiveDensityConfig,
     ProbedSurfels,
-    PullState,
     apply_probe,
     measure_pull,
     refine,
@@ -314,7 +313,7 @@ def _adapt_classically(key, state, density, due, extent):
             extent=extent,
             remove_huge=remove_huge,
         )
-        none = PullState(jnp.zeros_like(pull.total), jnp.zeros_like(pull.views))
+        none = jax.tree.map(jnp.zeros_like, pull)
         return _replace_surfels(state.replace(opt_state=(none, adam)), surfels, alive, new)
 
     def fade(state):
