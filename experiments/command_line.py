@@ -1,14 +1,10 @@
-"""Flags that all programs of experiments take, and what they say together."""
+"""Flags of the programs that train, and what they say together."""
 
 import dataclasses
 import datetime
-import logging
 import os
 import pathlib
-import sys
-import warnings
 
-import jax
 from absl import flags
 
 from experiments.presets import PRESETS, Preset, with_classic_density
@@ -60,23 +56,7 @@ flags.DEFINE_float(
 flags.DEFINE_bool(
     "half_pixel", False, "the capture has pixel centres at integers: add 0.5 to cx, cy"
 )
-flags.DEFINE_string(
-    "compilation_cache",
-    None,
-    "folder of compiled programs, kept between runs; empty: none; default: under ~/.cache",
-)
-
 _OF_METHOD = {"nerf": ("compute_dtype",), "surfels": ("density", "colour_ridge")}
-
-
-def set_up() -> None:
-    """Compile into the cache of the flags, and say only what concerns the user."""
-    set_up_compilation_cache(FLAGS.compilation_cache)
-    # Warnings are sentences for the user; notes on absent accelerators and on every file of a
-    # checkpoint are not.
-    warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
-    logging.getLogger("jax._src.xla_bridge").setLevel(logging.WARNING)
-    logging.getLogger("absl").setLevel(logging.WARNING)
 
 
 def preset_from_flags() -> Preset:
@@ -105,16 +85,6 @@ def preset_from_flags() -> Preset:
             field = with_classic_density(field, FLAGS.preset)
         given["field"] = field
     return dataclasses.replace(preset, **given)
-
-
-def set_up_compilation_cache(folder: str | None) -> None:
-    """Keep compiled programs on disk, so that the next run starts at once."""
-    if folder is None:
-        cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-        folder = os.path.join(cache, "jaxcloseup", "xla")
-    if folder:
-        jax.config.update("jax_compilation_cache_dir", folder)
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
 def choose_output_dir(

@@ -16,6 +16,7 @@ from experiments.surface_error import (
 from jaxcloseup.batch import Views, camera_at, to_float
 from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
+from jaxcloseup.lpips import BACKBONES, SMALLEST, LpipsError, LpipsWeights, load_lpips, lpips
 from jaxcloseup.metrics import SSIM_TAPS, cc_psnr, psnr, quantize, ssim
 from jaxcloseup.pseudo import count_seen
 from jaxcloseup.scenes import Scene
@@ -23,7 +24,27 @@ from jaxcloseup.scenes.scene import Surface
 
 
 SEEN_BY = (1, 3)
-LPIPS_REASON = "LPIPS is not part of this version"
+
+
+class Perceptual(NamedTuple):
+    """LPIPS networks by backbone, and for each that is missing the reason."""
+
+    networks: Mapping[str, LpipsWeights]
+    reasons: Mapping[str, str]
+
+
+def find_perceptual(folder: str | None = None) -> Perceptual:
+    """The LPIPS networks whose weights are found, in `folder` or where they usually are."""
+    networks, reasons = {}, {}
+    for backbone in BACKBONES:
+        try:
+            networks[backbone] = load_lpips(backbone, folder)
+        except LpipsError as error:
+            reasons[backbone] = str(error)
+    return Perceptual(networks, reasons)
+
+
+NO_PERCEPTUAL = Perceptual({}, dict.fromkeys(BACKBONES, "LPIPS was not asked for"))
 
 
 class Target(NamedTuple):
@@ -95,7 +116,9 @@ def targets_by_split(
     }
 
 
-def score(rendering: Rendering, target: Target) -> dict[str, float | str | None]:
+def score(
+    rendering: Rendering, target: Target, perceptual: Perceptual = NO_PERCEPTUAL
+) -> dict[str, float | str | None]:
     """Metrics of one view, on 8-bit colours; what cannot be computed is None beside its reason."""
     rows, columns = _frame(np.asarray(target.weight))
 
@@ -103,21 +126,44 @@ def score(rendering: Rendering, target: Target) -> dict[str, float | str | None]
         return array[rows, columns]
 
     image, truth, weight = map(crop, (rendering.rgb, target.rgb, target.weight))
+    image, truth = _as_8_bits(image, truth)
     seen = crop(target.seen)
-    values = dict(_full_metrics(image, truth, weight))
+    values = {}
     for least in SEEN_BY:
-        values |= {
-            f"{key}_seen{least}": value
-            for key, value in _masked_metrics(
-                image, truth, np.where(seen >= least, weight, 0)
-            ).items()
-        }
+        counted = np.where(seen >= least, weight, 0)
+        for key, value in _masked_metrics(image, truth, counted).items():
+            values[f"{key}_seen{least}"] = value
     if target.surface is not None:
         values |= surface_error(target.camera, rendering, target.surface)
     if target.landmarks is not None:
         values |= point_depth_error(rendering.depth, target.landmarks)
-    finite_image = np.isfinite(image).all()
-    result = {}
+    return score_image(image, truth, weight, perceptual, values)
+
+
+def score_image(
+    image: jax.Array,
+    truth: jax.Array,
+    weight: jax.Array,
+    perceptual: Perceptual = NO_PERCEPTUAL,
+    more: Mapping[str, jax.Array | float] | None = None,
+) -> dict[str, float | str | None]:
+    """Metrics of one image `[H, W, 3]`, on 8-bit colours.
+
+    Args:
+      image: what was rendered.
+      truth: what it should be.
+      weight: `[H, W]` of each pixel.
+      perceptual: networks of LPIPS, for which pixels without weight show the truth.
+      more: metrics that are known already.
+
+    Returns:
+      Each metric; what cannot be computed is None beside its reason, and equal images have an
+      infinite PSNR, which is None too.
+    """
+    image, truth = _as_8_bits(image, truth)
+    values = dict(_full_metrics(image, truth, weight)) | dict(more or {})
+    finite_image, smallest = np.isfinite(image).all(), min(truth.shape[:2])
+    result: dict[str, float | str | None] = {}
     for key, value in values.items():
         result[key] = float(value) if np.isfinite(value) else None
         if result[key] is not None:
@@ -126,12 +172,23 @@ def score(rendering: Rendering, target: Target) -> dict[str, float | str | None]
             reason = "the rendering is not finite"
         elif np.isposinf(value):
             reason = "equals the truth"
-        elif "ssim" in key and min(truth.shape[:2]) < SSIM_TAPS:
+        elif "ssim" in key and smallest < SSIM_TAPS:
             reason = f"SSIM needs {SSIM_TAPS} pixels a side"
         else:
             reason = "no pixel of this view counts"
         result[f"{key}_reason"] = reason
-    return result | {"lpips_vgg": None, "lpips_vgg_reason": LPIPS_REASON}
+    for backbone in BACKBONES:
+        key = f"lpips_{backbone}"
+        result[key], reason = None, perceptual.reasons.get(backbone)
+        if reason is None and not finite_image:
+            reason = "the rendering is not finite"
+        elif reason is None and smallest < SMALLEST[backbone]:
+            reason = f"LPIPS needs {SMALLEST[backbone]} pixels a side"
+        elif reason is None:
+            result[key] = float(_lpips(perceptual.networks[backbone], image, truth, weight))
+        if reason is not None:
+            result[f"{key}_reason"] = reason
+    return result
 
 
 def summarise(views: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
@@ -148,23 +205,29 @@ def summarise(views: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def evaluate(
-    render: Callable[[Camera], Rendering], targets: Sequence[Target]
+    render: Callable[[Camera], Rendering],
+    targets: Sequence[Target],
+    perceptual: Perceptual = NO_PERCEPTUAL,
 ) -> tuple[dict[str, Any], dict[str, Rendering]]:
     """Render and score every target; returns the summary and the renderings by name."""
     renderings = {target.name: jax.device_get(render(target.camera)) for target in targets}
-    return summarise({t.name: score(renderings[t.name], t) for t in targets}), renderings
+    scores = {t.name: score(renderings[t.name], t, perceptual) for t in targets}
+    return summarise(scores), renderings
+
+
+def _as_8_bits(image, truth):
+    # Before what is compiled, where products may be fused and equal images differ by rounding.
+    return quantize(image), quantize(truth)
 
 
 @jax.jit
 def _full_metrics(image, truth, weight):
-    image, truth = quantize(image), quantize(truth)
     metrics = {"psnr": psnr, "cc_psnr": cc_psnr, "ssim": _ssim}
     return {name: metric(image, truth, weight=weight) for name, metric in metrics.items()}
 
 
 @jax.jit
 def _masked_metrics(image, truth, weight):
-    image, truth = quantize(image), quantize(truth)
     return {
         "psnr": psnr(image, truth, weight=weight),
         "ssim": _ssim(image, truth, weight=weight),
@@ -172,11 +235,16 @@ def _masked_metrics(image, truth, weight):
     }
 
 
+@jax.jit
+def _lpips(network, image, truth, weight):
+    return lpips(network, jnp.where(weight[..., None] > 0, image, truth), truth)
+
+
 def _ssim(image, truth, *, weight):
     return ssim(image, truth, weight=weight) if min(truth.shape[:2]) >= SSIM_TAPS else jnp.nan
 
 
-def _frame(weight):
+def _frame(weight: np.ndarray) -> tuple[slice, slice]:
     """The smallest rectangle that holds all weight: photographs are padded at two sides."""
     rows, columns = np.nonzero(weight.any(axis=1))[0], np.nonzero(weight.any(axis=0))[0]
     if not len(rows):

@@ -15,7 +15,13 @@ import numpy as np
 
 import jaxcloseup
 from experiments.audit import audit_labels
-from experiments.evaluation import evaluate, exact_depths, targets_by_split
+from experiments.evaluation import (
+    NO_PERCEPTUAL,
+    Perceptual,
+    evaluate,
+    exact_depths,
+    targets_by_split,
+)
 from experiments.gate import choose_settings, print_gate
 from experiments.loop import Programs, run_stage
 from experiments.pictures import comparisons, label_pictures, write_renders
@@ -45,6 +51,7 @@ def run(
     names: dict[str, str],
     to_run: Sequence[str] = STAGES,
     save_every: int = 1000,
+    perceptual: Perceptual = NO_PERCEPTUAL,
 ) -> dict[str, Any]:
     """The stages on one scene; writes everything under `output_dir` and returns the results.
 
@@ -56,6 +63,7 @@ def run(
       names: of "method" and "preset", for the report.
       to_run: stages; `baseline` always runs.
       save_every: steps between checkpoints. Those in `output_dir` are gone on from.
+      perceptual: networks of LPIPS.
     """
     key_init, key_audit, key_pictures = jax.random.split(jax.random.key(seed), 3)
     key_depths, key_points = jax.random.fold_in(key_init, 1), jax.random.fold_in(key_init, 2)
@@ -92,7 +100,9 @@ def run(
             stages[stage] = {}
             for split, of_split in targets.items():
                 rendered = functools.partial(programs.render, state)
-                stages[stage][split], renderings[stage, split] = evaluate(rendered, of_split)
+                stages[stage][split], renderings[stage, split] = evaluate(
+                    rendered, of_split, perceptual
+                )
                 folder = output_dir / "renders" / stage / split
                 write_renders(folder, renderings[stage, split], scene)
                 print(f"{stage:>9} {split}: {in_short(stages[stage][split])}", flush=True)

@@ -20,6 +20,8 @@ SPLIT_TITLES = {"test": "Close-ups", "test_far": "Ordinary views"}
 COLUMNS = {
     "psnr": "PSNR (dB)",
     "ssim": "SSIM",
+    "lpips_vgg": "LPIPS (VGG)",
+    "lpips_alex": "LPIPS (AlexNet)",
     "cc_psnr": "PSNR, colour-corrected (dB)",
     "psnr_seen1": "PSNR where seen by 1+ (dB)",
     "psnr_seen3": "PSNR where seen by 3+ (dB)",

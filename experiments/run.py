@@ -12,9 +12,11 @@ import sys
 from absl import app, flags
 
 from experiments import command_line
+from experiments.evaluation import find_perceptual
 from experiments.loop import TrainingError
 from experiments.pipeline import STAGES, run
 from experiments.report import print_table
+from experiments.set_up import set_up
 from jaxcloseup.artifacts.checkpoints import CheckpointError
 from jaxcloseup.scenes import SceneError, load_scene
 
@@ -34,7 +36,7 @@ def main(argv: list[str]) -> None:
     """Run all stages with the settings of the flags."""
     if len(argv) > 1:
         raise app.UsageError(f"unexpected argument: {argv[1]}")
-    command_line.set_up()
+    set_up()
     try:
         preset = command_line.preset_from_flags()
         output_dir = command_line.choose_output_dir(
@@ -54,6 +56,7 @@ def main(argv: list[str]) -> None:
             names=names,
             to_run=FLAGS.stages,
             save_every=FLAGS.save_every,
+            perceptual=find_perceptual(FLAGS.lpips_weights),
         )
     except (TrainingError, CheckpointError, OSError) as error:
         sys.exit(f"experiments.run: {error}")

@@ -21,10 +21,18 @@ from absl import app, flags
 import jaxcloseup
 from experiments import command_line
 from experiments.audit import resolved_by_photographs
-from experiments.evaluation import evaluate, exact_depths, targets_by_split
+from experiments.evaluation import (
+    NO_PERCEPTUAL,
+    Perceptual,
+    evaluate,
+    exact_depths,
+    find_perceptual,
+    targets_by_split,
+)
 from experiments.loop import Programs, TrainingError, run_stage
 from experiments.pipeline import config, rendered_depths, versions
 from experiments.presets import Preset, initial_points, pseudo_settings
+from experiments.set_up import set_up
 from experiments.sweep_report import print_sweep, write_sweep
 from jaxcloseup.artifacts.checkpoints import CheckpointError, Checkpoints
 from jaxcloseup.batch import Views
@@ -140,6 +148,7 @@ def run_sweep(
     *,
     names: Mapping[str, str],
     max_parallel: int = 8,
+    perceptual: Perceptual = NO_PERCEPTUAL,
 ) -> dict[str, Any]:
     """All arms of one scene; returns, for each arm, the metrics of each seed and split.
 
@@ -151,6 +160,7 @@ def run_sweep(
       folder: for checkpoints; those of the same sweep are gone on from.
       names: of "method" and "preset".
       max_parallel: arms and seeds trained at once.
+      perceptual: networks of LPIPS.
     """
     chosen = [make_arm(name, pseudo_settings(preset)) for name in arms]
     for name, reason in _impossible(scene).items():
@@ -189,7 +199,7 @@ def run_sweep(
 
     def score(arm, seed, state, skipped):
         splits = {
-            split: evaluate(functools.partial(programs.render, state), of_split)[0]
+            split: evaluate(functools.partial(programs.render, state), of_split, perceptual)[0]
             for split, of_split in targets.items()
         }
         results[arm][str(seed)] = {"skipped": skipped, "splits": splits}
@@ -321,7 +331,7 @@ def main(argv: list[str]) -> None:
     """Run the sweep of the flags on every scene."""
     if len(argv) > 1:
         raise app.UsageError(f"unexpected argument: {argv[1]}")
-    command_line.set_up()
+    set_up()
     names = {"method": FLAGS.method, "preset": FLAGS.preset}
     try:
         preset = command_line.preset_from_flags()
@@ -352,6 +362,7 @@ def main(argv: list[str]) -> None:
                 output_dir / "checkpoints" / scene.name,
                 names=names,
                 max_parallel=FLAGS.max_parallel,
+                perceptual=find_perceptual(FLAGS.lpips_weights),
             )
             write_sweep(output_dir, found, about)
     except (TrainingError, CheckpointError, OSError) as error:
