@@ -38,11 +38,7 @@ from jaxcloseup.artifacts.checkpoints import CheckpointError, Checkpoints
 from jaxcloseup.batch import Views
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.geometry.union_warp import SourceBlocks, block_sources
-from jaxcloseup.pseudo import (
-    PseudoSettings,
-    label_views,
-    sample_virtual_camera,
-)
+from jaxcloseup.pseudo import PseudoSettings, label_views, sample_virtual_camera
 from jaxcloseup.scenes import Scene, SceneError, load_scene
 from jaxcloseup.splats.field import SurfelConfig
 from jaxcloseup.train import TrainState, init_state
@@ -76,7 +72,8 @@ flags.DEFINE_list(
     ["baseline", *NAMED_ARMS, *ARMS_IN_TURN],
     "arms: baseline, control, labels (no mask, four poses), mask, diverse (the preset's), oracle "
     "(true pixels of close-ups), resolved (these, as sharp as the photographs are), test_time, and "
-    "the preset with other settings, as in rgb_tolerance=0.02+label_share=0.5 or magnification=2:4",
+    "the preset with other settings, as in rgb_tolerance=0.02+label_share=0.5 or magnification=2:4 "
+    "(a wrong one is answered with the names of all)",
 )
 flags.DEFINE_integer(
     "max_parallel", 8, "arms and seeds trained at once, which bounds memory", lower_bound=1
@@ -84,10 +81,14 @@ flags.DEFINE_integer(
 
 
 class Arm(NamedTuple):
-    """An arm's name and settings."""
+    """An arm's name and settings, and whether its labels are made with the expected depth.
+
+    Of the latter None is what the field has by itself.
+    """
 
     name: str
     settings: PseudoSettings
+    expected_depth: bool | None = None
 
     @property
     def in_turn(self) -> bool:
@@ -103,10 +104,13 @@ def make_arm(name: str, settings: PseudoSettings) -> Arm:
     """
     if name == "baseline" or name in ARMS_IN_TURN:
         return Arm(name, settings)
-    changes = NAMED_ARMS[name] if name in NAMED_ARMS else _parse(name)
+    changes = dict(NAMED_ARMS[name] if name in NAMED_ARMS else _parse(name))
+    expected_depth = changes.pop("expected_depth", None)
     for field, value in changes.items():
         settings = _change(settings, name, field, value)
-    return Arm(name, settings)
+    if expected_depth not in (None, 0.0, 1.0):
+        raise ValueError(f"--arms={name}: expected_depth is 0 (labels from median depth) or 1")
+    return Arm(name, settings, None if expected_depth is None else bool(expected_depth))
 
 
 def _parse(name):
@@ -129,7 +133,7 @@ def _change(settings, arm, field, value):
     old = vars(holder).get(field)
     known = field != "pose" and old is not None and jnp.shape(old) == np.shape(value)
     if not known or not np.all(np.diff(np.atleast_1d(value)) >= 0) or np.any(np.isnan(value)):
-        fields = {*vars(settings), *vars(settings.pose)} - {"pose"}
+        fields = {*vars(settings), *vars(settings.pose), "expected_depth"} - {"pose"}
         raise ValueError(
             f"--arms={arm}: {field} takes no such value; settings are "
             + ", ".join(sorted(fields))
@@ -178,6 +182,12 @@ def run_sweep(
     stage = functools.partial(run_stage, checkpoints=checkpoints, save_every=1000)
 
     starts = []
+
+    def start_from(state, skipped):
+        depths = _depths(programs, state, views.cameras)
+        sources = jax.jit(block_sources)(views.cameras, depths, views.weight)
+        return _Start(state, depths, sources, skipped)
+
     for seed in range(seeds):
         key_init, _, _ = jax.random.split(jax.random.key(seed), 3)
         points = initial_points(jax.random.fold_in(key_init, 2), scene)
@@ -185,9 +195,7 @@ def run_sweep(
         steps = preset.baseline_steps
         name = f"baseline_{seed}"
         state, history = stage(name, programs, "photographs", state, views, steps=steps)
-        depths = _depths(programs, state, views.cameras)
-        sources = jax.jit(block_sources)(views.cameras, depths, views.weight)
-        starts.append(_Start(state, depths, sources, _skipped(history)))
+        starts.append(start_from(state, _skipped(history)))
     exact = exact_depths(scene, views.cameras) if scene.surface else None
     render = functools.partial(programs.render, starts[0].state)
     targets = targets_by_split(scene, starts[0].depths, exact, render)
@@ -204,13 +212,26 @@ def run_sweep(
         }
         results[arm][str(seed)] = {"skipped": skipped, "splits": splits}
 
+    @functools.cache
+    def with_depth(expected, seed):
+        start = starts[seed]
+        flag = jnp.full_like(start.state.buffers.expected, expected)
+        buffers = start.state.buffers.replace(expected=flag)
+        return start_from(start.state.replace(buffers=buffers), start.skipped)
+
+    def begin(arm, seed):
+        if arm.expected_depth is None:
+            return starts[seed]
+        return with_depth(arm.expected_depth, seed)
+
     for seed, start in enumerate(starts):
         if "baseline" in results:
             score("baseline", seed, start.state, start.skipped)
     for first in range(0, len(together), max_parallel):
         group = together[first : first + max_parallel]
         name = f"arms_{first // max_parallel}"
-        states, history = _train_together(stage, name, programs, views, group, starts)
+        begun = [begin(arm, seed) for arm, seed in group]
+        states, history = _train_together(stage, name, programs, views, group, begun)
         for i, (arm, seed) in enumerate(group):
             state = jax.tree.map(lambda leaf, i=i: leaf[i], states.replace(step=states.step[None]))
             skipped = sum(chunk["skipped"][i] for chunk in history)
@@ -266,12 +287,12 @@ def stack_arms(
     return states.replace(step=states.step[0]), depths, settings, sources
 
 
-def _train_together(stage, name, programs, views, group, starts):
-    begun = [
-        (arm.settings, starts[seed].state, starts[seed].depths, starts[seed].sources)
-        for arm, seed in group
+def _train_together(stage, name, programs, views, group, begun):
+    arms = [
+        (arm.settings, start.state, start.depths, start.sources)
+        for (arm, _), start in zip(group, begun, strict=True)
     ]
-    states, *data = stack_arms(begun, len(jax.devices()))
+    states, *data = stack_arms(arms, len(jax.devices()))
     print(f"{name}: " + ", ".join(f"{arm.name} {seed}" for arm, seed in group))
     steps = programs.preset.closeup_steps
     return stage(name, programs, "arms", states, views, *data, steps=steps)
@@ -317,7 +338,10 @@ def _check_flags(preset: Preset) -> None:
         if not values or len(set(values)) < len(values):
             raise ValueError(f"--{flag}={','.join(values)} must name one or more, each once")
     for arm in FLAGS.arms:
-        changes = make_arm(arm, pseudo_settings(preset)).settings
+        made = make_arm(arm, pseudo_settings(preset))
+        if made.expected_depth is not None and not isinstance(preset.field, SurfelConfig):
+            raise ValueError(f"--arms={arm}: a NeRF has expected depth only; leave it out")
+        changes = made.settings
         if preset.train.pooled_loss and 0 < float(changes.label_share) != preset.label_share:
             raise ValueError(
                 f"--arms={arm}: this preset pools the losses of photographs and labels, which have "

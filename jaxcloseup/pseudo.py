@@ -4,6 +4,7 @@
 training and kept; 0 is undefined. No gradient flows through labels, depths or poses.
 """
 
+import functools
 from typing import NamedTuple
 
 import chex
@@ -17,6 +18,17 @@ from jaxcloseup.geometry.masks import depth_consistent, in_bounds, rgb_consisten
 from jaxcloseup.geometry.poses import PoseSettings, four_anchors, sample_closeup_camera
 from jaxcloseup.geometry.union_warp import SourceBlocks, block_sources, union_warp
 from jaxcloseup.geometry.warp import backward_warp
+from jaxcloseup.numerics import safe_divide, safe_norm
+
+
+# Photographs to blend are ranked on so many of the virtual pixels, or up to twice as many.
+_RANKING_PIXELS = 256
+_RANKING_TOLERANCE = 0.05
+_ROUNDING = 1e-6  # of a cosine in float32
+
+
+def _by_default(value: float) -> jax.Array:
+    return struct.field(default_factory=functools.partial(jnp.float32, value))
 
 
 @struct.dataclass
@@ -33,16 +45,24 @@ class PseudoSettings:
       leave_out_source: `[]` 1 keeps the source view out of the union that checks its label.
       label_share: `[]` share of the labels' loss in a step's, 1/2 in the paper; 0: no labels. Where
         both losses are pooled, any other share is as good.
+      max_ray_angle: `[]` radians between the rays of a virtual pixel and of its source, beyond
+        which there is no label; inf: off.
+      num_sources: `[]` photographs whose colours are averaged: the source view, and those that see
+        most of the virtual pixels under small angles. 1 in the paper.
+      rate: `[]` factor on the learning rates of steps with labels.
     """
 
     pose: PoseSettings
     use_mask: jax.Array
     rgb_tolerance: jax.Array
     depth_tolerance: jax.Array
-    fixed_anchors: jax.Array
-    forward_label: jax.Array
-    leave_out_source: jax.Array
-    label_share: jax.Array
+    fixed_anchors: jax.Array = _by_default(0)
+    forward_label: jax.Array = _by_default(0)
+    leave_out_source: jax.Array = _by_default(0)
+    label_share: jax.Array = _by_default(0.5)
+    max_ray_angle: jax.Array = _by_default(jnp.inf)
+    num_sources: jax.Array = _by_default(1)
+    rate: jax.Array = _by_default(1)
 
 
 class PseudoLabel(NamedTuple):
@@ -103,21 +123,28 @@ def make_label(
     chex.assert_equal_shape_prefix([pixels, depth], depth.ndim)
     if sources is None:
         sources = block_sources(views.cameras, depths, views.weight)
-    # Backward: lift with D', read the source photograph where the point projects.
-    source = camera_at(views.cameras, source_index)
+    # Backward: lift with D', read the source photographs where the points project.
     points = pixels_to_points(camera, pixels, depth)
-    landed, landed_depth = points_to_pixels(source, points)
-    image = to_float(views.rgb[source_index])
-    maps = jnp.stack([depths[source_index], views.weight[source_index]], axis=-1)
-    observed, weight = jnp.moveaxis(backward_warp(maps, landed, order=0), -1, 0)
-    defined = (
-        (depth > 0)
-        & (landed_depth > 0)
-        & in_bounds(landed, source.height, source.width)
-        & (weight > 0)
-        & depth_consistent(observed, landed_depth, settings.depth_tolerance)
+    defined = depth > 0
+    some = points.reshape(-1, 3)[:: max(1, depth.size // _RANKING_PIXELS)]
+    ranked = _rank_sources(camera, some, source_index, views, depths, settings)
+
+    def add_source(rank, sums):
+        index = ranked[rank]
+        colour, weight = _read_source(camera, points, index, views, depths, settings)
+        weight = jnp.where(defined, weight, 0)
+        known = (weight > 0).astype(colour.dtype)
+        new = known[..., None] * colour, weight, known
+        return jax.tree.map(jnp.add, sums, new)
+
+    none = jnp.zeros(depth.shape, points.dtype)
+    count = jnp.clip(settings.num_sources.astype(jnp.int32), 1, len(views))
+    colours, weight, known = jax.lax.fori_loop(
+        0, count, add_source, (jnp.zeros((*depth.shape, 3), points.dtype), none, none)
     )
-    backward = jnp.where(defined[..., None], backward_warp(image, landed), 0)
+    defined = known > 0
+    weight = safe_divide(weight, known)
+    backward = safe_divide(colours, known[..., None])
     # Forward: every training pixel, the nearest on each virtual pixel.
     exclude = jnp.where(settings.leave_out_source > 0, source_index, -1)
     union = union_warp(sources, views.cameras, views.rgb, camera, pixels, exclude=exclude)
@@ -132,6 +159,54 @@ def make_label(
         forward=forward,
     )
     return jax.lax.stop_gradient(label)
+
+
+def _read_source(camera, points, index, views, depths, settings):
+    """What view `index` shows at points `[..., 3]`, and its weight, 0 where that is no label."""
+    source = camera_at(views.cameras, index)
+    landed, landed_depth = points_to_pixels(source, points)
+    maps = jnp.stack([depths[index], views.weight[index]], axis=-1)
+    observed, weight = jnp.moveaxis(backward_warp(maps, landed, order=0), -1, 0)
+    known = (
+        (landed_depth > 0)
+        & in_bounds(landed, source.height, source.width)
+        & (weight > 0)
+        & depth_consistent(observed, landed_depth, settings.depth_tolerance)
+        & (_cosine_between(camera, source, points) >= _least_cosine(settings))
+    )
+    colour = backward_warp(to_float(views.rgb[index]), landed)
+    return jnp.where(known[..., None], colour, 0), jnp.where(known, weight, 0)
+
+
+def _rank_sources(camera, points, first, views, depths, settings):
+    """Indices `[V]` of the views: `first`, then those that see most of points `[N, 3]` best."""
+
+    def score(view):
+        source, depth, weight = view
+        landed, landed_depth = points_to_pixels(source, points)
+        observed, weight = (
+            backward_warp(array[..., None], landed, order=0)[..., 0] for array in (depth, weight)
+        )
+        tolerance = jnp.minimum(settings.depth_tolerance, _RANKING_TOLERANCE)
+        cosine = _cosine_between(camera, source, points)
+        sees = depth_consistent(observed, landed_depth, tolerance) & (weight > 0)
+        sees &= (landed_depth > 0) & (cosine >= _least_cosine(settings))
+        return jnp.sum(jnp.where(sees, cosine, 0))
+
+    scores = jax.lax.map(score, (views.cameras, depths, views.weight))
+    return jnp.argsort(-scores.at[first].set(jnp.inf), stable=True)
+
+
+def _cosine_between(camera, source, points):
+    """Cosine `[...]` of the angle between the rays of two cameras to points `[..., 3]`."""
+    around = (1,) * (points.ndim - 1) + (3,)
+    ours, theirs = (points - one.position.reshape(around) for one in (camera, source))
+    norms = safe_norm(ours) * safe_norm(theirs)
+    return safe_divide(jnp.sum(ours * theirs, axis=-1), norms)
+
+
+def _least_cosine(settings):
+    return jnp.cos(jnp.minimum(settings.max_ray_angle, jnp.pi)) - _ROUNDING
 
 
 def label_views(

@@ -190,7 +190,7 @@ def pseudo_step(
         value = (1 - share) * batch_loss + share * virtual_loss
         return value, metrics | {"label_coverage": coverage}
 
-    return _update(state, loss, key_adapt, field, optimizer)
+    return _update(state, loss, key_adapt, field, optimizer, settings.rate)
 
 
 def labelled_step(
@@ -211,7 +211,7 @@ def labelled_step(
       state: what is trained.
       views: training photographs.
       labels: of `label_views`.
-      settings: of which `label_share` counts.
+      settings: of which `label_share` and `rate` count.
       field: static.
       optimizer: static.
       config: static.
@@ -233,7 +233,7 @@ def labelled_step(
         value = (1 - share) * batch_loss + share * label_loss
         return value, metrics | {f"label_{name}": value for name, value in label_metrics.items()}
 
-    return _update(state, loss, key_adapt, field, optimizer)
+    return _update(state, loss, key_adapt, field, optimizer, settings.rate)
 
 
 def run_steps(
@@ -323,9 +323,11 @@ def _pool(batch, virtual):
     )
 
 
-def _update(state, loss, key_adapt, field, optimizer):
+def _update(state, loss, key_adapt, field, optimizer, rate=None):
     (value, metrics), gradients = jax.value_and_grad(loss, has_aux=True)(state.params)
     updates, opt_state = optimizer.update(gradients, state.opt_state, state.params)
+    if rate is not None:
+        updates = jax.tree.map(lambda leaf: rate.astype(leaf.dtype) * leaf, updates)
     after = state.replace(
         step=state.step + 1,
         params=optax.apply_updates(state.params, updates),

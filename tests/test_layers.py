@@ -22,7 +22,7 @@ MAY_IMPORT = {
     "lpips": {"torch_file"},
     "volume": {"numerics", "geometry", "field"},
     "splats": {"numerics", "geometry", "field", "metrics"},
-    "pseudo": {"geometry", "field", "batch"},
+    "pseudo": {"numerics", "geometry", "field", "batch"},
     "train": {"geometry", "field", "batch", "pseudo", "rendered_loss"},
     "scenes": {"ply", "numerics", "geometry", "batch"},
     "artifacts": {"files", "ply", "numerics", "geometry", "batch", "splats"},

@@ -25,8 +25,9 @@ def camera():
     return Camera(camtoworld, jnp.array([7.0, 7.0, 4.0, 3.0]), HEIGHT, WIDTH)
 
 
-def settings(magnification=(2.0, 8.0), max_angle=jnp.pi / 4, anchor_tolerance=jnp.inf):
-    return PoseSettings(*map(jnp.asarray, (magnification, max_angle, anchor_tolerance)))
+def settings(magnification=(2.0, 8.0), max_angle=jnp.pi / 4, anchor_tolerance=jnp.inf, look_at=0.0):
+    values = magnification, max_angle, anchor_tolerance, look_at
+    return PoseSettings(*map(jnp.asarray, values))
 
 
 def draw(key, count, *args):
@@ -87,6 +88,23 @@ def test_without_turning_the_anchor_stays_in_place_at_the_right_distance(key, ca
     ratio = depth[2, 5] / z
     assert jnp.all((ratio >= 2 - 1e-4) & (ratio <= 8 + 1e-4))
     assert ratio.max() - ratio.min() > 4
+
+
+def test_cameras_that_look_at_the_anchor_turn_about_it(key, camera):
+    depth = jax.random.uniform(key, (HEIGHT, WIDTH), minval=2, maxval=3)
+    weight = jnp.zeros((HEIGHT, WIDTH)).at[2, 5].set(1)
+    orbit, still = (
+        draw(key, 100, camera, depth, settings(look_at=look_at), weight) for look_at in (1.0, 0.0)
+    )
+    anchor = pixels_to_points(camera, jnp.array([5.5, 2.5]), depth[2, 5])
+    pixels, z = jax.vmap(points_to_pixels, (0, None))(orbit, anchor)
+    np.testing.assert_allclose(pixels, jnp.broadcast_to(jnp.array([5.5, 2.5]), (100, 2)), atol=1e-3)
+    assert jnp.all((depth[2, 5] / z >= 2 - 1e-4) & (depth[2, 5] / z <= 8 + 1e-4))
+    np.testing.assert_array_equal(orbit.rotation, still.rotation)
+    # The distance is that of the camera that turns about itself, the side another one.
+    far = [jnp.linalg.norm(one.position - anchor[None], axis=1) for one in (orbit, still)]
+    np.testing.assert_allclose(*far, rtol=1e-4)
+    assert jnp.linalg.norm(orbit.position - still.position, axis=1).max() > 0.5
 
 
 def test_typical_anchors_only_when_asked(key, camera):

@@ -17,6 +17,7 @@ from jaxcloseup.pseudo import (
 
 
 label = jax.jit(make_label)
+POSITIONS = (-1.0, 0.0, 1.0, 0.5)
 GRID = pixel_grid(plane.HEIGHT, plane.WIDTH)
 
 
@@ -36,7 +37,7 @@ def settings(**changes):
 
 @pytest.fixture(scope="module")
 def capture():
-    cameras = [plane.camera_above(x, 0.1 * x, 4.0, tilt=0.1 * x) for x in (-1.0, 0.0, 1.0, 0.5)]
+    cameras = [plane.camera_above(x, 0.1 * x, 4.0, tilt=0.1 * x) for x in POSITIONS]
     views, depths = plane.make_views(cameras)
     closeup = plane.camera_above(0.2, 0.1, 1.2, tilt=0.2)
     return views, depths, closeup
@@ -54,6 +55,13 @@ def seen_by_first(points, camera):
     u = plane.FOCAL * x / z + plane.WIDTH / 2
     v = plane.FOCAL * y / z + plane.HEIGHT / 2
     return (z > 0) & (u >= 0) & (u < plane.WIDTH) & (v >= 0) & (v < plane.HEIGHT)
+
+
+def rays_cosine(points, one, other):
+    """Cosines of the angles between the rays of two cameras, in float64."""
+    rays = [points - np.asarray(c.camtoworld, np.float64)[:, 3] for c in (one, other)]
+    norms = [np.linalg.norm(ray, axis=-1) for ray in rays]
+    return np.sum(rays[0] * rays[1], axis=-1) / (norms[0] * norms[1])
 
 
 def test_labels_from_exact_depth_are_the_true_colours(capture):
@@ -111,6 +119,69 @@ def test_the_released_label_is_the_forward_warp(capture):
     kept = np.asarray(result.weight) > 0
     np.testing.assert_array_equal(result.rgb, result.forward)
     assert not np.array_equal(result.rgb[kept], result.backward[kept])
+
+
+def test_labels_end_at_the_largest_angle_between_rays(capture):
+    views, depths, closeup = capture
+    _, depth, points = truth(closeup)
+    wide = settings(use_mask=0.0)
+    kept = label(closeup, GRID, depth, 1, views, depths, wide).weight > 0
+    cosine = rays_cosine(points, closeup, jax.tree.map(lambda leaf: leaf[1], views.cameras))
+    limit = float(np.median(np.arccos(cosine)))
+    narrow = wide.replace(max_ray_angle=jnp.float32(limit))
+    result = label(closeup, GRID, depth, 1, views, depths, narrow)
+    clear = np.abs(np.arccos(cosine) - limit) > 1e-3  # of what is not float32's rounding
+    expected = np.asarray(kept) & (np.arccos(cosine) < limit)
+    np.testing.assert_array_equal((result.weight > 0)[clear], expected[clear])
+    assert 0.3 < np.asarray(result.weight).mean() < 0.7
+
+
+def test_blended_labels_are_the_mean_of_the_photographs_that_see_most(capture):
+    views, depths, closeup = capture
+    _, depth, points = truth(closeup)
+    # Photographs of one colour each tell whose colours are in a label.
+    levels = np.array([0.1, 0.2, 0.4, 0.8])
+    flat = views.replace(rgb=jnp.broadcast_to(levels.reshape(-1, 1, 1, 1), views.rgb.shape) * 1.0)
+    flat = flat.replace(rgb=flat.rgb.astype(jnp.float32))
+    blank = depths.at[3].set(0)  # confirms nothing: never blended
+    strict = settings(use_mask=0.0, depth_tolerance=0.02)
+    alone = label(closeup, GRID, depth, 1, flat, blank, strict)
+    several = label(
+        closeup, GRID, depth, 1, flat, blank, strict.replace(num_sources=jnp.float32(9))
+    )
+    seen = np.stack(
+        [label(closeup, GRID, depth, i, flat, blank, strict).weight > 0 for i in range(4)]
+    )
+    assert not seen[3].any()
+    mean = (levels.reshape(-1, 1, 1) * seen).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
+    np.testing.assert_allclose(several.rgb[..., 0], mean, atol=1e-5)
+    np.testing.assert_array_equal(several.weight > 0, seen.any(axis=0))
+    np.testing.assert_allclose(np.asarray(alone.rgb[..., 0])[seen[1]], 0.2, atol=1e-6)
+    # Of two, the second is the one that sees most under small angles.
+    cosines = [
+        rays_cosine(points, closeup, plane.camera_above(x, 0.1 * x, 4.0, tilt=0.1 * x))
+        for x in POSITIONS
+    ]
+    second = 1 + int(np.argmax([(seen[i] * cosines[i]).sum() for i in (1, 2, 3)]))
+    two = label(closeup, GRID, depth, 0, flat, blank, strict.replace(num_sources=jnp.float32(2)))
+    both = seen[0] & seen[second]
+    mean = (levels[0] + levels[second]) / 2
+    np.testing.assert_allclose(np.asarray(two.rgb[..., 0])[both], mean, atol=1e-5)
+
+
+def test_settings_of_the_contract_are_enough(capture):
+    views, depths, closeup = capture
+    _, depth, _ = truth(closeup)
+    paper = PseudoSettings(
+        PoseSettings(jnp.array([2.0, 8.0]), jnp.float32(0.5), jnp.float32(jnp.inf)),
+        use_mask=jnp.float32(1),
+        rgb_tolerance=jnp.float32(0.15),
+        depth_tolerance=jnp.float32(jnp.inf),
+    )
+    by_default = label(closeup, GRID, depth, 1, views, depths, paper)
+    spelt_out = label(closeup, GRID, depth, 1, views, depths, settings())
+    np.testing.assert_array_equal(by_default.weight, spelt_out.weight)
+    assert paper.label_share == 0.5
 
 
 def test_undefined_depth_and_weightless_photographs_give_no_label(capture):

@@ -217,6 +217,8 @@ def parsed_flags():
         ({"scenes": []}, "--scenes= must name one or more"),
         ({"arms": ["warm"]}, "--arms=warm is not an arm"),
         ({"method": "nerf", "arms": ["label_share=0.3"]}, "this preset pools the losses"),
+        ({"method": "nerf", "arms": ["expected_depth=1"]}, "a NeRF has expected depth only"),
+        ({"arms": ["expected_depth=2"]}, "expected_depth is 0"),
         ({"scenes": ["nowhere"]}, "nowhere"),
     ],
 )
@@ -236,6 +238,22 @@ def test_names_change_settings():
     np.testing.assert_array_equal(settings.pose.magnification, [2, 3])
     assert float(settings.label_share) == 0.5
     assert float(make_arm("control", pseudo_settings(TINY)).settings.label_share) == 0
+    arm = make_arm("expected_depth=1+look_at=1+num_sources=3", pseudo_settings(TINY))
+    assert arm.expected_depth is True
+    assert (arm.settings.pose.look_at, arm.settings.num_sources) == (1, 3)
+    assert make_arm("diverse", pseudo_settings(TINY)).expected_depth is None
+
+
+def test_an_arm_may_have_labels_from_the_other_depth(capture_folder, tmp_path):
+    scene = load_scene(str(capture_folder))
+    arms = ["diverse", "expected_depth=0", "expected_depth=1"]
+    names = {"method": "surfels", "preset": "tiny"}
+    preset = dataclasses.replace(TINY_SURFELS, label_share=0.5)
+    with jax.numpy_dtype_promotion("standard"):
+        found = run_sweep(scene, preset, arms, 1, tmp_path, names=names)
+    as_ever, median, expected = (found[arm]["0"]["splits"]["test"]["psnr"] for arm in arms)
+    assert as_ever == median
+    assert as_ever != expected
 
 
 DEVICES = """

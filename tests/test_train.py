@@ -170,6 +170,17 @@ def test_a_share_of_nothing_is_the_control(capture, pooled):
     np.testing.assert_allclose(arm.params, control.params, atol=1e-6)
 
 
+def test_the_rate_scales_what_a_step_with_labels_changes(capture):
+    views, depths = capture
+    state = fresh_state()
+    step = bind(pseudo_step, num_rays=64, num_label_rays=256)
+    whole, _ = step(state, views, depths, settings())
+    half, _ = step(state, views, depths, settings().replace(rate=jnp.float32(0.5)))
+    np.testing.assert_allclose(
+        half.params - state.params, (whole.params - state.params) / 2, atol=1e-6
+    )
+
+
 @pytest.mark.parametrize("count", [64, None])
 @pytest.mark.parametrize("share", [0.0, 0.25])
 def test_labelled_views_count_with_their_share(capture, count, share):

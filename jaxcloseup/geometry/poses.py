@@ -11,6 +11,7 @@ from flax import struct
 
 from jaxcloseup.geometry.cameras import Camera, pixels_to_points
 from jaxcloseup.geometry.rotations import euler_to_matrix, matrix_to_euler
+from jaxcloseup.numerics import matmul
 
 
 @struct.dataclass
@@ -21,11 +22,14 @@ class PoseSettings:
       magnification: `[2]` range (lo, hi) of lambda, how many times nearer the camera comes.
       max_angle: `[]` epsilon, largest change of each Euler angle, radians.
       anchor_tolerance: `[]` anchors have |D - mean D| < tolerance * mean D; inf: any.
+      look_at: `[]` 1 turns the camera about the anchor, which so stays at its pixel, 0 about
+        itself, as published.
     """
 
     magnification: jax.Array
     max_angle: jax.Array
     anchor_tolerance: jax.Array
+    look_at: jax.Array = struct.field(default_factory=lambda: jnp.zeros(()))
 
 
 def closeup_position(
@@ -116,4 +120,8 @@ def sample_closeup_camera(
     magnification = low + (high - low) * jax.random.uniform(key_magnification, (), depth.dtype)
     position = closeup_position(anchor, camera.position, magnification)
     rotation = perturb_rotation(key_rotation, camera.rotation, settings.max_angle)
+    # What the camera saw at the anchor's pixel it sees there again after a turn about the anchor.
+    turn = matmul(rotation, camera.rotation.T)
+    about_anchor = anchor + matmul(turn, (position - anchor)[:, None])[:, 0]
+    position = jnp.where(settings.look_at > 0, about_anchor, position)
     return camera.replace(camtoworld=jnp.concatenate([rotation, position[:, None]], axis=1))

@@ -46,7 +46,8 @@ class SurfelConfig:
       sh_degree: of the colour's spherical harmonics.
       sh_every: steps after which one more degree is drawn.
       initial_opacity: of surfels at the initial points.
-      depth: "median" or "expected": what the field calls depth, and labels are made with.
+      depth: "median" or "expected": what the field calls depth, labels are made with, and normals
+        are held against; arms of a sweep may have labels from the other.
       background: grey level in [0, 1] behind the scene; None is black.
       colour_ridge: in training each image may change its colours by an affine map, to which this
         is the resistance, see `fit_colours`; None allows none. Rendered images have no such change.
@@ -99,11 +100,13 @@ class SurfelBuffers:
       alive: `[N]` bool.
       degree: `[]` int32 degree of spherical harmonics that is drawn.
       regularise: `[]` 1 once regularisers count, before that 0.
+      expected: `[]` 1 where the expected depth is what the field calls depth, 0 where the median.
     """
 
     alive: jax.Array
     degree: jax.Array
     regularise: jax.Array
+    expected: jax.Array
 
 
 class SurfelFieldAux(NamedTuple):
@@ -146,7 +149,9 @@ def surfel_field(config: SurfelConfig, *, extent: float) -> RadianceField:
         )
         if isinstance(config.density, AdaptiveDensityConfig):
             surfels = with_probe(surfels)
-        return surfels, SurfelBuffers(alive, *_schedule(config, jnp.zeros((), jnp.int32)))
+        expected = jnp.float32(config.depth == "expected")
+        schedule = _schedule(config, jnp.zeros((), jnp.int32))
+        return surfels, SurfelBuffers(alive, *schedule, expected)
 
     def render(
         params: Surfels,
@@ -165,10 +170,11 @@ def surfel_field(config: SurfelConfig, *, extent: float) -> RadianceField:
             surfels = apply_probe(surfels, camera)
         background = None if config.background is None else jnp.full(3, config.background)
         image = render_surfels(surfels, buffers.alive, camera, config.raster, background=background)
-        depth = image.aux.median_depth if config.depth == "median" else image.depth
+        median, expected = image.aux.median_depth, image.depth
+        surface = median if config.depth == "median" else expected
 
         inconsistency = normal_inconsistency(
-            image.aux.normal, depth_to_normal(camera, depth), image.alpha
+            image.aux.normal, depth_to_normal(camera, surface), image.alpha
         )
         typical = safe_divide(jnp.sum(image.alpha * image.depth), jnp.sum(image.alpha))
         distortion = scale_free_distortion(image.aux.distortion, jax.lax.stop_gradient(typical))
@@ -184,6 +190,7 @@ def surfel_field(config: SurfelConfig, *, extent: float) -> RadianceField:
         scale = mean(jnp.mean(jnp.exp(params.log_scales), axis=-1)) / extent
         prior = config.opacity_weight * opacity + config.scale_weight * scale
         aux = SurfelFieldAux(image.aux, buffers.regularise * penalty, prior)
+        depth = jnp.where(buffers.expected > 0, expected, median)
         return Rendering(image.rgb, depth, image.alpha, aux)
 
     def loss(
