@@ -1,6 +1,9 @@
 """Strict numerics for every test, and where the shared reference data lies, if it is here."""
 
+import os
 import pathlib
+import shutil
+import tempfile
 
 import jax
 import pytest
@@ -9,6 +12,23 @@ from tiny_runs import write_plane
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+_CACHE = "JAXCLOSEUP_TEST_CACHE"
+
+
+def pytest_configure(config):
+    """Keep compiled programs for all processes of this session: many tests need the same ones."""
+    if not hasattr(config, "workerinput"):
+        os.environ[_CACHE] = tempfile.mkdtemp()
+    jax.config.update("jax_compilation_cache_dir", os.environ[_CACHE])
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+
+
+def pytest_unconfigure(config):
+    """Remove them."""
+    if not hasattr(config, "workerinput"):
+        shutil.rmtree(os.environ.pop(_CACHE))
+
 
 SHARED = pathlib.Path(__file__).parents[2] / "shared"
 
