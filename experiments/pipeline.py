@@ -27,6 +27,7 @@ from experiments.loop import Programs, run_stage
 from experiments.pictures import comparisons, label_pictures, write_renders
 from experiments.presets import Preset, initial_points, pseudo_settings
 from experiments.report import in_short, write_json, write_report
+from experiments.zoom_ladder import ladder_in_short, ladder_targets
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.artifacts.surfel_ply import write_surfels
 from jaxcloseup.batch import camera_at
@@ -98,14 +99,17 @@ def run(
     def score(stage, state):
         with timed(seconds, f"{stage}_evaluation"):
             stages[stage] = {}
-            for split, of_split in targets.items():
+            for split, of_split in held_out.items():
                 rendered = functools.partial(programs.render, state)
                 stages[stage][split], renderings[stage, split] = evaluate(
                     rendered, of_split, perceptual
                 )
                 folder = output_dir / "renders" / stage / split
                 write_renders(folder, renderings[stage, split], scene)
-                print(f"{stage:>9} {split}: {in_short(stages[stage][split])}", flush=True)
+                if split in targets:
+                    print(f"{stage:>9} {split}: {in_short(stages[stage][split])}", flush=True)
+            if len(held_out) > len(targets):
+                print(f"{stage:>9} {ladder_in_short(stages[stage])}", flush=True)
             if isinstance(state.params, Surfels):
                 path = output_dir / "splats" / f"{stage}.ply"
                 write_surfels(path, state.params, state.buffers.alive)
@@ -125,6 +129,7 @@ def run(
         sources = jax.jit(block_sources)(views.cameras, depths, views.weight)
         exact = exact_depths(scene, views.cameras) if scene.surface else None
         targets = targets_by_split(scene, depths, exact, render)
+        held_out = targets | ({} if exact is None else ladder_targets(scene, exact))
     score("baseline", baseline)
     gate = None
     if preset.gated:

@@ -12,6 +12,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from experiments.plots import line_plot
+from experiments.zoom_ladder import gain_over, zoom_curves
 from jaxcloseup.artifacts.images import png_data_uri
 from jaxcloseup.files import write_file
 
@@ -105,6 +107,7 @@ def write_report(
         *("<tr>" + "".join(f"<td>{html.escape(cell)}" for cell in row) for row in body),
         "</table></div>",
     ]
+    parts += _zoom_plots(results["stages"])
     if results["labels"]:
         parts.append(_labels_table(results["labels"]))
     if results["gate"]:
@@ -122,6 +125,23 @@ def write_report(
     config = html.escape(json.dumps({k: results[k] for k in ("config", "versions")}, indent=1))
     parts.append(f"<details><summary>Configuration</summary><pre>{config}</pre></details></html>")
     write_file(path, "\n".join(parts).encode())
+
+
+def _zoom_plots(stages):
+    curves = zoom_curves(stages)
+    if not curves:
+        return []
+    axis = {"x": "times nearer", "doubling": True}
+    parts = [
+        "<h2>Against magnification</h2><p>Cameras that come nearer and nearer to points of the "
+        "ordinary views.</p><div class=plots>",
+        line_plot(curves, y="PSNR (dB)", title="PSNR", **axis),
+    ]
+    if "control" in stages:
+        gains = [gain_over(curves, "control", curve) for curve in curves if curve.name != "control"]
+        axis |= {"y": "PSNR above control (dB)", "level": 0}
+        parts.append(line_plot(gains, title="Gain", **axis))
+    return [*parts, "</div>"]
 
 
 def _labels_table(labels):
@@ -179,6 +199,8 @@ th, td { padding: .25em .8em; text-align: right; border-bottom: 1px solid #ccc }
 th:nth-child(-n+2), td:nth-child(-n+2) { text-align: left }
 .wide { overflow-x: auto }
 figure { margin: 1em 0 }
+.plots { display: flex; flex-wrap: wrap; gap: 1em }
+.plots svg { max-width: 100%; height: auto }
 img { width: 100%; image-rendering: pixelated }
 figcaption { color: #555 }
 """

@@ -34,6 +34,7 @@ from experiments.pipeline import config, rendered_depths, versions
 from experiments.presets import Preset, initial_points, pseudo_settings
 from experiments.set_up import set_up
 from experiments.sweep_report import print_sweep, write_sweep
+from experiments.zoom_ladder import ladder_targets
 from jaxcloseup.artifacts.checkpoints import CheckpointError, Checkpoints
 from jaxcloseup.batch import Views
 from jaxcloseup.geometry.cameras import Camera
@@ -199,6 +200,8 @@ def run_sweep(
     exact = exact_depths(scene, views.cameras) if scene.surface else None
     render = functools.partial(programs.render, starts[0].state)
     targets = targets_by_split(scene, starts[0].depths, exact, render)
+    if exact is not None:
+        targets |= ladder_targets(scene, exact)
 
     together = [(arm, seed) for arm in chosen for seed in range(seeds)]
     in_turn = [(arm, seed) for arm, seed in together if arm.in_turn]

@@ -16,7 +16,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from experiments.plots import Curve, line_plot
 from experiments.report import SPLIT_TITLES, STYLE, write_json
+from experiments.zoom_ladder import MAGNIFICATIONS, PREFIX
 from jaxcloseup.files import write_file
 
 
@@ -32,6 +34,7 @@ class Row(NamedTuple):
       psnr: mean over scenes, seeds and views, dB.
       spread: standard deviation over seeds of the mean over scenes and views; None of one seed.
       ssim: mean.
+      lpips: mean, with VGG.
       gain: mean difference of PSNR from control, or None without one.
       low, high: its 95 % interval.
       skipped: steps that were not finite, of all seeds and scenes.
@@ -42,6 +45,7 @@ class Row(NamedTuple):
     psnr: float
     spread: float | None
     ssim: float | None
+    lpips: float | None
     gain: float | None
     low: float | None
     high: float | None
@@ -72,28 +76,16 @@ def rows(scenes: Mapping[str, Mapping[str, Any]]) -> list[Row]:
       scenes: for each scene what `run_sweep` returns.
     """
     table = []
-    arms = list(dict.fromkeys(arm for of_scene in scenes.values() for arm in of_scene))
+    arms = _arms(scenes)
     for split in SPLIT_TITLES:
-        psnr = {arm: _by_view(scenes, arm, split, "psnr") for arm in arms}
-        control = psnr.get("control", {})
         for arm in arms:
-            if not psnr[arm]:
+            psnr = _by_view(scenes, arm, split, "psnr")
+            if not psnr:
                 continue
             by_seed: dict[str, list[float]] = {}
-            for (_, seed, _), value in psnr[arm].items():
+            for (_, seed, _), value in psnr.items():
                 by_seed.setdefault(seed, []).append(value)
             seeds = [float(np.mean(values)) for values in by_seed.values()]
-            pairs: dict[tuple[str, str], list[float]] = {}
-            for (scene, seed, view), value in psnr[arm].items():
-                if (scene, seed, view) in control:
-                    difference = value - control[scene, seed, view]
-                    pairs.setdefault((scene, view), []).append(difference)
-            gain = low = high = None
-            if pairs and arm != "control":
-                groups = [np.array(group) for group in pairs.values()]
-                gain = float(np.mean([group.mean() for group in groups]))
-                low, high = paired_bootstrap(groups)
-            ssim = list(_by_view(scenes, arm, split, "ssim").values())
             skipped = sum(
                 result["skipped"]
                 for of_scene in scenes.values()
@@ -103,16 +95,46 @@ def rows(scenes: Mapping[str, Mapping[str, Any]]) -> list[Row]:
                 Row(
                     arm,
                     split,
-                    float(np.mean(list(psnr[arm].values()))),
+                    float(np.mean(list(psnr.values()))),
                     float(np.std(seeds, ddof=1)) if len(seeds) > 1 else None,
-                    float(np.mean(ssim)) if ssim else None,
-                    gain,
-                    low,
-                    high,
+                    *(_mean(scenes, arm, split, metric) for metric in ("ssim", "lpips_vgg")),
+                    *(gain_over_control(scenes, arm, split) or (None, None, None)),
                     skipped,
                 )
             )
     return table
+
+
+def gain_over_control(
+    scenes: Mapping[str, Mapping[str, Any]], arm: str, split: str
+) -> tuple[float, float, float] | None:
+    """Mean difference of an arm's PSNR from control, and its interval; None if there is none."""
+    if arm == "control":
+        return None
+    control = _by_view(scenes, "control", split, "psnr")
+    pairs: dict[tuple[str, str], list[float]] = {}
+    for (scene, seed, view), value in _by_view(scenes, arm, split, "psnr").items():
+        if (scene, seed, view) in control:
+            pairs.setdefault((scene, view), []).append(value - control[scene, seed, view])
+    if not pairs:
+        return None
+    groups = [np.array(group) for group in pairs.values()]
+    return float(np.mean([group.mean() for group in groups])), *paired_bootstrap(groups)
+
+
+def gain_curves(scenes: Mapping[str, Mapping[str, Any]]) -> list[Curve]:
+    """For each arm the gain over control against magnification, with its interval."""
+    curves = []
+    for arm in _arms(scenes):
+        found = {}
+        for m in MAGNIFICATIONS:
+            gain = gain_over_control(scenes, arm, f"{PREFIX}{m}")
+            if gain is not None:
+                found[m] = gain
+        if found:
+            columns = map(list, zip(*found.values(), strict=True))
+            curves.append(Curve(arm, list(found), *columns))
+    return curves
 
 
 def print_sweep(scenes: Mapping[str, Mapping[str, Any]]) -> None:
@@ -150,9 +172,35 @@ def write_sweep(folder: pathlib.Path, scenes: Mapping[str, Any], about: Mapping[
         "<div class=wide><table><tr>",
         *(f"<th>{html.escape(cell)}" for cell in header),
         *("<tr>" + "".join(f"<td>{html.escape(cell)}" for cell in line) for line in body),
-        "</table></div></html>",
+        "</table></div>",
     ]
+    curves = gain_curves(scenes)
+    if curves:
+        parts += [
+            "<h2>Against magnification</h2><p>Gain over control, of cameras that come nearer and "
+            "nearer to points of the ordinary views; shaded is the 95 % interval.</p>",
+            "<div class=plots>",
+            line_plot(
+                curves,
+                x="times nearer",
+                y="PSNR above control (dB)",
+                title="Gain",
+                doubling=True,
+                level=0,
+            ),
+            "</div>",
+        ]
+    parts.append("</html>")
     write_file(folder / "report.html", "\n".join(parts).encode())
+
+
+def _arms(scenes):
+    return list(dict.fromkeys(arm for of_scene in scenes.values() for arm in of_scene))
+
+
+def _mean(scenes, arm, split, metric):
+    values = list(_by_view(scenes, arm, split, metric).values())
+    return float(np.mean(values)) if values else None
 
 
 def _by_view(scenes, arm, split, metric):
@@ -177,11 +225,12 @@ def _cells(found):
             number(row.psnr),
             number(row.spread),
             number(row.ssim, "{:.4f}"),
+            number(row.lpips, "{:.4f}"),
             number(row.gain, "{:+.3f}"),
             "-" if row.gain is None else f"{row.low:+.3f} to {row.high:+.3f}",
             str(row.skipped),
         ]
         for row in found
     ]
-    header = ["views", "arm", "PSNR (dB)", "s.d.", "SSIM", "gain (dB)", "95 %", "skipped steps"]
+    header = ["views", "arm", "PSNR (dB)", "s.d.", "SSIM", "LPIPS", "gain (dB)", "95 %", "skipped"]
     return [header, *body]
