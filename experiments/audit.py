@@ -5,7 +5,8 @@ blurred to the footprint that the source's pixels have there. On captures, train
 left out one by one, labelled from the others and compared with what they are.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import cv2
 import jax
@@ -21,6 +22,7 @@ from jaxcloseup.pseudo import PseudoSettings, best_source, make_label, sample_vi
 from jaxcloseup.scenes import Scene
 
 
+CURVE_POINTS = 20
 _SIGMAS = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 
 
@@ -79,7 +81,7 @@ def audit_labels(
     depths: jax.Array,
     render_depth: Callable[[Camera], jax.Array],
     count: int = 16,
-) -> dict[str, float | str | None]:
+) -> dict[str, Any]:
     """Label error and yield over random virtual close-ups of a procedural scene.
 
     Args:
@@ -94,38 +96,100 @@ def audit_labels(
     Returns:
       `error`, mean absolute difference of kept labels from the blurred truth; `kept`, share of the
       pixels that the source view truly sees; `leaked`, share of kept pixels that it does not.
-      None beside a reason where there is nothing to divide by.
+      None beside a reason where there is nothing to divide by. `curve`: see `error_curve`, with
+      coverage as a share of all pixels.
     """
     sample = jax.jit(sample_virtual_camera)
     label_image = jax.jit(make_label)
+    of_curve: list[tuple[np.ndarray, ...]] = []
+    pixels_total = 0
     error = kept = kept_visible = visible_total = 0.0
     for one in jax.random.split(key, count):
         camera, index = sample(one, scene.train, depths, settings)
         pixels = pixel_grid(camera.height, camera.width)
-        label = label_image(
-            camera, pixels, render_depth(camera), index, scene.train, depths, settings
-        )
+        data = camera, pixels, render_depth(camera), index, scene.train, depths
+        label = label_image(*data, settings)
         truth = scene.surface(camera)
         visible, footprint = _seen_by(
             camera, pixels, truth.depth, camera_at(scene.train.cameras, index), exact_depths[index]
         )
+        visible = np.asarray(visible, np.float32)
         blurred = blur_to_footprint(np.asarray(truth.rgb), np.asarray(footprint))
         weight = np.asarray(label.weight)
-        error += float((weight * np.abs(label.rgb - blurred).mean(axis=-1)).sum())
+        difference = np.abs(label.rgb - blurred).mean(axis=-1)
+        error += float((weight * difference).sum())
         kept += float(weight.sum())
         kept_visible += float((weight * visible).sum())
         visible_total += float(visible.sum())
+        scored = label_image(*data, _of_any_colour(settings))
+        inside = np.asarray(scored.weight) > 0
+        score = np.abs(scored.backward - scored.forward).max(axis=-1)
+        scored_error = np.abs(scored.rgb - blurred).mean(axis=-1)
+        columns = score, scored_error, 1 - visible
+        of_curve.append(tuple(column[inside] for column in columns))
+        pixels_total += inside.size
     shares = {
         "error": (error, kept),
         "kept": (kept_visible, visible_total),
         "leaked": (kept - kept_visible, kept),
     }
-    result: dict[str, float | str | None] = {}
+    result: dict[str, Any] = {}
     for name, (part, whole) in shares.items():
         result[name] = part / whole if whole else None
         if not whole:
             result[f"{name}_reason"] = "no label was kept" if name != "kept" else "nothing is seen"
+    score, scored_error, leaked = map(np.concatenate, zip(*of_curve, strict=True))
+    result["curve"] = error_curve(score, scored_error, pixels_total, {"leaked": leaked})
     return result
+
+
+def error_curve(
+    score: np.ndarray,
+    error: np.ndarray,
+    total: int,
+    more: Mapping[str, np.ndarray] | None = None,
+) -> dict[str, list[float] | float] | None:
+    """Error of labels against how many are kept, those first that the mask trusts most.
+
+    The area under sparsification error (AUSE; Ilg et al., "Uncertainty Estimates and
+    Multi-Hypotheses Networks for Optical Flow", ECCV 2018) is 0 where the score sorts labels by
+    their true error, and one half where it says nothing and errors are uniform.
+
+    Args:
+      score: `[N]` of the labels, smaller is better.
+      error: `[N]` their true error.
+      total: pixels of all images, of which the labels cover a part.
+      more: `[N]` other quantities whose means are wanted for the same parts.
+
+    Returns:
+      Lists over parts of the labels, from few to all: `coverage`, their share of `total`; `error`,
+      their mean error; `oracle`, that of as many labels with the least error; those of `more`; and
+      the number `ause`. None without labels.
+    """
+    if not len(score):
+        return None
+    shares = np.arange(1, CURVE_POINTS + 1) / CURVE_POINTS
+    counts = np.maximum(1, np.round(shares * len(score)).astype(int))
+    by_score = np.argsort(score, kind="stable")
+
+    def means(values):
+        return (np.cumsum(values, dtype=np.float64)[counts - 1] / counts).tolist()
+
+    curve = {
+        "coverage": (counts / total).tolist(),
+        "error": means(error[by_score]),
+        "oracle": means(np.sort(error)),
+    }
+    for name, values in (more or {}).items():
+        curve[name] = means(values[by_score])
+    gap = np.subtract(curve["error"], curve["oracle"])
+    largest = curve["error"][-1]
+    return curve | {"ause": float(np.trapezoid(gap, shares) / largest) if largest else 0.0}
+
+
+def _of_any_colour(settings: PseudoSettings) -> PseudoSettings:
+    """Settings that keep whatever both warps reach, so that their difference can be sorted by."""
+    return settings.replace(use_mask=jnp.float32(1), rgb_tolerance=jnp.float32(jnp.inf))
 
 
 def audit_left_out(
@@ -153,7 +217,7 @@ def audit_left_out(
     """
     audit = jax.jit(_left_out)
     sums = np.zeros((len(candidates), 4))
-    for index in np.unique(np.linspace(0, len(views) - 1, count).round().astype(int)):
+    for index in _spread(views, count):
         seen = render(camera_at(views.cameras, index))
         for row, settings in enumerate(candidates):
             sums[row] += audit(index, seen.rgb, seen.depth, views, depths, settings)
@@ -167,15 +231,56 @@ def audit_left_out(
     return rows
 
 
-def _left_out(index, rgb, depth, views, depths, settings):
-    """Sums over kept pixels: squared errors of label and model, kept pixels, all pixels."""
+def left_out_curve(
+    views: Views,
+    depths: jax.Array,
+    render: Callable[[Camera], Rendering],
+    settings: PseudoSettings,
+    *,
+    count: int = 8,
+) -> dict[str, list[float] | float] | None:
+    """`error_curve` of labels of left-out training photographs, with the error of the `model`.
+
+    Needs no truth but the photographs. Where the labels' curve lies above the model's, a tolerance
+    that keeps so many of them teaches the model its own faults. Arguments as in `audit_left_out`.
+    """
+    label_of = jax.jit(_label_left_out)
+    found: list[tuple[np.ndarray, ...]] = []
+    total = 0
+    for index in _spread(views, count):
+        seen = render(camera_at(views.cameras, index))
+        data = index, seen.depth, views, depths, _of_any_colour(settings)
+        label, truth, weight = label_of(*data)
+        inside = np.asarray(label.weight * weight) > 0
+        columns = (
+            np.abs(label.backward - label.forward).max(axis=-1),
+            np.abs(label.rgb - truth).mean(axis=-1),
+            np.abs(jnp.clip(seen.rgb, 0, 1) - truth).mean(axis=-1),
+        )
+        found.append(tuple(column[inside] for column in columns))
+        total += int(np.sum(np.asarray(weight) > 0))
+    score, error, model = map(np.concatenate, zip(*found, strict=True))
+    return error_curve(score, error, total, {"model": model})
+
+
+def _spread(views, count):
+    return np.unique(np.linspace(0, len(views) - 1, count).round().astype(int))
+
+
+def _label_left_out(index, depth, views, depths, settings):
+    """The label of a training photograph from the others, its colours and its weight."""
     camera, weight = camera_at(views.cameras, index), views.weight[index]
     others = views.replace(weight=views.weight.at[index].set(0))
     source = best_source(camera, others, depths, depth=depth)
     pixels = pixel_grid(camera.height, camera.width)
     label = make_label(camera, pixels, depth, source, others, depths, settings)
+    return label, to_float(views.rgb[index]), weight
+
+
+def _left_out(index, rgb, depth, views, depths, settings):
+    """Sums over kept pixels: squared errors of label and model, kept pixels, all pixels."""
+    label, truth, weight = _label_left_out(index, depth, views, depths, settings)
     kept = label.weight * weight
-    truth = to_float(views.rgb[index])
 
     def error(image):
         return jnp.sum(kept * jnp.mean((jnp.clip(image, 0, 1) - truth) ** 2, axis=-1))

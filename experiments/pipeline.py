@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxcloseup
-from experiments.audit import audit_labels
+from experiments.audit import audit_labels, left_out_curve
 from experiments.evaluation import (
     NO_PERCEPTUAL,
     Perceptual,
@@ -179,6 +179,7 @@ def run(
             }
             audit["exact_depth"] = audit_labels(key_audit, exact, **of_labels | truth)
             audit["trained_depth"] = audit_labels(key_audit, exact, **of_labels)
+        left_out = left_out_curve(views, depths, render, settings)
     results = {
         "scene": scene.name,
         **names,
@@ -186,6 +187,7 @@ def run(
         "resolution": [size.width, size.height],
         "stages": stages,
         "labels": audit,
+        "left_out": left_out,
         "gate": gate,
         "seconds": seconds,
         "history": history,

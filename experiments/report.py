@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from experiments.plots import line_plot
+from experiments.plots import Curve, line_plot
 from experiments.zoom_ladder import gain_over, zoom_curves
 from jaxcloseup.artifacts.images import png_data_uri
 from jaxcloseup.files import write_file
@@ -110,6 +110,7 @@ def write_report(
     parts += _zoom_plots(results["stages"])
     if results["labels"]:
         parts.append(_labels_table(results["labels"]))
+    parts += _label_plots(results["labels"], results["left_out"])
     if results["gate"]:
         parts.append(_gate_table(results["gate"]))
     section = None
@@ -141,6 +142,30 @@ def _zoom_plots(stages):
         gains = [gain_over(curves, "control", curve) for curve in curves if curve.name != "control"]
         axis |= {"y": "PSNR above control (dB)", "level": 0}
         parts.append(line_plot(gains, title="Gain", **axis))
+    return [*parts, "</div>"]
+
+
+def _label_plots(labels, left_out):
+    plots = []
+    names = {"error": "by the mask", "oracle": "by their true error"}
+    axis = {"x": "share of all pixels", "y": "mean absolute error"}
+    for depth, of_depth in labels.items():
+        if of_depth["curve"] is not None:
+            title = f"Labels from {depth.replace('_', ' ')}"
+            plots.append((title, of_depth["curve"], names))
+    if left_out is not None:
+        more = names | {"model": "of the model there"}
+        plots.append(("Left-out photographs", left_out, more))
+    if not plots:
+        return []
+    parts = [
+        "<h2>How many labels, and how good</h2><p>Labels are kept by how well the two warps agree, "
+        "those that agree best first; the lower curve is the best order there is. The area between "
+        "them, AUSE, is 0 for a mask that knows.</p><div class=plots>"
+    ]
+    for title, curve, shown in plots:
+        curves = [Curve(name, curve["coverage"], curve[key]) for key, name in shown.items()]
+        parts.append(line_plot(curves, title=f"{title}: AUSE {curve['ause']:.2f}", **axis))
     return [*parts, "</div>"]
 
 

@@ -1,11 +1,20 @@
-"""What photographs resolve of a close-up, against waves whose attenuation is known."""
+"""What photographs resolve of a close-up, and how well a mask sorts, against known cases."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import plane
 import pytest
+from tiny_runs import TINY
 
-from experiments.audit import resolved_by_photographs
+from experiments.audit import (
+    audit_labels,
+    error_curve,
+    left_out_curve,
+    resolved_by_photographs,
+)
+from experiments.presets import pseudo_settings
+from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_rays
 from jaxcloseup.scenes import Scene
 from jaxcloseup.scenes.scene import Surface
@@ -55,3 +64,59 @@ def test_nothing_is_resolved_where_no_photograph_looks():
     # The photograph is 30 pixels, 1 unit, to the right.
     x = np.asarray(pixel_grid(plane.HEIGHT, plane.WIDTH))[..., 0]
     np.testing.assert_array_equal(seen, x > 30)
+
+
+def test_curves_of_a_mask_that_knows_and_of_one_that_does_not():
+    error = np.linspace(0, 1, 20_001)
+    mixed = np.random.default_rng(0).permutation(error)
+    knows = error_curve(error, error, 40_002)
+    assert knows["ause"] == pytest.approx(0, abs=1e-9)
+    assert knows["error"] == knows["oracle"]
+    # Errors spread evenly from 0 to 1: of the best part f the mean is f / 2.
+    np.testing.assert_allclose(knows["error"], np.arange(1, 21) / 40, atol=1e-4)
+    assert knows["coverage"][-1] == 0.5
+    blind = error_curve(mixed, error, 40_002)
+    np.testing.assert_allclose(blind["error"], 0.5, atol=0.02)
+    # The area between 1 / 2 and f / 2 from f = 1 / 20 on, over the mean error.
+    assert blind["ause"] == pytest.approx(0.5 * (1 - 1 / 20) ** 2, abs=0.02)
+    # Scores that know, one tenth of labels that leak, all of them last.
+    leaks = error_curve(error, error, 20_001, {"leaked": error > 0.9})
+    np.testing.assert_allclose(leaks["leaked"][:18], 0, atol=1e-9)
+    assert leaks["leaked"][-1] == pytest.approx(0.1, abs=1e-3)
+    assert error_curve(np.zeros(0), np.zeros(0), 10) is None
+
+
+def test_labels_from_exact_depth_are_sorted_and_never_leak():
+    cameras = [plane.camera_above(x, 0.1 * x, 4.0, tilt=0.1 * x) for x in (-1.0, 0.0, 1.0)]
+    scene, depths = scene_of(cameras)
+    curve = audit_labels(
+        jax.random.key(0),
+        depths,
+        scene=scene,
+        settings=settings(),
+        depths=depths,
+        render_depth=lambda camera: striped(camera).depth,
+        count=3,
+    )["curve"]
+    assert curve["leaked"] == [0.0] * 20
+    assert 0.05 < curve["coverage"][-1] < 1
+    assert all(np.less_equal(curve["oracle"], np.add(curve["error"], 1e-9)))
+
+
+def test_left_out_photographs_judge_labels_and_model():
+    cameras = [plane.camera_above(x, 0.1 * x, 4.0, tilt=0.1 * x) for x in (-1.0, 0.0, 1.0)]
+    views, depths = plane.make_views(cameras)
+
+    def render(camera):  # a model that is right in depth and off by 0.1 in colour
+        rgb, depth, _ = plane.photograph(camera)
+        rgb, depth = (jnp.asarray(a, jnp.float32) for a in (rgb - 0.1, depth))
+        return Rendering(rgb, depth, jnp.ones_like(depth))
+
+    curve = left_out_curve(views, depths, render, settings())
+    np.testing.assert_allclose(curve["model"], 0.1, atol=5e-3)
+    assert max(curve["error"]) < 0.02
+    assert 0.3 < curve["coverage"][-1] <= 1
+
+
+def settings():
+    return pseudo_settings(TINY).replace(leave_out_source=jnp.float32(0))
