@@ -6,9 +6,12 @@ import time
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from orbax.checkpoint.multihost import sync_global_processes
 
 from experiments.presets import Preset, make_field, make_optimizer, make_train_config
 from jaxcloseup.artifacts.checkpoints import Checkpoints
@@ -19,6 +22,9 @@ from jaxcloseup.geometry.union_warp import SourceBlocks
 from jaxcloseup.pseudo import PseudoSettings
 from jaxcloseup.scenes import Scene
 from jaxcloseup.train import TrainState, labelled_step, pseudo_step, run_steps, train_step
+
+
+HOSTS_WAIT = 24 * 3600  # seconds
 
 
 class TrainingError(Exception):
@@ -38,6 +44,7 @@ class Programs:
         self.preset, self.scene = preset, scene
         self.optimizer: optax.GradientTransformation = make_optimizer(preset, scene)
         self.growth = 1
+        self._meetings = 0
         self._compile()
 
     def _compile(self) -> None:
@@ -120,15 +127,23 @@ class Programs:
           TrainingError: no step had a finite loss and gradient.
         """
         if kind == "arms":
+            if jax.process_count() > 1:
+                # One host may be minutes behind, but collectives wait for half a minute only.
+                self._meetings += 1
+                sync_global_processes(
+                    f"arms {self._meetings}",
+                    processes=set(range(jax.process_count())),
+                    timeout=HOSTS_WAIT,
+                )
             # What comes out of a checkpoint lies on one device.
             views, *of_arms = data
-            state = jax.device_put(state, self._on_devices[0])
-            data = (
-                jax.device_put(views, self._on_devices[1]),
-                *jax.device_put(of_arms, self._on_devices[2]),
-            )
+            of_states, shared, split = self._on_devices
+            state = jax.tree.map(_place, of_states, state)
+            data = (_place(shared, views), *(_place(split, one) for one in of_arms))
         while True:
             after, metrics = self._runners[kind](state, *data, count=count)
+            if kind == "arms" and jax.process_count() > 1:
+                after, metrics = _gather((after, metrics))
             metrics = jax.device_get(metrics)
             # Means of counts: positive if any step had an overflow.
             overflow = [metrics.pop(key, np.zeros(())) for key in ("overflow", "label_overflow")]
@@ -156,6 +171,36 @@ class Programs:
             if surfels is None or not int(surfels.overflow):
                 return rendering
             self._grow()
+
+
+def _place(sharding: NamedSharding, tree: Any) -> Any:
+    """Arrays that every host has whole, each host's part on its devices."""
+    if jax.process_count() == 1:
+        return jax.device_put(tree, sharding)
+
+    def place(leaf):
+        leaf = np.asarray(leaf)
+        return jax.make_array_from_callback(leaf.shape, sharding, leaf.__getitem__)
+
+    return _map_keys_as_numbers(place, tree)
+
+
+def _gather(tree: Any) -> Any:
+    """Arrays that are spread over several hosts, whole on each."""
+
+    def gather(leaf):
+        return jnp.asarray(multihost_utils.process_allgather(leaf, tiled=True))
+
+    return _map_keys_as_numbers(gather, tree)
+
+
+def _map_keys_as_numbers(change, tree):
+    def one(leaf):
+        if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(change(jax.random.key_data(leaf)))
+        return change(leaf)
+
+    return jax.tree.map(one, tree)
 
 
 def run_stage(

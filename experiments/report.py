@@ -139,8 +139,8 @@ def _zoom_plots(stages):
         line_plot(curves, y="PSNR (dB)", title="PSNR", **axis),
     ]
     if "control" in stages:
-        gains = [gain_over(curves, "control", curve) for curve in curves if curve.name != "control"]
-        axis |= {"y": "PSNR above control (dB)", "level": 0}
+        gains = [gain_over(curves, "control", curve) for curve in curves]
+        axis |= {"y": "PSNR above control (dB)"}
         parts.append(line_plot(gains, title="Gain", **axis))
     return [*parts, "</div>"]
 

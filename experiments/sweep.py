@@ -29,7 +29,7 @@ from experiments.evaluation import (
     find_perceptual,
     targets_by_split,
 )
-from experiments.loop import Programs, TrainingError, run_stage
+from experiments.loop import HOSTS_WAIT, Programs, TrainingError, run_stage
 from experiments.pipeline import config, rendered_depths, versions
 from experiments.presets import Preset, initial_points, pseudo_settings
 from experiments.set_up import set_up
@@ -79,6 +79,14 @@ flags.DEFINE_list(
 flags.DEFINE_integer(
     "max_parallel", 8, "arms and seeds trained at once, which bounds memory", lower_bound=1
 )
+flags.DEFINE_string(
+    "coordinator",
+    None,
+    "address:port of the first of several hosts that sweep together, each started with the same "
+    "flags but for --process_id, and with one --output_dir that all of them see",
+)
+flags.DEFINE_integer("num_processes", None, "how many hosts there are", lower_bound=1)
+flags.DEFINE_integer("process_id", None, "which of them this is, from 0", lower_bound=0)
 
 
 class Arm(NamedTuple):
@@ -236,9 +244,9 @@ def run_sweep(
         begun = [begin(arm, seed) for arm, seed in group]
         states, history = _train_together(stage, name, programs, views, group, begun)
         for i, (arm, seed) in enumerate(group):
-            state = jax.tree.map(lambda leaf, i=i: leaf[i], states.replace(step=states.step[None]))
+            alone = jax.tree.map(lambda leaf, i=i: leaf[i], states.replace(step=None))
             skipped = sum(chunk["skipped"][i] for chunk in history)
-            score(arm.name, seed, state.replace(step=states.step), skipped)
+            score(arm.name, seed, alone.replace(step=states.step), skipped)
     for arm, seed in in_turn:
         start = starts[seed]
         steps = preset.closeup_steps
@@ -335,6 +343,22 @@ def _label_targets(scene, programs, start, settings):
     return jax.jit(label_views)(*data, sources=start.sources)
 
 
+def _join_hosts() -> None:
+    """Have the devices of all hosts, if there are several."""
+    hosts = FLAGS.coordinator, FLAGS.num_processes, FLAGS.process_id
+    if hosts == (None, None, None):
+        return
+    if None in hosts or FLAGS.process_id >= FLAGS.num_processes:
+        raise ValueError(
+            "several hosts need --coordinator, --num_processes and, below it, --process_id: give "
+            "all three"
+        )
+    if FLAGS.output_dir is None:
+        raise ValueError("several hosts need one folder that all of them see: give --output_dir")
+    # Hosts that are done wait for the first one, which writes the tables.
+    jax.distributed.initialize(*hosts, shutdown_timeout_seconds=HOSTS_WAIT)
+
+
 def _check_flags(preset: Preset) -> None:
     for flag in ("scenes", "arms"):
         values = getattr(FLAGS, flag)
@@ -361,11 +385,14 @@ def main(argv: list[str]) -> None:
     set_up()
     names = {"method": FLAGS.method, "preset": FLAGS.preset}
     try:
+        _join_hosts()
         preset = command_line.preset_from_flags()
         _check_flags(preset)
-        output_dir = command_line.choose_output_dir(
-            FLAGS.output_dir, "sweep", FLAGS.method, resume=FLAGS.resume
-        )
+        output_dir = pathlib.Path(FLAGS.output_dir or "")
+        if jax.process_index() == 0:
+            output_dir = command_line.choose_output_dir(
+                FLAGS.output_dir, "sweep", FLAGS.method, resume=FLAGS.resume
+            )
         captures = [
             load_scene(name, downscale=preset.downscale, half_pixel=FLAGS.half_pixel)
             for name in FLAGS.scenes
@@ -391,11 +418,13 @@ def main(argv: list[str]) -> None:
                 max_parallel=FLAGS.max_parallel,
                 perceptual=find_perceptual(FLAGS.lpips_weights),
             )
-            write_sweep(output_dir, found, about)
+            if jax.process_index() == 0:
+                write_sweep(output_dir, found, about)
     except (TrainingError, CheckpointError, OSError) as error:
         sys.exit(f"experiments.sweep: {error}")
-    print_sweep(found)
-    print(f"report: {output_dir / 'report.html'}")
+    if jax.process_index() == 0:
+        print_sweep(found)
+        print(f"report: {output_dir / 'report.html'}")
 
 
 if __name__ == "__main__":

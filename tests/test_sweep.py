@@ -7,6 +7,7 @@ import json
 import os
 import pathlib
 import shutil
+import socket
 import subprocess
 import sys
 
@@ -115,11 +116,10 @@ def test_an_arm_that_diverges_takes_no_other_down(capture_folder, capsys):
     jax.tree.map(np.testing.assert_array_equal, first, arms[1][1].params)
 
 
-def sweep_tiny(scene, folder):
-    arms = ["baseline", "control", "diverse", "test_time"]
+def sweep_tiny(scene, folder, arms=("baseline", "control", "diverse", "test_time"), seeds=2):
     names = {"method": "nerf", "preset": "tiny"}
     with jax.numpy_dtype_promotion("standard"):
-        return run_sweep(scene, TINY_STEPS, arms, 2, folder, names=names, max_parallel=3)
+        return run_sweep(scene, TINY_STEPS, arms, seeds, folder, names=names, max_parallel=3)
 
 
 def test_a_sweep_cut_off_and_resumed_ends_the_same(capture_folder, tmp_path, monkeypatch, capsys):
@@ -257,31 +257,94 @@ def test_an_arm_may_have_labels_from_the_other_depth(capture_folder, tmp_path):
 
 
 DEVICES = """
-import sys
-sys.path.insert(0, {tests!r})
-import jax
-import test_sweep
-from tiny_runs import write_plane
-import pathlib, tempfile
 assert len(jax.devices()) == 8
-folder = write_plane(pathlib.Path(tempfile.mkdtemp()))
+folder = write_plane(pathlib.Path(sys.argv[1]))
 test_sweep.test_an_arm_is_the_run_alone(test_sweep.TINY_STEPS, folder)
 """
 
+HOSTS = """
+jax.distributed.initialize("127.0.0.1:" + sys.argv[2], 2, int(sys.argv[3]))
+assert len(jax.devices()) == 2 * len(jax.local_devices())
+folder = pathlib.Path(sys.argv[1])
+scene = test_sweep.load_scene(str(folder / "capture"))
+found = test_sweep.sweep_tiny(scene, folder / "sweep", ("control", "diverse"), 1)
+(folder / ("host" + sys.argv[3] + ".json")).write_text(json.dumps(found))
+"""
 
-def test_arms_are_spread_over_all_devices():
-    """On eight devices of the host, four arms and four copies of the last give what one gives."""
+
+def start(script, *arguments, devices=1):
+    """A Python of its own, on so many devices of this host, with this session's programs."""
     tests = pathlib.Path(__file__).parent
     environment = os.environ | {
         "JAX_PLATFORMS": "cpu",
-        "XLA_FLAGS": "--xla_force_host_platform_device_count=8",
-        "PYTHONPATH": f"{tests.parent}",
+        "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
+        "PYTHONPATH": os.pathsep.join([str(tests.parent), str(tests)]),
+        "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir,
     }
-    done = subprocess.run(
-        [sys.executable, "-c", DEVICES.format(tests=str(tests))],
+    imports = "import json, pathlib, sys, jax, test_sweep; from tiny_runs import write_plane"
+    return subprocess.Popen(
+        [sys.executable, "-c", f"{imports}\n{script}", *map(str, arguments)],
         env=environment,
-        capture_output=True,
+        stderr=subprocess.PIPE,
         text=True,
-        check=False,
     )
-    assert done.returncode == 0, done.stderr[-2000:]
+
+
+def finish(process):
+    _, error = process.communicate(timeout=600)
+    assert process.returncode == 0, error[-2000:]
+
+
+def test_arms_are_spread_over_all_devices(tmp_path):
+    """On eight devices of the host, four arms and four copies of the last give what one gives."""
+    finish(start(DEVICES, tmp_path, devices=8))
+
+
+def test_arms_are_spread_over_hosts(capture_folder, tmp_path):
+    """Two processes that know each other end with what one ends with; the first one writes."""
+    (tmp_path / "capture").symlink_to(capture_folder)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    for process in [start(HOSTS, tmp_path, port, i) for i in range(2)]:
+        finish(process)
+    hosts = [json.loads((tmp_path / f"host{i}.json").read_text()) for i in range(2)]
+    assert hosts[0] == hosts[1]
+    scene = load_scene(str(capture_folder))
+    whole = sweep_tiny(scene, tmp_path / "alone", ("control", "diverse"), 1)
+    for arm, by_seed in whole.items():
+        for seed, result in by_seed.items():
+            for split, metrics in result["splits"].items():
+                found = hosts[0][arm][seed]["splits"][split]["psnr"]
+                assert found == pytest.approx(metrics["psnr"], abs=1e-2)
+    # What the first host kept, one host alone can go on from, and the other way round.
+    kept, alone = (
+        {path.relative_to(folder) for path in folder.glob("*/*")}
+        for folder in (tmp_path / "sweep", tmp_path / "alone")
+    )
+    assert kept == alone
+
+
+@pytest.mark.parametrize(
+    "hosts",
+    [
+        {"coordinator": "127.0.0.1:1"},
+        {"num_processes": 2, "process_id": 0},
+        {"coordinator": "127.0.0.1:1", "num_processes": 2, "process_id": 2},
+    ],
+)
+def test_hosts_need_all_three_flags(parsed_flags, tmp_path, hosts):
+    with (
+        flagsaver.flagsaver(output_dir=str(tmp_path / "out"), **hosts),
+        pytest.raises(SystemExit, match="several hosts need --coordinator, --num_processes and"),
+    ):
+        sweep.main(["sweep"])
+
+
+def test_hosts_need_one_folder(parsed_flags):
+    hosts = {"coordinator": "127.0.0.1:1", "num_processes": 2, "process_id": 1}
+    with (
+        flagsaver.flagsaver(output_dir=None, **hosts),
+        pytest.raises(SystemExit, match="give --output_dir"),
+    ):
+        sweep.main(["sweep"])

@@ -1,6 +1,7 @@
 """Checkpoints of a run: training states of its stages, and what run they are of.
 
-Orbax writes beside and renames, so a checkpoint that a crash cut short is never seen.
+Orbax writes beside and renames, so a checkpoint that a crash cut short is never seen. Where several
+hosts train together the first one writes and all read; states are then whole on each of them.
 """
 
 import json
@@ -9,6 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import orbax.checkpoint as ocp
 
 from jaxcloseup.files import write_file
@@ -36,6 +38,8 @@ class Checkpoints:
         identity = json.loads(json.dumps(identity))
         path = self.folder / "run.json"
         if not path.exists():
+            if jax.process_index() > 0:
+                return
             write_file(path, json.dumps(identity, indent=1).encode())
             return
         try:
@@ -56,6 +60,8 @@ class Checkpoints:
 
         `state` is a pytree of arrays; random keys are kept too.
         """
+        if jax.process_index() > 0:
+            return
         items = ocp.args.Composite(
             state=ocp.args.StandardSave(_plain(state)), progress=ocp.args.JsonSave(dict(progress))
         )
@@ -78,7 +84,7 @@ class Checkpoints:
                 f"({str(error).splitlines()[0]}): remove it to go on from an earlier one."
             ) from error
         state = jax.tree.map(
-            lambda new, old: jax.random.wrap_key_data(new) if _is_key(old) else new,
+            lambda new, old: jax.random.wrap_key_data(new) if _is_key(old) else jnp.asarray(new),
             found["state"],
             like,
         )
@@ -86,10 +92,18 @@ class Checkpoints:
 
     def _manager(self, stage):
         if stage not in self._managers:
+            folder = self.folder / stage
+            folder.mkdir(parents=True, exist_ok=True)
+            here, alone = jax.process_index(), ocp.options.MultiprocessingOptions()
+            if jax.process_count() > 1:
+                alone = ocp.options.MultiprocessingOptions(here, {here}, f"host_{here}")
             options = ocp.CheckpointManagerOptions(
-                max_to_keep=2, create=True, enable_async_checkpointing=False
+                max_to_keep=2,
+                create=False,
+                enable_async_checkpointing=False,
+                multiprocessing_options=alone,
             )
-            self._managers[stage] = ocp.CheckpointManager(self.folder / stage, options=options)
+            self._managers[stage] = ocp.CheckpointManager(folder, options=options)
         return self._managers[stage]
 
 
@@ -107,4 +121,7 @@ def _is_key(leaf):
 
 
 def _plain(state):
-    return jax.tree.map(lambda leaf: jax.random.key_data(leaf) if _is_key(leaf) else leaf, state)
+    """The state as NumPy arrays, which belong to no device of no host."""
+    return jax.device_get(
+        jax.tree.map(lambda leaf: jax.random.key_data(leaf) if _is_key(leaf) else leaf, state)
+    )
