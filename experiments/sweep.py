@@ -15,12 +15,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from absl import app, flags
 
 import jaxcloseup
 from experiments import command_line
-from experiments.audit import resolved_by_photographs
+from experiments.arms import ARMS_IN_TURN, NAMED_ARMS, make_arm, why_not
 from experiments.evaluation import (
     NO_PERCEPTUAL,
     Perceptual,
@@ -29,6 +28,7 @@ from experiments.evaluation import (
     find_perceptual,
     targets_by_split,
 )
+from experiments.fixed_labels import labels_of_less_error, true_close_ups
 from experiments.loop import HOSTS_WAIT, Programs, TrainingError, run_stage
 from experiments.pipeline import config, rendered_depths, versions
 from experiments.presets import Preset, initial_points, pseudo_settings
@@ -36,10 +36,9 @@ from experiments.set_up import set_up
 from experiments.sweep_report import print_sweep, write_sweep
 from experiments.zoom_ladder import ladder_targets
 from jaxcloseup.artifacts.checkpoints import CheckpointError, Checkpoints
-from jaxcloseup.batch import Views
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.geometry.union_warp import SourceBlocks, block_sources
-from jaxcloseup.pseudo import PseudoSettings, label_views, sample_virtual_camera
+from jaxcloseup.pseudo import PseudoSettings, label_views
 from jaxcloseup.scenes import Scene, SceneError, load_scene
 from jaxcloseup.splats.field import SurfelConfig
 from jaxcloseup.train import TrainState, init_state
@@ -53,17 +52,6 @@ class _Start(NamedTuple):
     sources: SourceBlocks
     skipped: int
 
-
-# The paper's Table 1, its two test-time rows, and what they are to be held against.
-_FIXED_POSES = {"fixed_anchors": 1.0, "magnification": [4.0, 4.0], "max_angle": 0.0}
-NAMED_ARMS: dict[str, dict[str, Any]] = {
-    "control": {"label_share": 0.0},
-    "labels": {"use_mask": 0.0, **_FIXED_POSES},
-    "mask": _FIXED_POSES,
-    "diverse": {},
-}
-ARMS_IN_TURN = ("oracle", "resolved", "test_time")  # labelled once, before their first step
-ORACLE_VIEWS = 64
 
 FLAGS = flags.FLAGS
 flags.DEFINE_list("scenes", ["table"], "built-in scenes or folders")
@@ -87,69 +75,6 @@ flags.DEFINE_string(
 )
 flags.DEFINE_integer("num_processes", None, "how many hosts there are", lower_bound=1)
 flags.DEFINE_integer("process_id", None, "which of them this is, from 0", lower_bound=0)
-
-
-class Arm(NamedTuple):
-    """An arm's name and settings, and whether its labels are made with the expected depth.
-
-    Of the latter None is what the field has by itself.
-    """
-
-    name: str
-    settings: PseudoSettings
-    expected_depth: bool | None = None
-
-    @property
-    def in_turn(self) -> bool:
-        """Whether it is trained alone."""
-        return self.name in ARMS_IN_TURN
-
-
-def make_arm(name: str, settings: PseudoSettings) -> Arm:
-    """An arm by its name, with the preset's settings changed as the name says.
-
-    Raises:
-      ValueError: the name is none, with what it could be.
-    """
-    if name == "baseline" or name in ARMS_IN_TURN:
-        return Arm(name, settings)
-    changes = dict(NAMED_ARMS[name] if name in NAMED_ARMS else _parse(name))
-    expected_depth = changes.pop("expected_depth", None)
-    for field, value in changes.items():
-        settings = _change(settings, name, field, value)
-    if expected_depth not in (None, 0.0, 1.0):
-        raise ValueError(f"--arms={name}: expected_depth is 0 (labels from median depth) or 1")
-    return Arm(name, settings, None if expected_depth is None else bool(expected_depth))
-
-
-def _parse(name):
-    changes = {}
-    for change in name.split("+"):
-        field, equals, text = change.partition("=")
-        try:
-            values = [float(value) for value in text.split(":")]
-        except ValueError:
-            equals = ""
-        if not equals:
-            known = ", ".join(["baseline", *NAMED_ARMS, *ARMS_IN_TURN])
-            raise ValueError(f"--arms={name} is not an arm: name {known}, or setting=number")
-        changes[field] = values[0] if len(values) == 1 else values
-    return changes
-
-
-def _change(settings, arm, field, value):
-    holder = settings if field in vars(settings) else settings.pose
-    old = vars(holder).get(field)
-    known = field != "pose" and old is not None and jnp.shape(old) == np.shape(value)
-    if not known or not np.all(np.diff(np.atleast_1d(value)) >= 0) or np.any(np.isnan(value)):
-        fields = {*vars(settings), *vars(settings.pose), "expected_depth"} - {"pose"}
-        raise ValueError(
-            f"--arms={arm}: {field} takes no such value; settings are "
-            + ", ".join(sorted(fields))
-            + ", of which magnification is a range as in 2:8"
-        )
-    changed = holder.replace(**{field: jnp.asarray(value, old.dtype)})
-    return changed if holder is settings else settings.replace(pose=changed)
 
 
 def run_sweep(
@@ -176,10 +101,10 @@ def run_sweep(
       perceptual: networks of LPIPS.
     """
     chosen = [make_arm(name, pseudo_settings(preset)) for name in arms]
-    for name, reason in _impossible(scene).items():
-        if name in arms:
-            print(f"no {name} of {scene.name}: {reason}")
-    chosen = [arm for arm in chosen if arm.name not in _impossible(scene)]
+    for arm in chosen:
+        if why_not(arm, scene):
+            print(f"no {arm.name} of {scene.name}: {why_not(arm, scene)}")
+    chosen = [arm for arm in chosen if not why_not(arm, scene)]
     programs = Programs(preset, scene)
     views = jax.device_put(scene.train)
     identity = {"scene": scene.name, "config": config(preset), "seeds": seeds, **names}
@@ -250,12 +175,19 @@ def run_sweep(
     for arm, seed in in_turn:
         start = starts[seed]
         steps = preset.closeup_steps
-        if arm.name != "test_time":
-            key, blurred = jax.random.key(seed), arm.name == "resolved"
-            data = scene, start.depths, exact, arm.settings
-            labels = true_close_ups(key, *data, blurred=blurred)
+        depths_of = functools.partial(_depths, programs, start.state)
+        data = scene, start.depths, exact
+        if arm.depth_error is not None:
+            data = *data, depths_of, arm.settings
+            labels = labels_of_less_error(jax.random.key(seed), *data, share=arm.depth_error)
+        elif arm.name != "test_time":
+            blurred = arm.name == "resolved"
+            data = *data, arm.settings
+            labels = true_close_ups(jax.random.key(seed), *data, blurred=blurred)
         else:
-            labels = _label_targets(scene, programs, start, arm.settings)
+            cameras = scene.test.cameras
+            data = cameras, depths_of(cameras), scene.train, start.depths, arm.settings
+            labels = jax.jit(label_views)(*data, sources=start.sources)
             whole = isinstance(preset.field, SurfelConfig)
             steps = preset.test_time_steps * (len(scene.test) if whole else 1)
         name = f"{arm.name}_{seed}"
@@ -267,16 +199,6 @@ def run_sweep(
             continue
         score(arm.name, seed, state, _skipped(history))
     return results
-
-
-def _impossible(scene: Scene) -> dict[str, str]:
-    """Arms that this scene cannot have, and why."""
-    reasons = {}
-    if scene.surface is None:
-        reasons |= dict.fromkeys(("oracle", "resolved"), "nobody knows the true pixels")
-    if scene.test is None:
-        reasons["test_time"] = "it has no close-ups to label"
-    return reasons
 
 
 def _skipped(history: Sequence[Mapping[str, Any]]) -> int:
@@ -309,38 +231,8 @@ def _train_together(stage, name, programs, views, group, begun):
     return stage(name, programs, "arms", states, views, *data, steps=steps)
 
 
-def true_close_ups(
-    key: jax.Array,
-    scene: Scene,
-    depths: jax.Array,
-    exact: jax.Array,
-    settings: PseudoSettings,
-    *,
-    blurred: bool,
-) -> Views:
-    """Random virtual close-ups with their true pixels, where a training view sees the surface.
-
-    The ceiling of what labels can do: no photograph holds so much detail, unless `blurred` leaves
-    of it what the nearest one resolves.
-    """
-    sample, surface = jax.jit(sample_virtual_camera), jax.jit(scene.surface)
-    images = []
-    for one in jax.random.split(key, ORACLE_VIEWS):
-        camera, _ = sample(one, scene.train, depths, settings)
-        resolved, seen = resolved_by_photographs(scene, camera, exact)
-        rgb = resolved if blurred else surface(camera).rgb
-        images.append(Views(camera, jnp.asarray(rgb, jnp.float32), jnp.asarray(seen, jnp.float32)))
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *images)
-
-
 def _depths(programs: Programs, state: TrainState, cameras: Camera) -> jax.Array:
     return rendered_depths(functools.partial(programs.render, state), cameras, programs.scene)
-
-
-def _label_targets(scene, programs, start, settings):
-    seen = _depths(programs, start.state, scene.test.cameras)
-    data = scene.test.cameras, seen, scene.train, start.depths, settings
-    return jax.jit(label_views)(*data, sources=start.sources)
 
 
 def _join_hosts() -> None:

@@ -20,10 +20,11 @@ from absl.testing import flagsaver
 from tiny_runs import TINY, TINY_SURFELS
 
 from experiments import sweep
+from experiments.arms import make_arm
 from experiments.loop import Programs
 from experiments.pipeline import rendered_depths
 from experiments.presets import initial_points, pseudo_settings
-from experiments.sweep import make_arm, run_sweep, stack_arms
+from experiments.sweep import run_sweep, stack_arms
 from experiments.sweep_report import paired_bootstrap, rows, write_sweep
 from jaxcloseup.geometry.union_warp import block_sources
 from jaxcloseup.scenes import load_scene
@@ -219,6 +220,8 @@ def parsed_flags():
         ({"method": "nerf", "arms": ["label_share=0.3"]}, "this preset pools the losses"),
         ({"method": "nerf", "arms": ["expected_depth=1"]}, "a NeRF has expected depth only"),
         ({"arms": ["expected_depth=2"]}, "expected_depth is 0"),
+        ({"arms": ["depth_error=-1"]}, "depth_error is a part"),
+        ({"arms": ["depth_error=0+expected_depth=1"]}, "do not go together"),
         ({"scenes": ["nowhere"]}, "nowhere"),
     ],
 )
@@ -242,6 +245,7 @@ def test_names_change_settings():
     assert arm.expected_depth is True
     assert (arm.settings.pose.look_at, arm.settings.num_sources) == (1, 3)
     assert make_arm("diverse", pseudo_settings(TINY)).expected_depth is None
+    assert make_arm("depth_error=0", pseudo_settings(TINY)).in_turn
 
 
 def test_an_arm_may_have_labels_from_the_other_depth(capture_folder, tmp_path):

@@ -4,11 +4,12 @@ import functools
 
 import jax
 
+from experiments.arms import make_arm
 from experiments.benchmarks.timing import interleaved_medians
 from experiments.loop import Programs
 from experiments.pipeline import rendered_depths
 from experiments.presets import PRESETS, initial_points, pseudo_settings
-from experiments.sweep import make_arm, stack_arms
+from experiments.sweep import stack_arms
 from jaxcloseup.geometry.union_warp import block_sources
 from jaxcloseup.scenes import load_scene
 from jaxcloseup.train import init_state

@@ -1,0 +1,105 @@
+"""The arms of a sweep: the rows of the paper's Table 1, ceilings, and any setting with a value."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcloseup.pseudo import PseudoSettings
+from jaxcloseup.scenes import Scene
+
+
+# The paper's Table 1, its two test-time rows, and what they are to be held against.
+_FIXED_POSES = {"fixed_anchors": 1.0, "magnification": [4.0, 4.0], "max_angle": 0.0}
+NAMED_ARMS: dict[str, dict[str, Any]] = {
+    "control": {"label_share": 0.0},
+    "labels": {"use_mask": 0.0, **_FIXED_POSES},
+    "mask": _FIXED_POSES,
+    "diverse": {},
+}
+ARMS_IN_TURN = ("oracle", "resolved", "test_time")  # labelled once, before their first step
+
+
+class Arm(NamedTuple):
+    """One arm.
+
+    Attributes:
+      name: as it was asked for.
+      settings: of its labels.
+      expected_depth: whether these are made with the expected depth or the median one; None for
+        what the field has by itself.
+      depth_error: part of the depth's error that is left in them; None for depth as it is.
+    """
+
+    name: str
+    settings: PseudoSettings
+    expected_depth: bool | None = None
+    depth_error: float | None = None
+
+    @property
+    def in_turn(self) -> bool:
+        """Whether it is trained alone, on views that are labelled before its first step."""
+        return self.name in ARMS_IN_TURN or self.depth_error is not None
+
+
+def make_arm(name: str, settings: PseudoSettings) -> Arm:
+    """An arm by its name, with the preset's settings changed as the name says.
+
+    Raises:
+      ValueError: the name is none, with what it could be.
+    """
+    if name == "baseline" or name in ARMS_IN_TURN:
+        return Arm(name, settings)
+    changes = dict(NAMED_ARMS[name] if name in NAMED_ARMS else _parse(name))
+    expected_depth, depth_error = (changes.pop(k, None) for k in ("expected_depth", "depth_error"))
+    for field, value in changes.items():
+        settings = _change(settings, name, field, value)
+    if expected_depth not in (None, 0.0, 1.0):
+        raise ValueError(f"--arms={name}: expected_depth is 0 (labels from median depth) or 1")
+    if None not in (expected_depth, depth_error):
+        raise ValueError(f"--arms={name}: expected_depth and depth_error do not go together")
+    if depth_error is not None and not (np.ndim(depth_error) == 0 and depth_error >= 0):
+        raise ValueError(f"--arms={name}: depth_error is a part, as in 0.5, and not negative")
+    expected_depth = None if expected_depth is None else bool(expected_depth)
+    return Arm(name, settings, expected_depth, depth_error)
+
+
+def _parse(name):
+    changes = {}
+    for change in name.split("+"):
+        field, equals, text = change.partition("=")
+        try:
+            values = [float(value) for value in text.split(":")]
+        except ValueError:
+            equals = ""
+        if not equals:
+            known = ", ".join(["baseline", *NAMED_ARMS, *ARMS_IN_TURN])
+            raise ValueError(f"--arms={name} is not an arm: name {known}, or setting=number")
+        changes[field] = values[0] if len(values) == 1 else values
+    return changes
+
+
+def _change(settings, arm, field, value):
+    holder = settings if field in vars(settings) else settings.pose
+    old = vars(holder).get(field)
+    known = field != "pose" and old is not None and jnp.shape(old) == np.shape(value)
+    if not known or not np.all(np.diff(np.atleast_1d(value)) >= 0) or np.any(np.isnan(value)):
+        fields = {*vars(settings), *vars(settings.pose), "expected_depth", "depth_error"} - {"pose"}
+        raise ValueError(
+            f"--arms={arm}: {field} takes no such value; settings are "
+            + ", ".join(sorted(fields))
+            + ", of which magnification is a range as in 2:8"
+        )
+    changed = holder.replace(**{field: jnp.asarray(value, old.dtype)})
+    return changed if holder is settings else settings.replace(pose=changed)
+
+
+def why_not(arm: Arm, scene: Scene) -> str | None:
+    """Why a scene cannot have an arm, or None."""
+    if scene.surface is None and arm.name in ("oracle", "resolved"):
+        return "nobody knows the true pixels"
+    if scene.surface is None and arm.depth_error is not None:
+        return "nobody knows the true depth"
+    if scene.test is None and arm.name == "test_time":
+        return "it has no close-ups to label"
+    return None
