@@ -241,10 +241,23 @@ def run_stage(
         programs.make_room(progress["growth"])
         print(f"{name:>9} {done}/{steps}  resumed")
     saved = done
+
+    def keep():
+        progress = {"history": history, "growth": programs.growth}
+        checkpoints.save(name, done, state, progress)
+
     start = time.perf_counter()
     while done < steps:
         count = min(chunk, steps - done)
-        state, values = programs.run(kind, state, *data, count=count)
+        try:
+            state, values = programs.run(kind, state, *data, count=count)
+        except TrainingError as error:
+            if done > saved:
+                keep()
+            raise TrainingError(
+                f"{name} stopped after {done} good steps, whose state is kept in "
+                f"{checkpoints.folder}: {error}"
+            ) from error
         done += count
         history.append({"step": done} | values)
         rate = (done - begun) / (time.perf_counter() - start)
@@ -257,7 +270,6 @@ def run_stage(
             flush=True,
         )
         if done == steps or done - saved >= save_every:
-            progress = {"history": history, "growth": programs.growth}
-            checkpoints.save(name, done, state, progress)
+            keep()
             saved = done
     return state, history

@@ -16,7 +16,7 @@ from experiments import run as program
 from experiments.audit import blur_to_footprint
 from experiments.evaluation import Target, score, summarise
 from experiments.gate import choose_settings, print_gate
-from experiments.loop import Programs, TrainingError
+from experiments.loop import Programs, TrainingError, run_stage
 from experiments.pipeline import config, run
 from experiments.presets import (
     PRESETS,
@@ -261,20 +261,37 @@ def test_surfels_can_be_cloned_and_split(parsed_flags):
     assert field.opacity_weight == 0
 
 
-def test_training_that_never_is_finite_stops_with_one_sentence(capture_folder):
+def test_training_that_is_no_longer_finite_stops_with_what_was_good(capture_folder, tmp_path):
     with jax.numpy_dtype_promotion("standard"):
         scene = load_scene(str(capture_folder))
         programs = Programs(TINY, scene)
-        state = init_state(
-            jax.random.key(0),
-            scene.points,
-            scene.rgb,
-            field=programs.field,
-            optimizer=programs.optimizer,
-        )
+        points = scene.points, scene.rgb
+        key = jax.random.key(0)
+        state = init_state(key, *points, field=programs.field, optimizer=programs.optimizer)
         broken = scene.train.replace(rgb=jnp.full(scene.train.rgb.shape, jnp.nan))
-        with pytest.raises(TrainingError, match="not finite in each of 3 steps"):
-            programs.run("photographs", state, broken, count=3)
+        checkpoints = Checkpoints(tmp_path, {"scene": "plane"})
+        good, run = [], programs.run
+
+        def breaks_after_two(kind, state, views, *, count):
+            now = run(kind, state, views if len(good) < 2 else broken, count=count)
+            good.append(now[0])
+            return now
+
+        programs.run = breaks_after_two
+        with pytest.raises(TrainingError, match=r"stopped after 2 good .* not finite in each of 1"):
+            run_stage(
+                "baseline",
+                programs,
+                "photographs",
+                state,
+                scene.train,
+                steps=10,
+                checkpoints=checkpoints,
+                save_every=1000,
+            )
+        step, kept, progress = Checkpoints(tmp_path, {"scene": "plane"}).load("baseline", state)
+    assert step == len(good) == len(progress["history"]) == 2
+    jax.tree.map(np.testing.assert_array_equal, kept.params, good[-1].params)
 
 
 def test_numbers_that_are_not_finite_become_null(tmp_path):
