@@ -1,5 +1,8 @@
 """Arithmetic that stays finite, in values and in gradients, where the plain form does not."""
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -21,3 +24,15 @@ def safe_norm(x: jax.Array, *, axis: int = -1, keepdims: bool = False) -> jax.Ar
 def matmul(a: jax.Array, b: jax.Array) -> jax.Array:
     """Matrix product in full precision, for geometry: accelerators would otherwise round inputs."""
     return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)
+
+
+def take_turns(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function` whose `jax.vmap` computes one member of the batch after the other on a CPU.
+
+    For work that is cut to the size of a core's cache: done for a whole batch at once it would not
+    fit. Elsewhere batches stay together. The function takes arrays, closes over none that may be
+    batched, and is not differentiated in reverse.
+    """
+    if jax.default_backend() != "cpu":
+        return function
+    return jax.custom_batching.sequential_vmap(function)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from jaxcloseup.batch import Batch
 from jaxcloseup.field import RadianceField
-from jaxcloseup.numerics import safe_divide
+from jaxcloseup.numerics import safe_divide, take_turns
 
 
 Loss = tuple[jax.Array, dict[str, jax.Array]]
@@ -58,6 +58,10 @@ def _chunked(field, chunk, params, buffers, batch, key):
 
 
 def _chunked_forward(field, chunk, params, buffers, batch, key):
+    return take_turns(functools.partial(_add_up, field, chunk))(params, buffers, batch, key)
+
+
+def _add_up(field, chunk, params, buffers, batch, key):
     total = jnp.sum(batch.weight)
 
     def add_gradient(gradients, piece):

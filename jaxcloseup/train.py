@@ -17,6 +17,7 @@ from jaxcloseup.batch import Batch, Views, sample_image, sample_pixels
 from jaxcloseup.field import RadianceField, Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.geometry.union_warp import SourceBlocks
+from jaxcloseup.numerics import take_turns
 from jaxcloseup.pseudo import PseudoSettings, make_label, sample_virtual_camera
 from jaxcloseup.rendered_loss import rendered_loss
 
@@ -153,23 +154,26 @@ def pseudo_step(
     pixels = _sample_virtual_pixels(key_pixels, camera, config.num_label_rays)
     label_pixels = pixel_grid(camera.height, camera.width) if pixels is None else pixels
 
-    def render(params):
-        key = key_depth if config.perturbed_depth else None
-        return field.render(params, state.buffers, camera, pixels, key)
+    key_depth = key_depth if config.perturbed_depth else None
+
+    def render(params, buffers, camera, pixels, key):
+        return field.render(params, buffers, camera, pixels, key)
 
     def label_of(seen):
         depth = seen.depth * seen.alpha if config.undivided_depth else seen.depth
         data = source_index, views, depths, settings
         return make_label(camera, label_pixels, depth, *data, sources=sources)
 
+    of_virtual = state.buffers, camera, pixels, key_depth
+
     loss_of = functools.partial(rendered_loss, field=field, chunk=config.gradient_chunk)
     if pixels is not None:
-        label = label_of(render(jax.lax.stop_gradient(state.params)))
+        label = label_of(take_turns(render)(jax.lax.stop_gradient(state.params), *of_virtual))
 
     def loss(params):
         if pixels is None:
             # The image that depth is taken from is the one that is judged.
-            seen = render(params)
+            seen = render(params, *of_virtual)
             of_image = label_of(jax.lax.stop_gradient(seen))
             coverage = jnp.mean(of_image.weight)
             virtual_loss, virtual_metrics = field.loss(seen, of_image.rgb, of_image.weight)
