@@ -15,7 +15,9 @@ from jaxcloseup.scenes.errors import SceneError
 NAMES = ("cameras", "images", "points3D")
 
 
-def check_files(folder: pathlib.Path, suffix: str, count_parameters: Callable[[int | str], int]):
+def check_files(
+    folder: pathlib.Path, suffix: str, count_parameters: Callable[[int | str], int]
+) -> None:
     """Walk through a model's cameras, images and points, and complain of what cannot be right.
 
     Args:
