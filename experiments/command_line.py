@@ -8,6 +8,9 @@ import pathlib
 from absl import flags
 
 from experiments.presets import PRESETS, Preset, with_classic_density
+from jaxcloseup.scenes import Scene, load_scene
+from jaxcloseup.scenes.formats import FORMATS
+from jaxcloseup.scenes.splits import SPLITS
 
 
 FLAGS = flags.FLAGS
@@ -56,6 +59,20 @@ flags.DEFINE_float(
 flags.DEFINE_bool(
     "half_pixel", False, "the capture has pixel centres at integers: add 0.5 to cx, cy"
 )
+flags.DEFINE_enum(
+    "format",
+    None,
+    list(FORMATS),
+    "what to read of a capture's folder: transforms*.json, a COLMAP model or LLFF's "
+    "poses_bounds.npy; default: the first of them that is there",
+)
+flags.DEFINE_enum(
+    "split",
+    "given",
+    list(SPLITS),
+    "photographs that are held out: as the capture says; every 8th by name, as test_far; or the "
+    "closest tenth, as test, and of the rest every 8th",
+)
 _OF_METHOD = {"nerf": ("compute_dtype",), "surfels": ("density", "colour_ridge")}
 
 
@@ -85,6 +102,31 @@ def preset_from_flags() -> Preset:
             field = with_classic_density(field, FLAGS.preset)
         given["field"] = field
     return dataclasses.replace(preset, **given)
+
+
+def names_from_flags() -> dict[str, str]:
+    """What tells runs apart beside their configuration, for reports and checkpoints."""
+    names = {"method": FLAGS.method, "preset": FLAGS.preset}
+    chosen = {key: FLAGS[key] for key in ("format", "split")}
+    return names | {key: flag.value for key, flag in chosen.items() if flag.value != flag.default}
+
+
+def scene_from_flags(name: str, downscale: int) -> Scene:
+    """A built-in scene or a capture, with a printed note on what of it was read.
+
+    Raises:
+      SceneError: one sentence that says what to do.
+    """
+    scene = load_scene(
+        name,
+        downscale=downscale,
+        half_pixel=FLAGS.half_pixel,
+        format=FLAGS.format,
+        split=FLAGS.split,
+    )
+    for note in scene.metadata.get("notes", ()):
+        print(note)
+    return scene
 
 
 def choose_output_dir(

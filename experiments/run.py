@@ -18,7 +18,7 @@ from experiments.pipeline import STAGES, run
 from experiments.report import print_table
 from experiments.set_up import set_up
 from jaxcloseup.artifacts.checkpoints import CheckpointError
-from jaxcloseup.scenes import SceneError, load_scene
+from jaxcloseup.scenes import SceneError
 
 
 FLAGS = flags.FLAGS
@@ -42,18 +42,17 @@ def main(argv: list[str]) -> None:
         output_dir = command_line.choose_output_dir(
             FLAGS.output_dir, FLAGS.scene, FLAGS.method, resume=FLAGS.resume
         )
-        scene = load_scene(FLAGS.scene, downscale=preset.downscale, half_pixel=FLAGS.half_pixel)
+        scene = command_line.scene_from_flags(FLAGS.scene, preset.downscale)
         output_dir.mkdir(parents=True, exist_ok=True)
     except (SceneError, OSError, ValueError) as error:
         sys.exit(f"experiments.run: {error}")
-    names = {"method": FLAGS.method, "preset": FLAGS.preset}
     try:
         results = run(
             scene,
             preset,
             FLAGS.seed,
             output_dir,
-            names=names,
+            names=command_line.names_from_flags(),
             to_run=FLAGS.stages,
             save_every=FLAGS.save_every,
             perceptual=find_perceptual(FLAGS.lpips_weights),

@@ -39,7 +39,7 @@ from jaxcloseup.artifacts.checkpoints import CheckpointError, Checkpoints
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.geometry.union_warp import SourceBlocks, block_sources
 from jaxcloseup.pseudo import PseudoSettings, label_views
-from jaxcloseup.scenes import Scene, SceneError, load_scene
+from jaxcloseup.scenes import Scene, SceneError
 from jaxcloseup.splats.field import SurfelConfig
 from jaxcloseup.train import TrainState, init_state
 
@@ -275,7 +275,7 @@ def main(argv: list[str]) -> None:
     if len(argv) > 1:
         raise app.UsageError(f"unexpected argument: {argv[1]}")
     set_up()
-    names = {"method": FLAGS.method, "preset": FLAGS.preset}
+    names = command_line.names_from_flags()
     try:
         _join_hosts()
         preset = command_line.preset_from_flags()
@@ -285,10 +285,7 @@ def main(argv: list[str]) -> None:
             output_dir = command_line.choose_output_dir(
                 FLAGS.output_dir, "sweep", FLAGS.method, resume=FLAGS.resume
             )
-        captures = [
-            load_scene(name, downscale=preset.downscale, half_pixel=FLAGS.half_pixel)
-            for name in FLAGS.scenes
-        ]
+        captures = [command_line.scene_from_flags(name, preset.downscale) for name in FLAGS.scenes]
         if len({scene.name for scene in captures}) < len(captures):
             raise ValueError(
                 f"--scenes={','.join(FLAGS.scenes)} has two of one name: sweep them one at a time"

@@ -81,9 +81,14 @@ def without(key, **changes):
         ([frame("train/a.png", cy=True)], "cy must be a finite number, got True"),
         ([frame("train/a.png", w=8)], "w and h belong together"),
         ([frame("train/a.png", w=8, h=0)], "h must be greater than 0"),
-        ([frame("train/a.png", k1=0.1, p2=-0.1)], r"distortion \(non-zero k1, p2\) is not supp"),
-        ([frame("train/a.png", camera_model="OPENCV_FISHEYE")], "OPENCV_FISHEYE.*undistort"),
-        ([frame("train/a.png", is_fisheye=True)], r"distortion \(is_fisheye\)"),
+        ([frame("train/a.png", k1=0.1, k4=-0.1)], r"distortion \(non-zero k4\).*FULL_OPENCV if"),
+        ([frame("train/a.png", camera_model="RADIAL", k6=1)], r"non-zero k6\).*with RADIAL"),
+        (
+            [frame("train/a.png", is_fisheye=True, p1=1)],
+            r"p1\) is not supported with OPENCV_FISHEYE",
+        ),
+        ([frame("train/a.png", camera_model="FOV")], "camera_model 'FOV'.*undistort"),
+        ([frame("train/a.png", k1=np.nan)], "k1 must be a finite number"),
         ([{k: v for k, v in frame("train/a.png").items() if k not in ("fx", "fy")}], "no focal"),
         (
             [without("fx", fy=None, camera_angle_x=4.0) | {"fy": 1.0}],
@@ -162,8 +167,3 @@ def test_empty_folder_and_no_folder(tmp_path):
         load_scene(tmp_path / "transforms.json")
     with pytest.raises(SceneError, match="is not a folder"):
         load_scene(tmp_path / "none")
-
-
-def test_distorted_capture_is_refused(shared):
-    with pytest.raises(SceneError, match=r"transforms\.json.*non-zero k1, k2, p1, p2.*undistort"):
-        load_scene(shared / "data" / "plush_raw")

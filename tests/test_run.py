@@ -201,6 +201,27 @@ def test_an_unknown_scene_is_one_sentence(parsed_flags, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_format_and_split_reach_the_capture(parsed_flags, capture_folder, capsys):
+    with flagsaver.flagsaver(format="transforms", split="every8"):
+        scene = command_line.scene_from_flags(str(capture_folder), 1)
+        names = command_line.names_from_flags()
+    assert (names["format"], names["split"]) == ("transforms", "every8")
+    assert scene.metadata["split"] == "every8" and scene.test is None
+    printed = capsys.readouterr().out
+    assert "reading transforms_train.json" in printed and "every 8th of its" in printed
+    assert set(command_line.names_from_flags()) == {"method", "preset"}
+
+
+def test_a_format_that_is_not_there_is_one_sentence(parsed_flags, capture_folder, tmp_path):
+    given = {"scene": str(capture_folder), "output_dir": str(tmp_path / "out"), "format": "llff"}
+    with (
+        flagsaver.flagsaver(**given),
+        pytest.raises(SystemExit, match="holds no capture in the format llff"),
+    ):
+        program.main(["run"])
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_folder_that_holds_something_is_refused_before_any_work(parsed_flags, tmp_path):
     (tmp_path / "results.json").write_text("{}")
     with (

@@ -1,5 +1,7 @@
 """The depth range of a scene whose files do not give one."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 
@@ -24,19 +26,37 @@ def near_far_from_points(
     Returns:
       near and far, or None where no camera sees any point.
     """
-    points = points[:: max(1, len(points) // _MOST_POINTS)].astype(np.float64)
+    points = points[:: max(1, len(points) // _MOST_POINTS)]
     ranges = []
-    for pose, (fx, fy, cx, cy), (width, height) in zip(camtoworld, intrinsics, sizes, strict=True):
-        x, y, z = ((points - pose[:, 3]) @ pose[:, :3]).T
-        x, y, z = x[z > 0], y[z > 0], z[z > 0]
-        column, row = fx * x / z + cx, fy * y / z + cy
-        seen = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        if seen.any():
-            ranges.append(np.percentile(z[seen], [1, 99]))
+    for pose, lens, size in zip(camtoworld, intrinsics, sizes, strict=True):
+        depths = depths_in_view(points, pose, lens, size)
+        if len(depths):
+            ranges.append(np.percentile(depths, [1, 99]))
     if not ranges:
         return None
     low, high = np.transpose(ranges)
     return 0.7 * float(low.min()), 1.5 * float(high.max())
+
+
+def depths_in_view(
+    points: np.ndarray,
+    camtoworld: np.ndarray,
+    intrinsics: np.ndarray,
+    size: Sequence[int],
+) -> np.ndarray:
+    """z-depths, in world units, of those of `points` `[P, 3]` that lie inside an image.
+
+    Args:
+      points: of the world.
+      camtoworld: `[3, 4]` OpenCV pose.
+      intrinsics: `[4]` fx, fy, cx, cy.
+      size: width and height in pixels.
+    """
+    fx, fy, cx, cy = intrinsics
+    x, y, z = ((points.astype(np.float64) - camtoworld[:, 3]) @ camtoworld[:, :3]).T
+    x, y, z = x[z > 0], y[z > 0], z[z > 0]
+    column, row = fx * x / z + cx, fy * y / z + cy
+    return z[(column >= 0) & (column < size[0]) & (row >= 0) & (row < size[1])]
 
 
 def near_far_from_cameras(camtoworld: np.ndarray) -> tuple[float, float]:

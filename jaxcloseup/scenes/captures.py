@@ -1,9 +1,11 @@
 """Scenes by name or from a folder of photographs."""
 
 import concurrent.futures
+import functools
+import logging
 import pathlib
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -12,12 +14,17 @@ import numpy as np
 from jaxcloseup.batch import Views
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.scenes.bounds import near_far_from_cameras, near_far_from_points
+from jaxcloseup.scenes.distortion import Remap, undistort, undistortion
 from jaxcloseup.scenes.errors import ImageSizeWarning, NearFarWarning, SceneError
+from jaxcloseup.scenes.fields import affine_transform, number
+from jaxcloseup.scenes.formats import FORMATS, Listing, read_listing
+from jaxcloseup.scenes.frames import Frame, frame_intrinsics
 from jaxcloseup.scenes.images import downscale_image, pad_images, read_image, read_mask
-from jaxcloseup.scenes.points import read_ply_points
 from jaxcloseup.scenes.scene import Scene
-from jaxcloseup.scenes.splits import Listing, read_listing, unique_names
-from jaxcloseup.scenes.transforms import Frame, affine_transform, frame_intrinsics, number
+from jaxcloseup.scenes.splits import SPLITS, unique_names
+
+
+_log = logging.getLogger(__name__)
 
 
 class _Photo(NamedTuple):
@@ -38,44 +45,71 @@ def load_scene(
     downscale: int = 1,
     half_pixel: bool = False,
     background: float = 1.0,
+    format: str | None = None,
+    split: str = "given",
 ) -> Scene:
     """A built-in scene by its name, or a capture from its folder.
 
-    A folder holds either
+    A folder holds, in order of precedence,
 
     - `transforms_train.json`, and beside it `transforms_test.json` (split `test`) and
       `transforms_test_far.json` or, as Blender's datasets name it, `transforms_val.json` (split
       `test_far`). `test` is meant for close-ups, but nothing checks that its views are; or
     - `transforms.json`, of instant-ngp or nerfstudio. Its `train_filenames`, `test_filenames` and
-      `val_filenames` are the three splits; without them every 8th photograph, sorted by name, is
-      held out as `test_far`.
+      `val_filenames` are the three splits; or
+    - a COLMAP model, binary or text, in `sparse/0`, `sparse` or `colmap/sparse/0`, with the
+      photographs in `images`. The model's own folder can be given too; or
+    - LLFF's `poses_bounds.npy`, with the photographs in `images`.
 
-    Lenses are pinholes. Photographs of several sizes are padded at the right and the bottom with
-    pixels of weight 0, and each camera keeps its own intrinsics. A frame's `mask_path` weighs its
-    pixels: white counts, black does not. Initial points come from `ply_file_path`, else from
-    `points3d.ply`. `near` and `far` are the file's, or are estimated with a warning.
+    Where these list no splits, a `split.json` may, with lists `train`, `test` and `test_far` of
+    names; without it every 8th photograph, sorted by name, is held out as `test_far`.
+
+    Photographs through lenses that bend are resampled to those of a pinhole camera of the same
+    size and focal lengths; pixels that they do not show have weight 0. Photographs of several
+    sizes are padded at the right and the bottom with pixels of weight 0, and each camera keeps its
+    own intrinsics. A frame's `mask_path` weighs its pixels: white counts, black does not. Initial
+    points are the COLMAP model's, but for those that fewer than two training photographs see, or
+    come from `ply_file_path`, else from `points3d.ply`. `near` and `far` are the file's, or are
+    estimated, with a warning unless it is from a COLMAP model's points.
 
     Args:
       name_or_path: one of `PROCEDURAL_SCENES`, or a folder; `./table` is the folder of that name.
       downscale: whole number by which photographs shrink, by averaging areas.
       half_pixel: the files count pixel centres at whole numbers, as the paper's do.
       background: grey level in [0, 1] behind transparent pixels.
+      format: read `transforms`, `colmap` or `llff` and nothing else; None: the first that is there.
+      split: `given`: as the capture says; `every8`: every 8th photograph by name is `test_far`;
+        `closest`: the tenth of the photographs that are nearest to what they see, by the median
+        depth of its points over the focal length in pixels, is `test`, and of the rest every 8th
+        is `test_far`.
 
     Returns:
       The scene. For a folder, `metadata` holds `path`, `downscale`, `files` and `sizes` (the path
       and, before padding, the (width, height) of each photograph, by split) and
-      `applied_transform` (`[3, 4]`, from the capture's original world to this one, or None).
+      `applied_transform` (`[3, 4]`, from the capture's original world to this one, or None),
+      `format`, `split`, `notes` (sentences on what was read and how it was divided) and, for
+      `closest`, `times_nearer` (how many times nearer each view of `test` is than the median
+      training photograph).
 
     Raises:
       SceneError: one sentence that names the file and the field and says what to do.
     """
     if isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1:
         raise SceneError(f"downscale must be a whole number of at least 1, got {downscale!r}.")
+    if split not in SPLITS:
+        raise SceneError(f"split {split!r} is unknown: choose one of {', '.join(SPLITS)}.")
+    if format is not None and format not in FORMATS:
+        raise SceneError(f"format {format!r} is unknown: choose one of {', '.join(FORMATS)}.")
     path = pathlib.Path(name_or_path)
     if len(path.parts) == 1 and str(name_or_path) == path.name:
         from jaxcloseup.scenes.procedural import PROCEDURAL_SCENES, procedural_scene
 
         if path.name in PROCEDURAL_SCENES:
+            if split != "given" or format is not None:
+                raise SceneError(
+                    f"{path} is a built-in scene with a split of its own: leave out "
+                    f"{'split' if split != 'given' else 'format'}."
+                )
             return procedural_scene(path.name, downscale=downscale)
         if not path.exists():
             raise SceneError(
@@ -83,27 +117,41 @@ def load_scene(
                 f"{', '.join(PROCEDURAL_SCENES)}, or give the path of a capture."
             )
     if not path.is_dir():
-        raise SceneError(f"{path} is not a folder: give the one that holds the transforms*.json.")
-    return _load_folder(path, downscale, half_pixel, background)
+        raise SceneError(f"{path} is not a folder: give the one that holds the capture.")
+    listing = read_listing(path, format=format, split=split)
+    for note in listing.notes:
+        _log.info(note)
+    scene = _load(listing, downscale, half_pixel, background)
+    scene.metadata.update(path=path, split=split)
+    return scene
 
 
-def _load_folder(path: pathlib.Path, downscale: int, half_pixel: bool, background: float) -> Scene:
-    listing = read_listing(path)
-    points, rgb = _read_points(listing)
+def _load(listing: Listing, downscale: int, half_pixel: bool, background: float) -> Scene:
     transform = listing.fields.get("applied_transform")
     if transform is not None:
         transform = affine_transform(str(listing.file), "applied_transform", transform)
 
     frames = [frame for members in listing.frames.values() for frame in members]
     with concurrent.futures.ThreadPoolExecutor() as pool:  # OpenCV decodes without Python's lock
-        photos = list(pool.map(lambda frame: _read_photo(frame, downscale, background), frames))
+        find_remap = functools.lru_cache(maxsize=2)(undistortion)  # most captures have one lens
+        read = functools.partial(
+            _read_photo,
+            downscale=downscale,
+            background=background,
+            half_pixel=half_pixel,
+            find_remap=find_remap,
+        )
+        photos = list(pool.map(read, frames))
     _warn_sizes(listing, frames, photos)
     intrinsics = np.stack(
-        [_intrinsics(*pair, half_pixel) for pair in zip(frames, photos, strict=True)]
+        [
+            _intrinsics(frame, photo.stored_size, photo.size, half_pixel)
+            for frame, photo in zip(frames, photos, strict=True)
+        ]
     )
     camtoworld = np.stack([frame.camtoworld for frame in frames])
     sizes = np.array([photo.size for photo in photos])
-    near, far = _near_far(listing, points, camtoworld, intrinsics, sizes)
+    near, far = _near_far(listing, camtoworld, intrinsics, sizes)
 
     width, height = sizes.max(0).tolist()
     ends = np.cumsum([len(members) for members in listing.frames.values()])[:-1]
@@ -123,26 +171,35 @@ def _load_folder(path: pathlib.Path, downscale: int, half_pixel: bool, backgroun
     }
     files = {split: [frame.file for frame in part] for split, part in listing.frames.items()}
     return Scene(
-        name=path.resolve().name,
+        name=listing.folder.resolve().name,
         train=views["train"],
         test=views.get("test"),
         test_far=views.get("test_far"),
-        points=points,
-        rgb=rgb,
+        points=listing.points,
+        rgb=listing.rgb,
         near=near,
         far=far,
         names={split: unique_names(paths) for split, paths in files.items()},
         metadata={
-            "path": path,
             "downscale": downscale,
             "files": files,
             "sizes": {split: [photos[i].size for i in part] for split, part in parts.items()},
             "applied_transform": transform,
+            "format": listing.format,
+            "notes": listing.notes,
+            **({} if listing.times_nearer is None else {"times_nearer": listing.times_nearer}),
         },
     )
 
 
-def _read_photo(frame: Frame, downscale: int, background: float) -> _Photo:
+def _read_photo(
+    frame: Frame,
+    *,
+    downscale: int,
+    background: float,
+    half_pixel: bool,
+    find_remap: Callable[..., Remap],
+) -> _Photo:
     rgb = read_image(frame.file, background=background)
     height, width = rgb.shape[:2]
     if downscale > min(width, height):
@@ -158,16 +215,22 @@ def _read_photo(frame: Frame, downscale: int, background: float) -> _Photo:
                 f"{frame.mask} is {mask.shape[1]} x {mask.shape[0]} pixels and its photograph "
                 f"{width} x {height}: give them one size."
             )
+    if frame.distortion:
+        intrinsics = _intrinsics(frame, (width, height), (width, height), half_pixel).tolist()
+        remap = find_remap(frame.distortion, tuple(intrinsics), width, height)
+        rgb, mask = undistort(rgb, mask, remap)
     return _Photo(
         downscale_image(rgb, downscale), downscale_image(mask, downscale), (width, height)
     )
 
 
-def _intrinsics(frame: Frame, photo: _Photo, half_pixel: bool) -> np.ndarray:
-    """fx, fy, cx, cy in the pixels of the downscaled photograph."""
-    size = frame.size or photo.stored_size
+def _intrinsics(
+    frame: Frame, stored: tuple[int, int], wanted: tuple[int, int], half_pixel: bool
+) -> np.ndarray:
+    """fx, fy, cx, cy in pixels of an image of size `wanted`, for a photograph of size `stored`."""
+    size = frame.size or stored
     return frame_intrinsics(frame, *size, half_pixel=half_pixel) * np.tile(
-        np.divide(photo.size, size), 2
+        np.divide(wanted, size), 2
     )
 
 
@@ -196,21 +259,8 @@ def _warn_sizes(listing: Listing, frames: Sequence[Frame], photos: Sequence[_Pho
         )
 
 
-def _read_points(listing: Listing) -> tuple[np.ndarray, np.ndarray]:
-    folder, named = listing.file.parent, listing.fields.get("ply_file_path")
-    if named and not (folder / str(named)).is_file():
-        raise SceneError(
-            f"{listing.file}: ply_file_path {named!r} does not exist: restore it or drop the field."
-        )
-    file = folder / str(named or "points3d.ply")
-    if file.is_file():
-        return read_ply_points(file)
-    return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
-
-
 def _near_far(
     listing: Listing,
-    points: np.ndarray,
     camtoworld: np.ndarray,
     intrinsics: np.ndarray,
     sizes: np.ndarray,
@@ -223,17 +273,18 @@ def _near_far(
     }
     near, far = given.get("near"), given.get("far")
     if near is None or far is None:
-        estimate = near_far_from_points(points, camtoworld, intrinsics, sizes)
+        estimate = near_far_from_points(listing.points, camtoworld, intrinsics, sizes)
         source = "points" if estimate else "poses"
         low, high = estimate or near_far_from_cameras(camtoworld)
         near, far = near or low, far or high
         absent = " and ".join(key for key in ("near", "far") if key not in given)
-        warnings.warn(
-            f"{label}: no {absent}; from the {source}, near {near:.4g} and far {far:.4g} are used: "
-            "give both in world units if they do not hold the scene.",
-            NearFarWarning,
-            stacklevel=2,
-        )
+        if source == "poses" or listing.format != "colmap":  # no field of COLMAP's could be given
+            warnings.warn(
+                f"{label}: no {absent}; from the {source}, near {near:.4g} and far {far:.4g} are "
+                "used: give both in world units if they do not hold the scene.",
+                NearFarWarning,
+                stacklevel=2,
+            )
     if near >= far:
         raise SceneError(f"{label}: near {near:.4g} is not less than far {far:.4g}: correct them.")
     return near, far

@@ -1,67 +1,112 @@
-"""Which photographs of a folder are trained on and which are held out."""
+"""Which photographs of a capture are trained on and which are held out."""
 
-import logging
+import json
 import pathlib
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from jaxcloseup.scenes.errors import DuplicateFileWarning, SceneError
-from jaxcloseup.scenes.transforms import Frame, read_transforms
+import numpy as np
 
+from jaxcloseup.scenes.bounds import depths_in_view
+from jaxcloseup.scenes.errors import DuplicateFileWarning, SceneError, UnknownKeyWarning
+from jaxcloseup.scenes.frames import Frame, frame_intrinsics
+from jaxcloseup.scenes.images import read_image
 
-_log = logging.getLogger(__name__)
 
 TEST_EVERY = 8
-_FILES = {
-    "train": ("transforms_train.json",),
-    "test": ("transforms_test.json",),
-    "test_far": ("transforms_test_far.json", "transforms_val.json"),
-}
+CLOSEST_SHARE = 0.1
+SPLITS = ("given", "every8", "closest")
 _LISTS = {"train": "train_filenames", "test": "test_filenames", "test_far": "val_filenames"}
+_SPLIT_FILE_KEYS = {"train", "test", "test_far", "unused"}
 
 
-class Listing(NamedTuple):
-    """What a folder lists.
+class Division(NamedTuple):
+    """The photographs of a capture by split.
 
     Attributes:
-      file: the file that speaks for the whole capture.
-      fields: its fields.
       frames: for each split present the photographs, `train` first.
+      notes: sentences on how they were divided.
+      times_nearer: of `closest`, how many times nearer each photograph of `test` is than the median
+        one of `train`; else None.
     """
 
-    file: pathlib.Path
-    fields: dict[str, Any]
     frames: dict[str, list[Frame]]
+    notes: tuple[str, ...] = ()
+    times_nearer: tuple[float, ...] | None = None
 
 
-def read_listing(folder: pathlib.Path) -> Listing:
-    """The photographs of a folder by split; `load_scene` documents the formats.
+def listed_split(
+    file: pathlib.Path, fields: dict[str, Any], frames: Sequence[Frame]
+) -> dict[str, list[Frame]] | None:
+    """The splits that the fields of a single `transforms.json` list, if they do."""
+    lists = {key: (split, fields[key]) for split, key in _LISTS.items() if fields.get(key)}
+    by_path = {pathlib.PurePath(frame.listed): frame for frame in frames}
+    chosen = _choose(file, lists, lambda name: by_path.get(pathlib.PurePath(name)), "file_path")
+    return _with_train(file, chosen, frames) if chosen else None
 
-    Raises:
-      SceneError: no known file in the folder, or something wrong in one.
+
+def split_of_file(folder: pathlib.Path, frames: Sequence[Frame]) -> dict[str, list[Frame]] | None:
+    """The splits of a folder's `split.json`, if there is one.
+
+    It is an object with lists `train`, `test`, `test_far` and `unused` of names of photographs;
+    one that is in none of them is not used either, unless there is no `train`.
     """
-    separate, single = folder / "transforms_train.json", folder / "transforms.json"
-    if separate.is_file():
-        if single.is_file():
-            _log.info("%s: reading %s and not %s", folder, separate.name, single.name)
-        found = {
-            split: next((folder / name for name in names if (folder / name).is_file()), None)
-            for split, names in _FILES.items()
-        }
-        read = {split: read_transforms(file) for split, file in found.items() if file}
-        listing = Listing(
-            separate, read["train"][0], {split: frames for split, (_, frames) in read.items()}
-        )
-    elif single.is_file():
-        fields, frames = read_transforms(single)
-        listing = Listing(single, fields, _divide(single, fields, frames))
-    else:
+    file = folder / "split.json"
+    if not file.is_file():
+        return None
+    try:
+        fields = json.loads(file.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError) as error:
         raise SceneError(
-            f"{folder} holds no capture: neither {separate.name} nor {single.name} is in it."
+            f"{file} is not readable as JSON ({error}): correct or drop it."
+        ) from error
+    if not isinstance(fields, dict):
+        raise SceneError(f"{file} is not an object with lists train and test: correct or drop it.")
+    if unknown := sorted(set(fields) - _SPLIT_FILE_KEYS):
+        warnings.warn(
+            f"{file}: these fields are not read: {', '.join(unknown)}.",
+            UnknownKeyWarning,
+            stacklevel=2,
         )
-    _warn_duplicates(listing)
-    return listing
+    by_name = {frame.file.name: frame for frame in frames}
+    by_name |= {frame.listed: frame for frame in frames}
+    lists = {key: (key, fields[key]) for key in fields if key in _SPLIT_FILE_KEYS and fields[key]}
+    chosen = _choose(file, lists, by_name.get, "name")
+    splits = _with_train(file, chosen, frames)
+    return {key: splits[key] for key in _LISTS if key in splits}
+
+
+def divide(
+    name: str,
+    frames: Sequence[Frame],
+    given: dict[str, list[Frame]] | None,
+    split: str,
+    points: np.ndarray,
+) -> Division:
+    """The photographs as `split` says.
+
+    Args:
+      name: of the capture, for notes.
+      frames: all of them.
+      given: as the capture's files divide them, or None where none does.
+      split: one of `SPLITS`. `given` takes every 8th where nothing is; `load_scene` has the rest.
+      points: `[P, 3]` of the world; `closest` needs some.
+    """
+    if split == "given" and given:
+        return Division(given)
+    frames = sorted({frame.file: frame for frame in frames}.values(), key=lambda f: f.listed)
+    if split == "closest":
+        return _closest(name, frames, points)
+    parts = _every_eighth(frames)
+    reason = " lists no splits" if split == "given" else ""
+    return Division(
+        parts,
+        (
+            f"{name}{reason}: every {TEST_EVERY}th of its {len(frames)} photographs by name, "
+            f"{len(parts.get('test_far', ()))} in all, is test_far",
+        ),
+    )
 
 
 def unique_names(files: Sequence[pathlib.Path]) -> list[str]:
@@ -78,48 +123,11 @@ def unique_names(files: Sequence[pathlib.Path]) -> list[str]:
     return names
 
 
-def _divide(
-    file: pathlib.Path, fields: dict[str, Any], frames: list[Frame]
-) -> dict[str, list[Frame]]:
-    """The splits that a single file lists, or else every 8th photograph held out."""
-    lists = {split: fields[key] for split, key in _LISTS.items() if fields.get(key)}
-    if not lists:
-        frames = sorted(frames, key=lambda frame: frame.listed)
-        train = [frame for i, frame in enumerate(frames) if i % TEST_EVERY or len(frames) == 1]
-        held_out = [frame for i, frame in enumerate(frames) if i % TEST_EVERY == 0]
-        if len(frames) == 1:
-            return {"train": train}
-        _log.info(
-            "%s lists no splits: every %dth of its %d photographs by name, %d in all, is test_far",
-            *(file, TEST_EVERY, len(frames), len(held_out)),
-        )
-        return {"train": train, "test_far": held_out}
-    by_path = {pathlib.PurePath(frame.listed): frame for frame in frames}
-    splits = {}
-    for split, names in lists.items():
-        key = _LISTS[split]
-        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise SceneError(f"{file}: {key} must be a list of the frames' file_path: correct it.")
-        unlisted = [name for name in names if pathlib.PurePath(name) not in by_path]
-        if unlisted:
-            raise SceneError(
-                f"{file}: {key} names {unlisted[0]!r}, which no frame has as its file_path "
-                f"({len(unlisted)} of {len(names)} such names): correct it."
-            )
-        splits[split] = [by_path[pathlib.PurePath(name)] for name in names]
-    if "train" not in splits:
-        held_out = {frame.file for members in splits.values() for frame in members}
-        train = [frame for frame in frames if frame.file not in held_out]
-        if not train:
-            raise SceneError(f"{file}: every frame is held out: leave some for train_filenames.")
-        splits = {"train": train, **splits}
-    return splits
-
-
-def _warn_duplicates(listing: Listing) -> None:
+def warn_duplicates(folder: pathlib.Path, splits: dict[str, list[Frame]]) -> None:
+    """Warn of photographs that are listed more than once."""
     seen: dict[pathlib.Path, str] = {}
     repeated = []
-    for split, members in listing.frames.items():
+    for split, members in splits.items():
         for frame in members:
             if frame.file in seen:
                 repeated.append(f"{frame.listed} ({seen[frame.file]} and {split})")
@@ -127,9 +135,94 @@ def _warn_duplicates(listing: Listing) -> None:
     if repeated:
         more = ", ..." if len(repeated) > 3 else ""
         warnings.warn(
-            f"{listing.file.parent} lists {len(repeated)} photographs again: "
+            f"{folder} lists {len(repeated)} photographs again: "
             f"{', '.join(repeated[:3])}{more}; a score on a photograph that was trained on says "
             "nothing about new views.",
             DuplicateFileWarning,
             stacklevel=2,
         )
+
+
+def _every_eighth(frames: Sequence[Frame]) -> dict[str, list[Frame]]:
+    if len(frames) == 1:
+        return {"train": list(frames)}
+    return {
+        "train": [frame for i, frame in enumerate(frames) if i % TEST_EVERY],
+        "test_far": [frame for i, frame in enumerate(frames) if i % TEST_EVERY == 0],
+    }
+
+
+def _closest(name: str, frames: Sequence[Frame], points: np.ndarray) -> Division:
+    if len(frames) < 2:
+        raise SceneError(f"{name}: split closest needs 2 photographs and there is 1: add some.")
+    sizes = [_size_of_pixel(frame, points) for frame in frames]
+    if not np.isfinite(sizes).any():
+        raise SceneError(
+            f"{name}: split closest needs points that the photographs see, and there are none: "
+            "load the COLMAP model, or give ply_file_path."
+        )
+    nearest = np.argsort(sizes, kind="stable")[: max(1, round(CLOSEST_SHARE * len(frames)))]
+    held_out = sorted(nearest.tolist())
+    rest = [frame for i, frame in enumerate(frames) if i not in held_out]
+    parts = _every_eighth(rest)
+    parts = {"train": parts["train"], "test": [frames[i] for i in held_out], **parts}
+    of_file = {frame.file: size for frame, size in zip(frames, sizes, strict=True)}
+    median = np.median([of_file[frame.file] for frame in parts["train"]])
+    ratios = tuple(float(median / sizes[i]) for i in held_out)
+    note = (
+        f"{name}: the {len(held_out)} nearest of {len(frames)} photographs are test, "
+        f"{min(ratios):.2f} to {max(ratios):.2f} times nearer (median {np.median(ratios):.2f}) "
+        f"than the median of {len(parts['train'])} training photographs; "
+        f"{len(parts.get('test_far', ()))} others are test_far"
+    )
+    return Division(parts, (note,), ratios)
+
+
+def _size_of_pixel(frame: Frame, points: np.ndarray) -> float:
+    """How much of the world a pixel of the original size covers, or infinity if nothing is seen."""
+    size = frame.size or read_image(frame.file).shape[1::-1]
+    intrinsics = frame_intrinsics(frame, *size)
+    if frame.seen is None:
+        depths = depths_in_view(points, frame.camtoworld, intrinsics, size)
+    else:
+        depths = (points[frame.seen] - frame.camtoworld[:, 3]) @ frame.camtoworld[:, 2]
+        depths = depths[depths > 0]
+    return (
+        float(np.median(depths) / np.sqrt(intrinsics[0] * intrinsics[1])) if len(depths) else np.inf
+    )
+
+
+def _choose(
+    file: pathlib.Path,
+    lists: dict[str, tuple[str, Any]],
+    find: Callable[[str], Frame | None],
+    field: str,
+) -> dict[str, list[Frame]]:
+    splits = {}
+    for key, (split, names) in lists.items():
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise SceneError(f"{file}: {key} must be a list of the frames' {field}: correct it.")
+        unlisted = [name for name in names if find(name) is None]
+        if unlisted:
+            raise SceneError(
+                f"{file}: {key} names {unlisted[0]!r}, which no frame has as its {field} "
+                f"({len(unlisted)} of {len(names)} such names): correct it."
+            )
+        splits[split] = [find(name) for name in names]
+    return splits
+
+
+def _with_train(
+    file: pathlib.Path, splits: dict[str, list[Frame]], frames: Sequence[Frame]
+) -> dict[str, list[Frame]]:
+    if "train" in splits:
+        return splits
+    held_out = {frame.file for members in splits.values() for frame in members}
+    train = [frame for frame in frames if frame.file not in held_out]
+    if not train:
+        raise SceneError(f"{file}: every frame is held out: leave some for {_train_key(file)}.")
+    return {"train": train, **splits}
+
+
+def _train_key(file: pathlib.Path) -> str:
+    return "train" if file.name == "split.json" else _LISTS["train"]
