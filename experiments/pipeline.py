@@ -22,7 +22,7 @@ from experiments.evaluation import (
     exact_depths,
     targets_by_split,
 )
-from experiments.gate import choose_settings, print_gate
+from experiments.gate import print_gate, weigh_labels
 from experiments.loop import Programs, run_stage
 from experiments.pictures import comparisons, label_pictures, write_renders
 from experiments.presets import Preset, initial_points, pseudo_settings
@@ -134,10 +134,9 @@ def run(
     gate = None
     if preset.gated:
         with timed(seconds, "gate"):
-            chosen, gate = choose_settings(views, depths, render, settings)
-            settings = settings if chosen is None else chosen
+            settings, gate = weigh_labels(views, depths, render, settings)
             print_gate(gate)
-    use_labels = gate is None or gate["use_labels"]
+    use_labels = gate is None or gate["weight"] > 0
     steps = preset.closeup_steps
     if "control" in to_run or not use_labels:
         control = train("control", "photographs", baseline, views, steps=steps)

@@ -49,8 +49,7 @@ class Preset:
       leave_out_source: labels are held against the other views alone.
       label_share: of the labels' loss in a step's, unless both are pooled.
       test_time_steps: in total for a NeRF, for each target view for surfels.
-      gated: use labels only where left-out photographs show that they beat the model, and with the
-        tolerances found there.
+      gated: labels weigh what left-out photographs show that they deserve, which may be nothing.
     """
 
     field: NerfConfig | SurfelConfig = dataclasses.field(default_factory=NerfConfig)
@@ -140,7 +139,7 @@ QUICK_SURFELS = dataclasses.replace(
     closeup_steps=200,
     downscale=8,
     leave_out_source=True,
-    label_share=0.2,
+    label_share=0.1,
     gated=True,
 )
 

@@ -12,6 +12,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from experiments.gate import verdict
 from experiments.plots import Curve, line_plot
 from experiments.zoom_ladder import gain_over, zoom_curves
 from jaxcloseup.artifacts.images import png_data_uri
@@ -184,20 +185,19 @@ def _labels_table(labels):
 
 
 def _gate_table(gate):
-    verdict = "Labels are used" if gate["use_labels"] else "No labels are used"
     lines = "".join(
         f"<tr><td>{row['rgb_tolerance']}<td>{row['depth_tolerance']}<td>{row['coverage']:.0%}"
         f"<td>{format_metric('psnr', row['label_psnr'])}"
         f"<td>{format_metric('psnr', row['model_psnr'])}"
-        f"<td>{'chosen' if i == gate['chosen'] else ''}"
-        for i, row in enumerate(gate["left_out"])
+        for row in gate["left_out"]
     )
     return (
         "<h2>Labels against left-out photographs</h2><p>Training photographs are left out one by "
-        "one and labelled from the others. Labels are used where they are nearer to the photograph "
-        f"than the model, which was trained on it, is on the same pixels. {verdict}.</p><table><tr>"
+        "one and labelled from the others. The model was trained on them, and labels need not be "
+        "nearer to them than it is; but where few of them agree closely (the first line) they do "
+        f"harm. Here {html.escape(verdict(gate))}.</p><table><tr>"
         "<th>tolerance of colour<th>of depth<th>labelled<th>PSNR of labels (dB)"
-        f"<th>PSNR of the model (dB)<th>{lines}</table>"
+        f"<th>PSNR of the model (dB){lines}</table>"
     )
 
 

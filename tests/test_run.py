@@ -16,7 +16,7 @@ from experiments import command_line
 from experiments import run as program
 from experiments.audit import blur_to_footprint
 from experiments.evaluation import Target, score, summarise
-from experiments.gate import choose_settings, print_gate
+from experiments.gate import AGREEMENT, verdict, weigh_labels
 from experiments.loop import Programs, TrainingError, run_stage
 from experiments.pipeline import config, run
 from experiments.presets import (
@@ -77,7 +77,7 @@ def test_surfels_run_through_all_stages_from_random_points(capture_folder, tmp_p
     assert "room for" not in capsys.readouterr().out
     assert json.loads((tmp_path / "results.json").read_text()) == results
     stages = results["stages"]
-    use_labels = results["gate"]["use_labels"]
+    use_labels = results["gate"]["weight"] > 0
     # Without labels, control takes the place of closeup.
     assert ("control" in stages) == (not use_labels)
     assert {"baseline", "closeup", "test_time"} <= set(stages)
@@ -113,26 +113,33 @@ def test_no_step_is_taken_on_a_truncated_image(capture_folder, capsys):
         np.testing.assert_allclose(small, large, atol=1e-5)
 
 
-@pytest.mark.parametrize("model", ["grey", "true"])
-def test_labels_are_used_where_they_beat_the_model(model):
-    cameras = [plane.camera_above(x, 0.1 * x, 3.0, tilt=0.1 * x) for x in (-0.6, -0.2, 0.2, 0.6)]
+@pytest.mark.parametrize("off", [1.0, 1.02, 1.3])
+def test_labels_weigh_what_they_deserve(off):
+    """With exact depth labels are right; the further depth is off, the fewer of them agree."""
+    positions = (-0.6, -0.2, 0.2, 0.6)
+    cameras = [plane.camera_above(x, 0.1 * x, 3.0, tilt=0.1 * x) for x in positions]
     views, depths = plane.make_views(cameras)
 
     def render(camera):
         rgb, depth, _ = plane.photograph(camera)
-        rgb = jnp.full(rgb.shape, 0.5) if model == "grey" else jnp.asarray(rgb, jnp.float32)
-        return Rendering(rgb, jnp.asarray(depth, jnp.float32), jnp.ones(depth.shape))
+        depth = jnp.asarray(off * depth, jnp.float32)
+        return Rendering(jnp.full(rgb.shape, 0.5), depth, jnp.ones(depth.shape))
 
-    chosen, found = choose_settings(views, depths, render, pseudo_settings(QUICK_SURFELS))
-    assert found["use_labels"] == (chosen is not None) == (model == "grey")
-    best = max(found["left_out"], key=lambda row: row["coverage"])
-    assert best["label_psnr"] > 30
-    assert best["coverage"] > 0.3
-    if model == "grey":
-        assert best["model_psnr"] < 15
-        # The loosest colours keep most of these labels, which are right.
-        assert chosen.rgb_tolerance == jnp.float32(0.08)
-    print_gate(found)
+    settings = pseudo_settings(QUICK_SURFELS)
+    changed, found = weigh_labels(views, off * depths, render, settings)
+    low, high = AGREEMENT
+    expected = np.clip((found["agreement"] - low) / (high - low), 0, 1)
+    assert found["weight"] == pytest.approx(expected)
+    assert changed.label_share == pytest.approx(expected * settings.label_share)
+    assert changed.replace(label_share=settings.label_share) == settings
+    assert found["agreement"] == found["left_out"][0]["coverage"]
+    assert found["left_out"][-1]["model_psnr"] < 15
+    if off == 1.0:
+        assert found["left_out"][-1]["label_psnr"] > 30
+        assert found["weight"] > 0
+    if off == 1.3:
+        assert found["weight"] == 0
+    assert ("no labels" in verdict(found)) == (found["weight"] == 0)
 
 
 def test_a_saved_render_reproduces_its_score(finished, capture_folder):
