@@ -42,7 +42,8 @@ def main(argv: list[str]) -> None:
         output_dir = command_line.choose_output_dir(
             FLAGS.output_dir, FLAGS.scene, FLAGS.method, resume=FLAGS.resume
         )
-        scene = load_scene(FLAGS.scene, downscale=preset.downscale, half_pixel=FLAGS.half_pixel)
+        load_options = {"downscale": preset.downscale, "half_pixel": FLAGS.half_pixel}
+        scene = load_scene(FLAGS.scene, **load_options)
         output_dir.mkdir(parents=True, exist_ok=True)
     except (SceneError, OSError, ValueError) as error:
         sys.exit(f"experiments.run: {error}")
@@ -57,6 +58,7 @@ def main(argv: list[str]) -> None:
             to_run=FLAGS.stages,
             save_every=FLAGS.save_every,
             perceptual=find_perceptual(FLAGS.lpips_weights),
+            load_options=load_options,
         )
     except (TrainingError, CheckpointError, OSError) as error:
         sys.exit(f"experiments.run: {error}")
