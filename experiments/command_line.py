@@ -7,6 +7,7 @@ import pathlib
 
 from absl import flags
 
+from experiments.output_dir import check_unused
 from experiments.presets import PRESETS, Preset, with_classic_density
 
 
@@ -17,9 +18,6 @@ flags.DEFINE_enum(
     "quick",
     ["quick", "paper", "released"],
     "hyper-parameters; flags below override them; released: of NeRF alone",
-)
-flags.DEFINE_string(
-    "output_dir", None, "where results go; default outputs/<scene>/<method>/<date_time>"
 )
 flags.DEFINE_integer(
     "downscale",
@@ -101,9 +99,4 @@ def choose_output_dir(
     if folder is None:
         stamp = datetime.datetime.now().strftime("%Y-%m-%d_%H%M%S")
         folder = os.path.join("outputs", pathlib.Path(scene).name, method, stamp)
-    path = pathlib.Path(folder)
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise FileExistsError(
-            f"--output_dir={folder} already holds something: name a new folder, or remove it first"
-        )
-    return path
+    return check_unused(folder)
