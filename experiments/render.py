@@ -15,7 +15,7 @@ import datetime
 import functools
 import pathlib
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import cv2
 import jax
@@ -44,7 +44,7 @@ from jaxcloseup.batch import camera_at
 from jaxcloseup.geometry.cameras import pixel_grid
 from jaxcloseup.geometry.union_warp import block_sources
 from jaxcloseup.pseudo import label_views
-from jaxcloseup.scenes import SceneError
+from jaxcloseup.scenes import Scene, SceneError
 from jaxcloseup.splats.field import SurfelConfig
 from jaxcloseup.support import find_support
 from jaxcloseup.train import TrainState, labelled_depth
@@ -109,7 +109,6 @@ def _render() -> None:
         row, column = camera_paths.check_pixel(view, pixel)
 
     programs, state = restore(record, scene, stage)
-    zoom = 1.0
     if way == "from":
         seen = labelled_depth(programs.render(state, view), near=0, far=scene.far)
         depth = float(seen[row, column])
@@ -118,9 +117,8 @@ def _render() -> None:
                 f"--pixel={','.join(FLAGS.pixel)} of {FLAGS['from'].value} has no depth, for the "
                 f"{stage} shows no surface there: choose another pixel"
             )
-        zoom = FLAGS.magnification
-        shots = camera_paths.dolly(view, pixel, depth, magnification=zoom, frames=FLAGS.frames)
-        shots = _resized(shots)
+        motion = {"magnification": FLAGS.magnification, "frames": FLAGS.frames}
+        shots = _resized(camera_paths.dolly(view, pixel, depth, **motion))
     fine_tuned = FLAGS.fine_tune or FLAGS.target is not None
     depths = None
     if FLAGS.support or fine_tuned:
@@ -129,14 +127,8 @@ def _render() -> None:
         )
     if fine_tuned:
         state = fine_tune(programs, state, depths, shots, most=FLAGS.target_steps)
-    folders = render_shots(
-        output_dir,
-        programs,
-        state,
-        shots,
-        near=scene.near / zoom,
-        depths=depths if FLAGS.support else None,
-    )
+    seen_from = depths if FLAGS.support else None
+    folders = render_shots(output_dir, programs, state, shots, depths=seen_from)
     print(f"{len(shots.names)} frames: {', '.join(str(folder) for folder in folders)}")
     if way != "views" and len(shots.names) > 1:
         for folder in folders:
@@ -197,7 +189,6 @@ def render_shots(
     state: TrainState,
     shots: Shots,
     *,
-    near: float,
     depths: jax.Array | None,
 ) -> list[pathlib.Path]:
     """Write `<kind>/<name>.png` for every camera; returns the folders.
@@ -207,24 +198,23 @@ def render_shots(
       programs: of the run.
       state: what is rendered.
       shots: cameras.
-      near: depth of the reddest red; the darkest blue is the scene's `far`.
       depths: `[V, H, W]` of the training views, or None for no support.
     """
     scene = programs.scene
     support = jax.jit(find_support)
     kinds: list[str] = []
-    for name, camera in camera_paths.one_by_one(shots):
+    cameras = camera_paths.one_by_one(shots)
+    # Depth has the colours of three frames in all of them, so that videos do not flicker.
+    some = [programs.render(state, cameras[i][1]) for i in {0, len(cameras) // 2, len(cameras) - 1}]
+    limits = depth_range([labelled_depth(one, near=0, far=scene.far) for one in some], scene)
+    for name, camera in cameras:
         seen = programs.render(state, camera)
-        images = {
-            "rgb": seen.rgb,
-            "depth": colorize_depth(
-                seen.depth, near=near, far=scene.far, valid=np.asarray(seen.alpha) >= 0.5
-            ),
-        }
+        solid = np.asarray(seen.alpha) >= 0.5
+        depth_colours = colorize_depth(seen.depth, near=limits[0], far=limits[1], valid=solid)
+        images = {"rgb": seen.rgb, "depth": depth_colours}
         surfels = getattr(seen.aux, "surfels", None)
         if surfels is not None:
-            solid = np.asarray(seen.alpha)[..., None] >= 0.5
-            images["normals"] = colorize_normals(np.where(solid, surfels.normal, 0))
+            images["normals"] = colorize_normals(np.where(solid[..., None], surfels.normal, 0))
         if depths is not None:
             depth = labelled_depth(seen, near=0, far=scene.far)
             pixels = pixel_grid(camera.height, camera.width)
@@ -234,6 +224,16 @@ def render_shots(
             write_png(output_dir / kind / f"{name}.png", image)
         kinds = list(images)
     return [output_dir / kind for kind in kinds]
+
+
+def depth_range(depths: Sequence[jax.Array], scene: Scene) -> tuple[float, float]:
+    """Near and far of most of these depths, 0 being undefined, or else the scene's."""
+    known = np.concatenate([np.asarray(depth).ravel() for depth in depths])
+    known = known[known > 0]
+    if not len(known):
+        return scene.near, scene.far
+    low, high = np.percentile(known, [1, 99])
+    return float(low), float(high)
 
 
 def _chosen_way() -> str:

@@ -128,7 +128,7 @@ def colorize_support(count: Image, footprint: Image) -> np.ndarray:
         image = image.repeat(factor, axis=0).repeat(factor, axis=1)
         texts = [f"<={s}" if s > 0 else f">={-s}" for s in steps] + [last, "unseen"]
         panels.append(np.concatenate([image, _legend(colours, texts, image.shape[1])]))
-    titles = ["pixel of the sharpest photograph, in pixels", "photographs that saw it"]
+    titles = ["finest photograph's pixel, in pixels here", "photographs that saw it"]
     return side_by_side(panels, labels=titles)
 
 

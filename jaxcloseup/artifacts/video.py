@@ -1,7 +1,10 @@
 """Videos out of frames: MP4 where the extra `video` is installed, else WebM or AVI by OpenCV."""
 
+import contextlib
+import functools
 import os
 import pathlib
+import subprocess
 from collections.abc import Callable, Iterable, Iterator
 
 import cv2
@@ -60,7 +63,8 @@ def write_video(stem: str | pathlib.Path, frames: Iterable[Image], *, fps: float
         except OSError as error:
             if error.args and str(path) in str(error):
                 raise
-            raise _unwritable(path, error.strerror or str(error).strip()) from error
+            reason = error.strerror or str(error).strip().splitlines()[-1]
+            raise _unwritable(path, reason) from error
         finally:
             part.unlink(missing_ok=True)
         return path
@@ -71,11 +75,11 @@ def _formats() -> Iterator[tuple[str, Callable]]:
     try:
         import imageio_ffmpeg
 
-        imageio_ffmpeg.get_ffmpeg_exe()
+        program = imageio_ffmpeg.get_ffmpeg_exe()
     except (ImportError, RuntimeError):  # without it, or without a program in it
         pass
     else:
-        yield ".mp4", _open_ffmpeg
+        yield ".mp4", functools.partial(_open_ffmpeg, program)
     for ending, codec in _OPENCV.items():
 
         def open_opencv(path, size, fps, codec=codec):
@@ -88,14 +92,26 @@ def _formats() -> Iterator[tuple[str, Callable]]:
         yield ending, open_opencv
 
 
-def _open_ffmpeg(path, size, fps):
-    import imageio_ffmpeg
+def _open_ffmpeg(program, path, size, fps):
+    """A pipe into FFmpeg. imageio-ffmpeg's own forks this process, which JAX's threads forbid."""
+    frames = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", f"{fps:g}"]
+    codec = ["-c:v", "libx264", "-crf", "16", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+    command = [program, "-y", "-v", "error", *frames, "-i", "-", *codec, str(path)]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+    process = subprocess.Popen(command, **pipes)
 
-    writer = imageio_ffmpeg.write_frames(
-        str(path), size, fps=fps, quality=8, macro_block_size=2, ffmpeg_log_level="error"
-    )
-    writer.send(None)
-    return (lambda frame: writer.send(np.ascontiguousarray(frame))), writer.close
+    def add(frame):
+        # Where FFmpeg gave up there is no pipe any more; `close` says why.
+        with contextlib.suppress(BrokenPipeError):
+            process.stdin.write(np.ascontiguousarray(frame))
+
+    def close():
+        _, said = process.communicate()
+        if process.returncode:
+            lines = said.decode(errors="replace").strip().splitlines()
+            raise OSError(f"FFmpeg failed: {lines[-1] if lines else process.returncode}")
+
+    return add, close
 
 
 def _even(frames: Iterable[Image]) -> Iterator[np.ndarray]:
