@@ -47,7 +47,7 @@ def view_shots(scene: Scene, split: str) -> Shots:
         raise CameraError(
             f"--views={split}: {scene.name} has no such views: choose " + ", ".join(scene.names)
         )
-    return Shots(views.cameras, [name.replace("/", "_") for name in scene.names[split]])
+    return Shots(views.cameras, list(scene.names[split]))
 
 
 def read_camera_path(path: pathlib.Path) -> Shots:

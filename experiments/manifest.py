@@ -28,7 +28,7 @@ def write_manifest(
     Args:
       folder: of the run.
       about: configuration, versions (the device among them), seeds and scenes.
-      seconds: wall time of each stage; for a sweep by scene.
+      seconds: wall time of each stage since the run was begun or resumed; for a sweep by scene.
     """
     commit, changed = git_commit(pathlib.Path(jaxcloseup.__file__).parent)
     git = {"git_commit": commit, "git_changed": changed}

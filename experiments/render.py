@@ -51,6 +51,7 @@ from jaxcloseup.train import TrainState, labelled_depth
 
 
 FLAGS = flags.FLAGS
+flags.declare_key_flag("output_dir")
 flags.DEFINE_string("run", None, "folder of the run")
 flags.DEFINE_string("stage", None, "which state to render; default: closeup, or the last there is")
 flags.DEFINE_string("data", None, "where the run's capture lies now, if it was moved")

@@ -415,7 +415,8 @@ def main(argv: list[str]) -> None:
     found: dict[str, Any] = {}
     seconds: dict[str, dict[str, float]] = {scene.name: {} for scene in captures}
     try:
-        if jax.process_index() == 0:
+        # One that is resumed may yet turn out to be another sweep.
+        if jax.process_index() == 0 and not FLAGS.resume:
             write_manifest(output_dir, manifest)
         for scene in captures:
             found[scene.name] = run_sweep(

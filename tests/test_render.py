@@ -15,7 +15,7 @@ from test_camera_paths import path_file
 from tiny_runs import TINY_SURFELS
 
 from experiments import render as program
-from experiments.finished import preset_from_config
+from experiments.finished import load_run_scene, preset_from_config, read_run
 from experiments.loop import Programs
 from experiments.manifest import about_scene, write_manifest
 from experiments.pipeline import config
@@ -189,6 +189,14 @@ def test_a_run_that_does_not_fit_is_one_sentence(render, kept, tmp_path, name, c
     broken = copy_of(kept, tmp_path / "broken", name, change)
     with pytest.raises(SystemExit, match=message):
         render(run=broken, views="test")
+
+
+def test_other_photographs_than_it_was_trained_on_are_said(kept):
+    record = read_run(kept)
+    other = record._replace(manifest={**record.manifest, "data_sha256": "0"})
+    with pytest.warns(UserWarning, match="does not hold the photographs or cameras"):
+        load_run_scene(other)
+    load_run_scene(record)
 
 
 def test_runs_that_are_none_are_one_sentence(render, tmp_path):
