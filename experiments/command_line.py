@@ -4,9 +4,12 @@ import dataclasses
 import datetime
 import os
 import pathlib
+from collections.abc import Mapping
+from typing import Any
 
 from absl import flags
 
+from experiments.output_dir import check_unused
 from experiments.presets import PRESETS, Preset, with_classic_density
 from jaxcloseup.scenes import Scene, load_scene
 from jaxcloseup.scenes.formats import FORMATS
@@ -20,9 +23,6 @@ flags.DEFINE_enum(
     "quick",
     ["quick", "paper", "released"],
     "hyper-parameters; flags below override them; released: of NeRF alone",
-)
-flags.DEFINE_string(
-    "output_dir", None, "where results go; default outputs/<scene>/<method>/<date_time>"
 )
 flags.DEFINE_integer(
     "downscale",
@@ -111,19 +111,19 @@ def names_from_flags() -> dict[str, str]:
     return names | {key: flag.value for key, flag in chosen.items() if flag.value != flag.default}
 
 
-def scene_from_flags(name: str, downscale: int) -> Scene:
+def load_options_from_flags(preset: Preset) -> dict[str, Any]:
+    """What `load_scene` is given beside a scene's name."""
+    options = {name: FLAGS[name].value for name in ("half_pixel", "format", "split")}
+    return {"downscale": preset.downscale, **options}
+
+
+def load(name: str, options: Mapping[str, Any]) -> Scene:
     """A built-in scene or a capture, with a printed note on what of it was read.
 
     Raises:
       SceneError: one sentence that says what to do.
     """
-    scene = load_scene(
-        name,
-        downscale=downscale,
-        half_pixel=FLAGS.half_pixel,
-        format=FLAGS.format,
-        split=FLAGS.split,
-    )
+    scene = load_scene(name, **options)
     for note in scene.metadata.get("notes", ()):
         print(note)
     return scene
@@ -143,9 +143,4 @@ def choose_output_dir(
     if folder is None:
         stamp = datetime.datetime.now().strftime("%Y-%m-%d_%H%M%S")
         folder = os.path.join("outputs", pathlib.Path(scene).name, method, stamp)
-    path = pathlib.Path(folder)
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise FileExistsError(
-            f"--output_dir={folder} already holds something: name a new folder, or remove it first"
-        )
-    return path
+    return check_unused(folder)

@@ -18,9 +18,9 @@ from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.lpips import BACKBONES, SMALLEST, LpipsError, LpipsWeights, load_lpips, lpips
 from jaxcloseup.metrics import SSIM_TAPS, cc_psnr, psnr, quantize, ssim
-from jaxcloseup.pseudo import count_seen
 from jaxcloseup.scenes import Scene
 from jaxcloseup.scenes.scene import Surface
+from jaxcloseup.support import count_seen
 
 
 SEEN_BY = (1, 3)

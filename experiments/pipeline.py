@@ -6,7 +6,7 @@ import functools
 import pathlib
 import platform
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -24,6 +24,7 @@ from experiments.evaluation import (
 )
 from experiments.gate import print_gate, weigh_labels
 from experiments.loop import Programs, run_stage
+from experiments.manifest import about_scene, write_manifest
 from experiments.pictures import comparisons, label_pictures, write_renders
 from experiments.presets import Preset, initial_points, pseudo_settings
 from experiments.report import in_short, write_json, write_report
@@ -53,6 +54,7 @@ def run(
     to_run: Sequence[str] = STAGES,
     save_every: int = 1000,
     perceptual: Perceptual = NO_PERCEPTUAL,
+    load_options: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """The stages on one scene; writes everything under `output_dir` and returns the results.
 
@@ -65,6 +67,7 @@ def run(
       to_run: stages; `baseline` always runs.
       save_every: steps between checkpoints. Those in `output_dir` are gone on from.
       perceptual: networks of LPIPS.
+      load_options: what `load_scene` was given, to load the scene again; for the manifest.
     """
     key_init, key_audit, key_pictures = jax.random.split(jax.random.key(seed), 3)
     key_depths, key_points = jax.random.fold_in(key_init, 1), jax.random.fold_in(key_init, 2)
@@ -81,6 +84,10 @@ def run(
     settings = pseudo_settings(preset)
     seconds: dict[str, float] = {}
     history, stages, renderings = {}, {}, {}
+    load_options = {"downscale": preset.downscale} if load_options is None else load_options
+    manifest = {**names, "seed": seed, "config": config(preset), "versions": versions()}
+    manifest |= about_scene(scene, load_options)
+    write_manifest(output_dir, manifest)
 
     def train(stage, kind, state, *data, steps):
         with timed(seconds, stage):
@@ -193,6 +200,7 @@ def run(
         "config": config(preset),
         "versions": versions(),
     }
+    write_manifest(output_dir, manifest, seconds)
     write_json(output_dir / "results.json", results)
     write_report(output_dir / "report.html", results, pictures)
     return results

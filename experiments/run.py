@@ -42,7 +42,8 @@ def main(argv: list[str]) -> None:
         output_dir = command_line.choose_output_dir(
             FLAGS.output_dir, FLAGS.scene, FLAGS.method, resume=FLAGS.resume
         )
-        scene = command_line.scene_from_flags(FLAGS.scene, preset.downscale)
+        load_options = command_line.load_options_from_flags(preset)
+        scene = command_line.load(FLAGS.scene, load_options)
         output_dir.mkdir(parents=True, exist_ok=True)
     except (SceneError, OSError, ValueError) as error:
         sys.exit(f"experiments.run: {error}")
@@ -56,6 +57,7 @@ def main(argv: list[str]) -> None:
             to_run=FLAGS.stages,
             save_every=FLAGS.save_every,
             perceptual=find_perceptual(FLAGS.lpips_weights),
+            load_options=load_options,
         )
     except (TrainingError, CheckpointError, OSError) as error:
         sys.exit(f"experiments.run: {error}")

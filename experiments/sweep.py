@@ -30,7 +30,8 @@ from experiments.evaluation import (
 )
 from experiments.fixed_labels import labels_of_less_error, true_close_ups
 from experiments.loop import HOSTS_WAIT, Programs, TrainingError, run_stage
-from experiments.pipeline import config, rendered_depths, versions
+from experiments.manifest import about_scene, write_manifest
+from experiments.pipeline import config, rendered_depths, timed, versions
 from experiments.presets import Preset, initial_points, pseudo_settings
 from experiments.set_up import set_up
 from experiments.sweep_report import print_sweep, write_sweep
@@ -87,6 +88,7 @@ def run_sweep(
     names: Mapping[str, str],
     max_parallel: int = 8,
     perceptual: Perceptual = NO_PERCEPTUAL,
+    seconds: dict[str, float] | None = None,
 ) -> dict[str, Any]:
     """All arms of one scene; returns, for each arm, the metrics of each seed and split.
 
@@ -99,6 +101,7 @@ def run_sweep(
       names: of "method" and "preset".
       max_parallel: arms and seeds trained at once.
       perceptual: networks of LPIPS.
+      seconds: is filled with the wall time of each stage.
     """
     chosen = [make_arm(name, pseudo_settings(preset)) for name in arms]
     for arm in chosen:
@@ -113,7 +116,11 @@ def run_sweep(
     identity |= {"max_parallel": max_parallel, "devices": len(jax.devices())}
     identity |= {"version": jaxcloseup.__version__}
     checkpoints = Checkpoints(folder, identity)
-    stage = functools.partial(run_stage, checkpoints=checkpoints, save_every=1000)
+    seconds = {} if seconds is None else seconds
+
+    def stage(name, *data, steps):
+        with timed(seconds, name):
+            return run_stage(name, *data, steps=steps, checkpoints=checkpoints, save_every=1000)
 
     starts = []
 
@@ -285,7 +292,8 @@ def main(argv: list[str]) -> None:
             output_dir = command_line.choose_output_dir(
                 FLAGS.output_dir, "sweep", FLAGS.method, resume=FLAGS.resume
             )
-        captures = [command_line.scene_from_flags(name, preset.downscale) for name in FLAGS.scenes]
+        load_options = command_line.load_options_from_flags(preset)
+        captures = [command_line.load(name, load_options) for name in FLAGS.scenes]
         if len({scene.name for scene in captures}) < len(captures):
             raise ValueError(
                 f"--scenes={','.join(FLAGS.scenes)} has two of one name: sweep them one at a time"
@@ -294,8 +302,14 @@ def main(argv: list[str]) -> None:
     except (SceneError, OSError, ValueError) as error:
         sys.exit(f"experiments.sweep: {error}")
     about = {**names, "config": config(preset), "versions": versions()}
+    manifest = about | {"seeds": list(range(FLAGS.seeds)), "arms": FLAGS.arms}
+    manifest["scenes"] = {scene.name: about_scene(scene, load_options) for scene in captures}
     found: dict[str, Any] = {}
+    seconds: dict[str, dict[str, float]] = {scene.name: {} for scene in captures}
     try:
+        # One that is resumed may yet turn out to be another sweep.
+        if jax.process_index() == 0 and not FLAGS.resume:
+            write_manifest(output_dir, manifest)
         for scene in captures:
             found[scene.name] = run_sweep(
                 scene,
@@ -306,9 +320,12 @@ def main(argv: list[str]) -> None:
                 names=names,
                 max_parallel=FLAGS.max_parallel,
                 perceptual=find_perceptual(FLAGS.lpips_weights),
+                seconds=seconds[scene.name],
             )
             if jax.process_index() == 0:
                 write_sweep(output_dir, found, about)
+        if jax.process_index() == 0:
+            write_manifest(output_dir, manifest, seconds)
     except (TrainingError, CheckpointError, OSError) as error:
         sys.exit(f"experiments.sweep: {error}")
     if jax.process_index() == 0:

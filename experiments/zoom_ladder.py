@@ -15,8 +15,8 @@ from experiments.plots import Curve
 from jaxcloseup.batch import camera_at
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points
 from jaxcloseup.geometry.poses import closeup_position, sample_anchor
-from jaxcloseup.pseudo import count_seen
 from jaxcloseup.scenes import Scene
+from jaxcloseup.support import count_seen
 
 
 MAGNIFICATIONS = (1, 2, 4, 8, 16)

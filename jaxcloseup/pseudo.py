@@ -276,32 +276,3 @@ def best_source(
         return jnp.sum(lands & (own_depth > 0) & (weight > 0))
 
     return jnp.argmax(jax.lax.map(count, (views.cameras, depths, views.weight)))
-
-
-def count_seen(
-    camera: Camera,
-    pixels: jax.Array,
-    depth: jax.Array,
-    views: Views,
-    depths: jax.Array,
-    *,
-    tolerance: float = 0.02,
-) -> jax.Array:
-    """How many training photographs saw the surface behind each pixel, `[...]` int32.
-
-    A view saw a point that lands on a pixel of its photograph at a depth confirmed by its own depth
-    map to a relative `tolerance`. Arguments as for `make_label`; pixels without depth count 0.
-    """
-    points = pixels_to_points(camera, pixels, depth)
-
-    def add_view(count, view):
-        source, view_depth, weight = view
-        landed, landed_depth = points_to_pixels(source, points)
-        maps = jnp.stack([view_depth, weight], axis=-1)
-        observed, weight = jnp.moveaxis(backward_warp(maps, landed, order=0), -1, 0)
-        confirmed = depth_consistent(observed, landed_depth, tolerance)
-        saw = (depth > 0) & (weight > 0) & confirmed
-        return count + saw.astype(jnp.int32), None
-
-    count = jnp.zeros(depth.shape, jnp.int32)
-    return jax.lax.scan(add_view, count, (views.cameras, depths, views.weight))[0]

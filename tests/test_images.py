@@ -9,6 +9,8 @@ import pytest
 from jaxcloseup.artifacts.images import (
     colorize_depth,
     colorize_error,
+    colorize_normals,
+    colorize_support,
     png_data_uri,
     side_by_side,
     to_uint8,
@@ -133,3 +135,28 @@ def test_labels():
     assert (strip[:, 60:64] == 255).all()
     with pytest.raises(ValueError, match="zip"):
         side_by_side([panel], labels=["a", "b"])
+
+
+def test_colorize_normals():
+    normal = np.array([[[0.0, 0, 2], [-0.1, 0, 0], [0, 0, 0], [np.nan, 0, 0]]])
+    expected = [[128, 128, 255], [0, 128, 128], [0, 0, 0], [0, 0, 0]]
+    np.testing.assert_allclose(colorize_normals(normal)[0].astype(int), expected, atol=1)
+
+
+def test_support_is_drawn_in_steps_with_unseen_pixels_apart():
+    footprint = np.array([[0.5, 1, 1.5, 2, 3.9, 8, 9, 100, np.inf]])
+    count = np.array([[12, 9, 8, 4, 3, 2, 1, 1, 0]])
+    picture = colorize_support(count, footprint)
+    factor = 360 // 9
+    assert picture.shape == (24 + factor + 24, 2 * 360 + 8, 3)
+    sharp, often = (picture[24 + factor // 2, left : left + 360 : factor] for left in (0, 368))
+    unseen = [230, 0, 126]
+    for row, groups in ((sharp, "aabbcdeeu"), (often, "aabccdeeu")):
+        colours = {group: row[i].tolist() for i, group in enumerate(groups)}
+        assert colours["u"] == unseen
+        assert [colours[group] for group in groups] == row.tolist()
+        steps = [sum(colours[group]) for group in "abcde"]
+        assert steps == sorted(steps, reverse=True) and len(set(steps)) == 5
+    # The legend shows the same colours, in the same order.
+    legend = picture[-12, 8:360:60].tolist()
+    assert legend == [sharp[i].tolist() for i in (0, 2, 4, 5, 6, 8)]

@@ -23,6 +23,7 @@ MAY_IMPORT = {
     "volume": {"numerics", "geometry", "field"},
     "splats": {"numerics", "geometry", "field", "metrics"},
     "pseudo": {"numerics", "geometry", "field", "batch"},
+    "support": {"numerics", "geometry", "batch"},
     "train": {"numerics", "geometry", "field", "batch", "pseudo", "rendered_loss"},
     "scenes": {"ply", "numerics", "geometry", "batch"},
     "artifacts": {"files", "ply", "numerics", "geometry", "batch", "splats"},

@@ -9,7 +9,6 @@ from jaxcloseup.geometry.poses import PoseSettings
 from jaxcloseup.pseudo import (
     PseudoSettings,
     best_source,
-    count_seen,
     label_views,
     make_label,
     sample_virtual_camera,
@@ -270,19 +269,3 @@ def test_target_views_are_labelled_from_their_best_source(capture):
         kept = np.asarray(labels.weight[i]) > 0
         assert kept.mean() > 0.2
         np.testing.assert_allclose(labels.rgb[i][kept], stacked.rgb[i][kept], atol=0.03)
-
-
-def test_photographs_that_saw_a_pixel_are_counted(capture):
-    views, depths, _ = capture
-    wide = plane.camera_above(0.0, 0.0, 6.0)
-    _, depth, points = truth(wide)
-    expected = sum(
-        seen_by_first(points, jax.tree.map(lambda leaf, i=i: leaf[i], views.cameras))
-        for i in range(len(views))
-    )
-    seen = jax.jit(count_seen)(wide, GRID, depth, views, depths)
-    assert {0, 1, 4} <= set(np.unique(expected).tolist())
-    # At the border of a photograph a projected edge may fall to either side.
-    assert np.mean(np.asarray(seen) == expected) > 0.98
-    none = jax.jit(count_seen)(wide, GRID, depth * 0.7, views, depths)
-    assert none.max() == 0

@@ -16,6 +16,7 @@ from experiments import command_line
 from experiments import run as program
 from experiments.audit import blur_to_footprint
 from experiments.evaluation import Target, score, summarise
+from experiments.finished import choose_stage, load_run_scene, read_run, restore
 from experiments.gate import AGREEMENT, verdict, weigh_labels
 from experiments.loop import Programs, TrainingError, run_stage
 from experiments.pipeline import config, run
@@ -27,7 +28,9 @@ from experiments.presets import (
 )
 from experiments.report import write_json
 from jaxcloseup.artifacts.checkpoints import Checkpoints
+from jaxcloseup.artifacts.images import to_uint8
 from jaxcloseup.artifacts.surfel_ply import read_surfels
+from jaxcloseup.batch import camera_at
 from jaxcloseup.field import Rendering
 from jaxcloseup.scenes import load_scene
 from jaxcloseup.splats.adaptive_density import AdaptiveDensityConfig
@@ -62,6 +65,24 @@ def test_a_run_scores_every_stage_on_every_split(finished):
             assert scores["lpips_vgg_reason"]
         assert results["seconds"][stage] > 0
     assert results["stages"]["control"] != results["stages"]["closeup"]
+
+
+def test_a_run_leaves_what_it_takes_to_render_it(finished, capture_folder):
+    results, output_dir = finished
+    manifest = json.loads((output_dir / "manifest.json").read_text())
+    assert manifest["finished"] and manifest["seconds"]["closeup"] == results["seconds"]["closeup"]
+    assert manifest["config"] == results["config"] and manifest["versions"]["device"]
+    assert manifest["scene"] == str(capture_folder.resolve())
+    record = read_run(output_dir)
+    assert record.preset == TINY
+    assert record.stages == ["baseline", "closeup", "control", "test_time"]
+    assert choose_stage(record, None) == "closeup"
+    with jax.numpy_dtype_promotion("standard"):
+        scene = load_run_scene(record)
+        programs, state = restore(record, scene, "closeup")
+        image = programs.render(state, camera_at(scene.test.cameras, 0)).rgb
+    saved = cv2.imread(str(output_dir / "renders" / "closeup" / "test" / "rgb" / "0.png"))
+    np.testing.assert_allclose(to_uint8(image), saved[..., ::-1], atol=1)
 
 
 def run_surfels(capture_folder, output_dir, **options):

@@ -78,7 +78,7 @@ class Checkpoints:
         )
         try:
             found = manager.restore(step, args=items)
-        except (ValueError, OSError) as error:
+        except (ValueError, KeyError, OSError) as error:
             raise CheckpointError(
                 f"{self.folder / stage / str(step)} does not hold this run's state "
                 f"({str(error).splitlines()[0]}): remove it to go on from an earlier one."

@@ -1,4 +1,4 @@
-"""Pictures: PNG files, colour maps for depth and error, panels side by side.
+"""Pictures: PNG files, colour maps for depth, error, normals and support, panels side by side.
 
 Images are `[H, W, 3]`, red first, or `[H, W]` grey; floats in [0, 1] or uint8; NumPy or JAX arrays.
 """
@@ -17,6 +17,8 @@ from jaxcloseup.files import write_file
 Image = np.ndarray | jax.Array
 
 _LABEL_HEIGHT = 24
+_LEGEND_WIDTH = 360
+_UNSEEN = (230, 0, 126)
 
 
 def to_uint8(image: Image) -> np.ndarray:
@@ -86,6 +88,50 @@ def colorize_error(error: Image, *, highest: float = 0.25) -> np.ndarray:
     return _map((error.mean(-1) if error.ndim == 3 else error) / highest, cv2.COLORMAP_INFERNO)
 
 
+def colorize_normals(normal: Image) -> np.ndarray:
+    """Normals in false colours, uint8 `[H, W, 3]`: (n + 1) / 2; where there is none, black.
+
+    Args:
+      normal: `[H, W, 3]` of any length; those of length 0 are none.
+    """
+    normal = np.nan_to_num(np.asarray(normal, np.float64))
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    unit = normal / np.where(length > 0, length, 1)
+    return to_uint8(np.where(length > 0, (unit + 1) / 2, 0))
+
+
+def colorize_support(count: Image, footprint: Image) -> np.ndarray:
+    """Two panels, how sharply and by how many photographs pixels were seen, with legends below.
+
+    Pixels that nobody saw are magenta in both, the one colour that the maps do not have.
+
+    Args:
+      count: `[H, W]` photographs that saw the pixel.
+      footprint: `[H, W]` side of the smallest photograph's pixel in pixels of the view; drawn in
+        steps, up to 1 (as sharp as the view), 2, 4, 8 and coarser.
+
+    Returns:
+      uint8 `[H', W', 3]`; small images are drawn larger, for the legends to be read.
+    """
+    count, footprint = np.asarray(count), np.asarray(footprint)
+    unseen = count < 1
+    panels = []
+    for values, steps, last in (
+        (footprint, (1, 2, 4, 8), "coarser"),
+        (-count, (-9, -5, -3, -2), "1"),
+    ):
+        step = np.searchsorted(np.array(steps) * (1 + 1e-4 * np.sign(steps)), values)
+        colours = _map(np.linspace(0.95, 0.1, len(steps) + 1), cv2.COLORMAP_VIRIDIS)
+        colours = np.concatenate([colours.reshape(-1, 3), [_UNSEEN]]).astype(np.uint8)
+        image = colours[np.where(unseen, len(steps) + 1, step)]
+        factor = -(-_LEGEND_WIDTH // image.shape[1])
+        image = image.repeat(factor, axis=0).repeat(factor, axis=1)
+        texts = [f"<={s}" if s > 0 else f">={-s}" for s in steps] + [last, "unseen"]
+        panels.append(np.concatenate([image, _legend(colours, texts, image.shape[1])]))
+    titles = ["finest photograph's pixel, in pixels here", "photographs that saw it"]
+    return side_by_side(panels, labels=titles)
+
+
 def side_by_side(
     images: Iterable[Image], *, labels: Sequence[str] | None = None, gap: int = 8
 ) -> np.ndarray:
@@ -123,3 +169,15 @@ def _label(text: str, width: int) -> np.ndarray:
     (length, _), _ = cv2.getTextSize(text, font, scale, 1)
     scale *= min(1, (width - 4) / max(length, 1))
     return cv2.putText(strip, text, (2, 17), font, scale, (0, 0, 0), 1, cv2.LINE_AA)
+
+
+def _legend(colours, texts, width):
+    """A strip of boxes of the colours, each with its text."""
+    edges = np.linspace(0, width, len(texts) + 1).astype(int)
+    boxes = []
+    for colour, text, left, right in zip(colours, texts, edges, edges[1:], strict=False):
+        box = np.full((_LABEL_HEIGHT, right - left, 3), 255, np.uint8)
+        box[4:-4, 2:14] = colour
+        box[:, 14:] = _label(text, right - left - 14)
+        boxes.append(box)
+    return np.concatenate(boxes, axis=1)

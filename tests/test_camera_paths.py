@@ -1,0 +1,175 @@
+import dataclasses
+import json
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import plane
+import pytest
+
+from experiments import camera_paths
+from experiments.camera_paths import CameraError, check_pixel, dolly, looked_at, read_camera_path
+from jaxcloseup.batch import camera_at
+from jaxcloseup.geometry.cameras import Camera, pixels_to_points, points_to_pixels
+from jaxcloseup.scenes import load_scene
+
+
+def path_file(folder, **changes):
+    """A camera path of two cameras; a change to None leaves the field out."""
+    pose = np.eye(4)
+    pose[:3] = plane.camera_above(0.3, 0.1, 2.0, tilt=0.2).camtoworld
+    pose[:3, 1:3] *= -1  # OpenCV to OpenGL
+    entry = {"camera_to_world": pose.ravel().tolist(), "fov": 40, "aspect": 4 / 3}
+    fields = {
+        "camera_type": "perspective",
+        "render_height": 24,
+        "render_width": 32,
+        "camera_path": [entry, entry | {"fov": 20.0}],
+        "fps": 24,
+        "seconds": 2.0,
+    }
+    for key, value in changes.items():
+        target = fields if key in fields else fields["camera_path"][1]
+        target.pop(key) if value is None else target.update({key: value})
+    file = folder / "path.json"
+    file.write_text(json.dumps(fields))
+    return file
+
+
+def test_a_camera_path_is_read_as_nerfstudio_means_it(tmp_path):
+    shots = read_camera_path(path_file(tmp_path))
+    expected = plane.camera_above(0.3, 0.1, 2.0, tilt=0.2)
+    assert shots.names == ["0000", "0001"] and shots.fps == 24
+    for i, fov in enumerate((40, 20)):
+        camera = camera_at(shots.cameras, i)
+        assert (camera.height, camera.width) == (24, 32)
+        np.testing.assert_allclose(camera.camtoworld, expected.camtoworld, atol=1e-6)
+        # The rays at the top and at the bottom are `fov` apart.
+        focal = 12 / math.tan(math.radians(fov / 2))
+        np.testing.assert_allclose(camera.intrinsics, [focal, focal, 16, 12], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("changes", "fps"), [({"fps": None}, 1.0), ({"seconds": None}, 24)])
+def test_frames_a_second_follow_from_seconds(tmp_path, changes, fps):
+    assert read_camera_path(path_file(tmp_path, **changes)).fps == fps
+
+
+FLAT = np.eye(4).ravel().tolist()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"render_height": None}, "no render_height"),
+        ({"render_width": 31.5}, "render_width must be a whole number"),
+        ({"render_height": "tall"}, "render_height must be a finite number"),
+        ({"camera_path": None}, "camera_path must be a list"),
+        ({"camera_path": []}, "camera_path must be a list of one camera or more"),
+        ({"camera_path": [3]}, r"camera_path\[0\] must be an object"),
+        ({"camera_type": "fisheye"}, "camera_type is 'fisheye'"),
+        ({"fps": 0}, "fps and seconds must be positive"),
+        ({"camera_to_world": None}, r"camera_path\[1\]: no camera_to_world"),
+        ({"camera_to_world": FLAT[:15]}, r"camera_path\[1\]: camera_to_world must be 16 finite"),
+        ({"camera_to_world": ["a"] * 16}, "must be 16 finite numbers"),
+        ({"camera_to_world": [math.nan, *FLAT[1:]]}, "must be 16 finite numbers"),
+        ({"camera_to_world": [*FLAT[:12], 1, 2, 3, 1]}, "may be transposed"),
+        ({"camera_to_world": [2, *FLAT[1:]]}, "not a rotation and a position"),
+        ({"camera_to_world": [-1, *FLAT[1:]]}, "not a rotation and a position"),
+        ({"fov": None}, r"camera_path\[1\]: no fov"),
+        ({"fov": 180}, "fov must be between 0 and 180"),
+    ],
+)
+def test_a_broken_camera_path_is_one_sentence(tmp_path, changes, message):
+    with pytest.raises(CameraError, match=message) as error:
+        read_camera_path(path_file(tmp_path, **changes))
+    assert "path.json" in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (b"{", "not JSON at line 1"),
+        (b"[]", "not an object"),
+        (b"\xff", "not UTF-8"),
+        (None, "read"),
+    ],
+)
+def test_what_is_no_camera_path_is_one_sentence(tmp_path, text, message):
+    if text is not None:
+        (tmp_path / "a.json").write_bytes(text)
+    with pytest.raises(CameraError, match=message):
+        read_camera_path(tmp_path / "a.json")
+
+
+def test_a_dolly_ends_so_many_times_nearer_and_grows_evenly():
+    camera, pixel = plane.camera_above(0.3, 0.0, 4.0, tilt=0.3), (20.5, 7.5)
+    depth = float(plane.photograph(camera)[1][7, 20])
+    shots = dolly(camera, pixel, depth, magnification=4.0, frames=5)
+    anchor = pixels_to_points(camera, jnp.array(pixel), jnp.float32(depth))
+    sizes = []
+    for i in range(5):
+        one = camera_at(shots.cameras, i)
+        np.testing.assert_array_equal(one.rotation, camera.rotation)
+        # A short rod at the anchor, parallel to the image.
+        ends = anchor[None] + jnp.array([[-0.01], [0.01]]) * camera.rotation[None, :, 0]
+        (left, right), _ = points_to_pixels(one, ends)
+        np.testing.assert_allclose((left + right) / 2, pixel, atol=1e-3)
+        sizes.append(float(right[0] - left[0]))
+    np.testing.assert_allclose(np.array(sizes) / sizes[0], 4 ** (np.arange(5) / 4), rtol=1e-3)
+    np.testing.assert_allclose(shots.cameras.position[0], camera.position, atol=1e-6)
+    (last,) = dolly(camera, pixel, depth, magnification=4.0, frames=1).cameras.position
+    np.testing.assert_allclose(last, shots.cameras.position[-1], atol=1e-6)
+
+
+@pytest.mark.parametrize("pixel", [(-0.1, 3), (32, 3), (3, 24), (math.nan, 3)])
+def test_a_pixel_outside_is_one_sentence(pixel):
+    camera = plane.camera_above(0, 0, 1)
+    assert check_pixel(camera, (31.9, 0)) == (0, 31)
+    with pytest.raises(CameraError, match=r"--pixel=.* is outside .* 32 x 24 pixels"):
+        check_pixel(camera, pixel)
+
+
+def ring(centre, radius, height, count=12):
+    """Stacked cameras on a circle in the plane z = `height`, looking at its centre below."""
+    poses = []
+    for angle in np.linspace(0, 2 * np.pi, count, endpoint=False):
+        position = centre + np.array([radius * np.cos(angle), radius * np.sin(angle), height])
+        poses.append(camera_paths._look(position, centre, np.array([0.0, 0, 1])))
+    intrinsics = jnp.tile(jnp.array([40.0, 40, 16, 12]), (count, 1))
+    return Camera(jnp.asarray(np.array(poses), jnp.float32), intrinsics, 24, 32)
+
+
+def test_an_orbit_is_the_circle_of_cameras_that_stand_on_one(capture_folder):
+    scene = load_scene(str(capture_folder))
+    centre = np.array([1.0, -2.0, 0.5])
+    cameras = ring(centre, 3.0, 2.0)
+    scene = dataclasses.replace(scene, train=scene.train.replace(cameras=cameras))
+    shots = camera_paths.orbit(scene, 12)
+    # From the first camera round, one way or the other.
+    np.testing.assert_allclose(shots.cameras.camtoworld, cameras.camtoworld, atol=1e-4)
+    pixel, depth = jax.vmap(points_to_pixels, (0, None))(shots.cameras, jnp.asarray(centre, "f"))
+    np.testing.assert_allclose(pixel, np.tile([16, 12], (12, 1)), atol=1e-2)
+    np.testing.assert_allclose(depth, math.hypot(3, 2), rtol=1e-5)
+
+
+def test_cameras_that_look_nowhere_in_common_look_ahead():
+    positions, forward = np.eye(3), np.tile([0.0, 0, 1], (3, 1))
+    point = looked_at(positions, forward, near=1.0, far=3.0)
+    np.testing.assert_allclose(point, positions.mean(0) + 1.5 * forward[0])
+    # Back to back in a room: where their axes meet is behind them.
+    outward = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0]])
+    point = looked_at(outward * 0.1, outward, near=1.0, far=3.0)
+    np.testing.assert_allclose(point, (outward * 1.6).mean(0))
+
+
+def test_the_size_changes_and_the_view_does_not():
+    camera = plane.camera_above(0.3, 0.0, 4.0, tilt=0.3)
+    points = jnp.asarray(plane.photograph(camera)[2], jnp.float32)
+    before, _ = points_to_pixels(camera, points)
+    for sizes, (width, height) in (((64, None), (64, 48)), ((None, 12), (16, 12))):
+        larger = camera_paths.resized(camera, *sizes)
+        assert (larger.width, larger.height) == (width, height)
+        after, _ = points_to_pixels(larger, points)
+        np.testing.assert_allclose(after, before * (width / 32), atol=1e-3)
+    assert camera_paths.resized(camera, None, None) is camera

@@ -1,0 +1,89 @@
+import dataclasses
+import json
+import shutil
+import subprocess
+
+import pytest
+from absl import flags
+from absl.testing import flagsaver
+
+from experiments import sweep
+from experiments.manifest import about_scene, git_commit, hash_data
+from jaxcloseup.scenes import load_scene
+
+
+def test_the_hash_is_of_all_that_training_reads(capture_folder):
+    scene = load_scene(str(capture_folder))
+    digest = hash_data(scene)
+    assert len(digest) == 64
+    assert hash_data(load_scene(str(capture_folder))) == digest
+    views = scene.train
+    pose = views.cameras.camtoworld.at[0, 0, 3].add(1e-6)
+    for changed in (
+        views.replace(rgb=views.rgb.at[-1, -1, -1, -1].add(1)),
+        views.replace(weight=views.weight.at[0, 0, 0].set(0)),
+        views.replace(cameras=views.cameras.replace(camtoworld=pose)),
+    ):
+        assert hash_data(dataclasses.replace(scene, train=changed)) != digest
+    # Held-out photographs are not read in training.
+    assert hash_data(dataclasses.replace(scene, test=None)) == digest
+
+
+def test_a_manifest_knows_how_to_load_the_scene_again(capture_folder, monkeypatch):
+    monkeypatch.chdir(capture_folder.parent)
+    about = about_scene(load_scene(capture_folder.name), {"downscale": 1})
+    again = load_scene(about["scene"], **about["load_options"])
+    assert about["scene"] == str(capture_folder.resolve())
+    assert hash_data(again) == about["data_sha256"]
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
+def test_the_commit_is_that_of_the_package_alone(tmp_path):
+    def git(*args):
+        identity = ["-c", "user.name=a", "-c", "user.email=a@b.c"]
+        subprocess.run(["git", "-C", tmp_path, *identity, *args], check=True, capture_output=True)
+
+    package, installed = tmp_path / "package", tmp_path / ".venv" / "package"
+    for folder in (package, installed):
+        folder.mkdir(parents=True)
+        (folder / "a.py").write_text("a")
+    assert git_commit(package) == (None, None)
+    git("init")
+    assert git_commit(package) == (None, None)  # nothing is committed yet
+    git("add", "package")
+    git("commit", "-m", "a")
+    commit, changed = git_commit(package)
+    assert len(commit) == 40 and not changed
+    (package / "a.py").write_text("b")
+    assert git_commit(package) == (commit, True)
+    # Somebody else's checkout that happens to hold the environment.
+    assert git_commit(installed) == (None, None)
+
+
+def test_git_that_is_missing_is_no_error(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert git_commit(tmp_path) == (None, None)
+
+
+def test_a_sweep_leaves_a_manifest(capture_folder, tmp_path, monkeypatch):
+    flags.FLAGS(["sweep"])
+    begun = {}
+
+    def stub(scene, preset, arms, seeds, folder, *, seconds, **options):
+        begun.update(json.loads((tmp_path / "out" / "manifest.json").read_text()))
+        seconds["baseline_0"] = 1.5
+        return {}
+
+    monkeypatch.setattr(sweep, "run_sweep", stub)
+    monkeypatch.setattr(sweep, "write_sweep", lambda *_: None)
+    monkeypatch.setattr(sweep, "print_sweep", lambda *_: None)
+    given = {"output_dir": str(tmp_path / "out"), "scenes": [str(capture_folder)], "downscale": 1}
+    with flagsaver.flagsaver(compilation_cache="", arms=["control"], seeds=2, **given):
+        sweep.main(["sweep"])
+    assert begun["finished"] is False and begun["seconds"] is None
+    after = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    name = capture_folder.name
+    assert after["finished"] and after["seconds"] == {name: {"baseline_0": 1.5}}
+    assert after["seeds"] == [0, 1] and after["arms"] == ["control"]
+    assert after["scenes"][name]["load_options"] == {"downscale": 1, "half_pixel": False}
+    assert after["scenes"][name]["data_sha256"] == hash_data(load_scene(str(capture_folder)))

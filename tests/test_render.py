@@ -1,0 +1,223 @@
+"""Rendering a run: its state is the plane as surfels, kept as a run would keep it."""
+
+import dataclasses
+import json
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import plane
+import pytest
+from absl import flags
+from absl.testing import flagsaver
+from test_camera_paths import path_file
+from tiny_runs import TINY_SURFELS
+
+from experiments import render as program
+from experiments.finished import load_run_scene, preset_from_config, read_run
+from experiments.loop import Programs
+from experiments.manifest import about_scene, write_manifest
+from experiments.pipeline import config
+from experiments.presets import PRESETS, with_classic_density
+from jaxcloseup.artifacts.checkpoints import Checkpoints
+from jaxcloseup.scenes import load_scene
+from jaxcloseup.train import init_state
+
+
+PRESET = dataclasses.replace(TINY_SURFELS, gated=False)
+HALF = 1.4  # the surfels reach so far from the middle of the plane
+
+
+@pytest.fixture(scope="session")
+def kept(capture_folder, tmp_path_factory):
+    """A folder as a run leaves it, cut off after its closeup."""
+    folder = tmp_path_factory.mktemp("kept")
+    with jax.numpy_dtype_promotion("standard"):
+        scene = load_scene(str(capture_folder))
+        side = np.linspace(-HALF, HALF, 24)
+        points = np.stack([*np.meshgrid(side, side), np.zeros((24, 24))], -1).reshape(-1, 3)
+        programs = Programs(PRESET, scene)
+        bound = {"field": programs.field, "optimizer": programs.optimizer}
+        data = (jnp.asarray(x, jnp.float32) for x in (points, plane.texture(points)))
+        state = init_state(jax.random.key(0), *data, **bound)
+        flat = {
+            "opacity_logits": jnp.full_like(state.params.opacity_logits, 3.0),
+            "quaternions": jnp.zeros_like(state.params.quaternions).at[:, 0].set(1),
+        }
+        state = state.replace(params=state.params.replace(**flat))
+    write_manifest(folder, about_scene(scene, {"downscale": 1}) | {"seed": 0})
+    size = [plane.WIDTH, plane.HEIGHT]
+    identity = {"scene": scene.name, "config": config(PRESET), "resolution": size}
+    checkpoints = Checkpoints(folder / "checkpoints", identity | {"version": "1"})
+    for stage in ("baseline", "closeup"):
+        checkpoints.save(stage, 3, state, {"history": [], "growth": 1})
+    return folder
+
+
+@pytest.fixture
+def render(kept, tmp_path):
+    """Run the program with flags; returns its output folder."""
+    flags.FLAGS(["render"])
+
+    def call(**given):
+        given = {"run": str(kept), "output_dir": str(tmp_path / "out")} | given
+        promotion = jax.numpy_dtype_promotion("standard")
+        with promotion, flagsaver.flagsaver(compilation_cache="", **given):
+            program.main(["render"])
+        return tmp_path / "out"
+
+    return call
+
+
+def files(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+def test_test_views_are_rendered_with_their_own_cameras(render, capture_folder, capsys):
+    out = render(views="test")
+    kinds = ("depth", "normals", "rgb", "support")
+    assert files(out) == [f"{kind}/0.png" for kind in kinds]
+    truth = cv2.imread(str(capture_folder / "test" / "0.png"))
+    image = cv2.imread(str(out / "rgb" / "0.png"))
+    assert image.shape == truth.shape
+    assert np.abs(image.astype(float) - truth).mean() < 25
+    # The plane's normal, towards the camera, is +z.
+    red_last = cv2.imread(str(out / "normals" / "0.png"))[plane.HEIGHT // 2, plane.WIDTH // 2]
+    np.testing.assert_allclose(red_last, [255, 128, 128], atol=20)
+    assert "closeup after 3 steps" in capsys.readouterr().out
+
+
+def test_a_dolly_is_frames_and_videos(render):
+    given = {"from": "2.png", "pixel": ["16", "12"], "magnification": 2.0, "frames": 3}
+    out = render(stage="baseline", support=False, **given)
+    frames = [f"{kind}/{i:04d}.png" for kind in ("depth", "normals", "rgb") for i in range(3)]
+    videos = [name for name in files(out) if name not in frames]
+    assert sorted(set(files(out)) - set(videos)) == frames
+    assert {name.split(".")[0] for name in videos} == {"depth", "normals", "rgb"}
+    assert cv2.imread(str(out / "rgb" / "0002.png")).shape == (plane.HEIGHT, plane.WIDTH, 3)
+    capture = cv2.VideoCapture(str(out / next(v for v in videos if v.startswith("rgb"))))
+    count = 0
+    while capture.grab():
+        count += 1
+    assert count == 3
+
+
+def test_a_camera_path_may_be_fine_tuned_for(render, tmp_path, capsys):
+    entry = json.loads(path_file(tmp_path).read_text())["camera_path"][0]
+    file = path_file(tmp_path, camera_path=[entry])
+    out = render(target=str(file), target_steps=1)
+    said = capsys.readouterr().out
+    assert "pixels to be rendered; 1 steps" in said and "label_psnr" in said
+    tuned = (out / "rgb" / "0000.png").read_bytes()
+    out = render(camera_path=str(file), output_dir=str(out.with_name("plain")), support=False)
+    assert (out.with_name("plain") / "rgb" / "0000.png").read_bytes() != tuned
+
+
+def test_nothing_is_fine_tuned_where_the_gate_lets_no_labels_in(capture_folder, monkeypatch):
+    monkeypatch.setattr(program, "weigh_labels", lambda *data: (data[-1], {"weight": 0.0}))
+    monkeypatch.setattr(program, "print_gate", lambda _: None)
+    programs = Programs(dataclasses.replace(PRESET, gated=True), load_scene(str(capture_folder)))
+    assert program.fine_tune(programs, "state", None, None, most=None) == "state"
+
+
+MISTAKES = {
+    "no such run": ({"run": "nowhere"}, "--run=nowhere is not a folder"),
+    "no run": ({"run": None}, "--run is missing"),
+    "nothing to render": ({"views": None}, "exactly one of --views, .*, and none is"),
+    "two things": ({"orbit": True}, "all of these are: views, orbit"),
+    "no such stage": ({"stage": "test_time"}, "choose baseline or closeup"),
+    "no such views": ({"views": "val"}, "--views=val: .* choose train, test, test_far"),
+    "a size of its own": ({"width": 64}, "--views has sizes of its own"),
+    "fps": ({"fps": 0.0}, "--fps=0 must be above 0"),
+    "moved to nowhere": ({"data": "nowhere"}, "nowhere is neither a folder nor"),
+    "no view": ({"views": None, "from": "x", "pixel": ["3", "4"]}, "--from=x is no training view"),
+    "no pixel": ({"views": None, "from": "0"}, "--from needs --pixel=x,y"),
+    "not numbers": ({"views": None, "from": "0", "pixel": ["a", "b"]}, "--from needs --pixel=x,y"),
+    "outside": ({"views": None, "from": "0", "pixel": ["32", "4"]}, "--pixel=32,4 is outside"),
+    "no depth": ({"views": None, "from": "0", "pixel": ["0", "0"]}, "--pixel=0,0 .* no depth"),
+    "farther": (
+        {"views": None, "from": "0", "pixel": ["3", "4"], "magnification": 0.9},
+        "--magnification=0.9 must be 1 or more",
+    ),
+    "no camera path": ({"views": None, "camera_path": "no.json"}, "no.json cannot be read"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_one_sentence_and_nothing_is_written(render, kept, tmp_path, mistake):
+    changes, message = MISTAKES[mistake]
+    before = files(kept)
+    with pytest.raises(SystemExit, match=message) as error:
+        render(**{"views": "test"} | changes)
+    assert "\n" not in error.value.code and error.value.code.startswith("experiments.render: ")
+    assert not (tmp_path / "out").exists()
+    assert files(kept) == before
+
+
+def test_a_folder_that_holds_something_is_refused(render, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "a").write_text("")
+    with pytest.raises(SystemExit, match="already holds something"):
+        render(views="test")
+
+
+def copy_of(kept, folder, name, change):
+    """A run without states whose file `name` is changed."""
+    (folder / "checkpoints" / "closeup" / "3").mkdir(parents=True)
+    for file in ("manifest.json", "checkpoints/run.json"):
+        fields = json.loads((kept / file).read_text())
+        if file == name:
+            fields = change(fields)
+        (folder / file).write_text(fields if isinstance(fields, str) else json.dumps(fields))
+    return str(folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("manifest.json", lambda _: "{", "manifest.json cannot be read"),
+        ("manifest.json", lambda _: {"scenes": {}}, "is of a sweep or unknown"),
+        ("manifest.json", lambda a: a | {"scene": "/nowhere"}, "/nowhere is not a folder"),
+        ("manifest.json", lambda a: a | {"load_options": {"lens": 3}}, "options that this version"),
+        ("manifest.json", lambda a: a | {"load_options": {"downscale": 2}}, "was trained with"),
+        ("checkpoints/run.json", lambda a: a | {"config": {}}, "cannot read the configuration"),
+        ("checkpoints/run.json", lambda a: a, "does not hold this run's state"),
+    ],
+)
+def test_a_run_that_does_not_fit_is_one_sentence(render, kept, tmp_path, name, change, message):
+    broken = copy_of(kept, tmp_path / "broken", name, change)
+    with pytest.raises(SystemExit, match=message):
+        render(run=broken, views="test")
+
+
+def test_other_photographs_than_it_was_trained_on_are_said(kept):
+    record = read_run(kept)
+    other = record._replace(manifest={**record.manifest, "data_sha256": "0"})
+    with pytest.warns(UserWarning, match="does not hold the photographs or cameras"):
+        load_run_scene(other)
+    load_run_scene(record)
+
+
+def test_runs_that_are_none_are_one_sentence(render, tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(SystemExit, match=r"has no manifest\.json: name the folder of a run"):
+        render(run=str(tmp_path / "empty"), views="test")
+
+
+@pytest.mark.parametrize("method", list(PRESETS))
+def test_presets_come_back_from_their_json(method):
+    for name, preset in PRESETS[method].items():
+        presets = [preset]
+        if method == "surfels":
+            field = with_classic_density(preset.field, name)
+            presets += [dataclasses.replace(preset, field=field), PRESET]
+        for one in presets:
+            assert preset_from_config(json.loads(json.dumps(config(one)))) == one
+
+
+def test_a_preset_of_another_form_names_the_field():
+    stored = config(PRESET)
+    field = stored["field"] | {"glow": 1}
+    with pytest.raises(ValueError, match=r"config\.field differs in glow"):
+        preset_from_config(stored | {"field": field})

@@ -1,0 +1,81 @@
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from jaxcloseup.artifacts import video
+from jaxcloseup.artifacts.video import write_video
+
+
+def frames(height, width, count=7):
+    """Smooth images that brighten."""
+    y, x = np.mgrid[:height, :width]
+    image = np.stack([x / width, y / height, 0.5 + 0 * x], -1)
+    return [0.3 + 0.4 * image + 0.03 * i for i in range(count)]
+
+
+def read(path):
+    capture, images = cv2.VideoCapture(str(path)), []
+    while True:
+        more, image = capture.read()
+        if not more:
+            return images, capture.get(cv2.CAP_PROP_FPS)
+        images.append(image[..., ::-1] / 255)
+
+
+@pytest.fixture
+def opencv_only(monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+
+
+def check(path, ending, images):
+    assert path.suffix == ending
+    assert [file.name for file in path.parent.iterdir()] == [path.name]
+    found, fps = read(path)
+    assert len(found) == len(images)
+    assert fps == pytest.approx(12, abs=0.1)
+    for new, old in zip(found, images, strict=True):
+        height, width = old.shape[:2]
+        assert new.shape == (height + height % 2, width + width % 2, 3)
+        assert np.abs(new[:height, :width] - old).mean() < 0.02
+
+
+@pytest.mark.parametrize("size", [(64, 96), (63, 97)])
+def test_webm_by_opencv_keeps_every_frame(tmp_path, opencv_only, size):
+    images = frames(*size)
+    check(write_video(tmp_path / "new" / "a", images, fps=12), ".webm", images)
+
+
+def test_avi_where_there_is_no_webm(tmp_path, opencv_only, monkeypatch):
+    monkeypatch.delitem(video._OPENCV, ".webm")
+    images = frames(64, 96)
+    check(write_video(tmp_path / "a.b", images, fps=12), ".avi", images)
+
+
+def test_mp4_with_the_extra(tmp_path):
+    pytest.importorskip("imageio_ffmpeg", reason="needs the extra video")
+    images = frames(63, 97)
+    check(write_video(tmp_path / "a", images, fps=12), ".mp4", images)
+
+
+@pytest.mark.parametrize("opened", [0, 2])
+def test_a_video_that_was_cut_short_is_none(tmp_path, monkeypatch, opened):
+    monkeypatch.setattr(video, "_count", lambda path: opened)
+    with pytest.raises(OSError, match=r"a\.\w+ cannot be written \(it was cut short"):
+        write_video(tmp_path / "a", frames(32, 32), fps=12)
+    assert not list(tmp_path.iterdir())
+
+
+def test_frames_that_fit_no_video(tmp_path):
+    with pytest.raises(ValueError, match="at least one frame"):
+        write_video(tmp_path / "a", [], fps=12)
+    with pytest.raises(ValueError, match="have one size"):
+        write_video(tmp_path / "a", [*frames(32, 32), *frames(30, 32)], fps=12)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_unwritable_folder_is_one_sentence(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match=r"cannot be written .*: choose another output folder"):
+        write_video(tmp_path / "file" / "a", frames(32, 32), fps=12)
