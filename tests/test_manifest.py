@@ -85,5 +85,6 @@ def test_a_sweep_leaves_a_manifest(capture_folder, tmp_path, monkeypatch):
     name = capture_folder.name
     assert after["finished"] and after["seconds"] == {name: {"baseline_0": 1.5}}
     assert after["seeds"] == [0, 1] and after["arms"] == ["control"]
-    assert after["scenes"][name]["load_options"] == {"downscale": 1, "half_pixel": False}
+    options = {"downscale": 1, "half_pixel": False, "format": None, "split": "given"}
+    assert after["scenes"][name]["load_options"] == options
     assert after["scenes"][name]["data_sha256"] == hash_data(load_scene(str(capture_folder)))
