@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -40,6 +41,13 @@ class Arm(NamedTuple):
     def in_turn(self) -> bool:
         """Whether it is trained alone, on views that are labelled before its first step."""
         return self.name in ARMS_IN_TURN or self.depth_error is not None
+
+    @property
+    def outlook(self) -> str:
+        """What decides, beside the seed, which virtual cameras it has and what is warped there."""
+        settings = self.settings
+        seen_from = settings.pose, settings.fixed_anchors, settings.leave_out_source
+        return str(jax.device_get((seen_from, self.expected_depth)))
 
 
 def make_arm(name: str, settings: PseudoSettings) -> Arm:

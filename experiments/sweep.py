@@ -146,6 +146,8 @@ def run_sweep(
     together = [(arm, seed) for arm in chosen for seed in range(seeds)]
     in_turn = [(arm, seed) for arm, seed in together if arm.in_turn]
     together = [pair for pair in together if not pair[0].in_turn and pair[0].name != "baseline"]
+    # Side by side, arms that look from the same places share their forward warps.
+    together.sort(key=lambda pair: (pair[1], pair[0].outlook))
     results: dict[str, Any] = {arm.name: {} for arm in chosen}
 
     def score(arm, seed, state, skipped):

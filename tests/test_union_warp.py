@@ -101,16 +101,22 @@ def test_spheres_hold_their_points_and_culling_loses_none(capture):
 
 
 def test_virtual_cameras_batch_under_vmap(capture):
+    """Whether a warp equals the one before it, in part or in whole, or not."""
     cameras, depths, rgb, weight, virtual = capture
     sources = block(cameras, depths, weight)
-    two = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), virtual)
-    two = two.replace(camtoworld=two.camtoworld.at[1, 0, 3].add(0.2))
+    shifts, excludes = [0.0, 0.0, 0.2, 0.2, 0.0], [-1, -1, -1, 1, -1]
+    count = len(shifts)
+    several = jax.tree.map(lambda leaf: jnp.stack([leaf] * count), virtual)
+    several = several.replace(camtoworld=several.camtoworld.at[:, 0, 3].add(jnp.array(shifts)))
     grid = pixel_grid(HEIGHT, WIDTH)
-    both = jax.jit(jax.vmap(lambda c: union_warp(sources, cameras, rgb, c, grid)))(two)
-    for i in range(2):
-        camera = jax.tree.map(lambda leaf, i=i: leaf[i], two)
-        values, _ = by_oracle(cameras, depths, rgb, weight, camera)
-        np.testing.assert_array_equal(both.values[i], values)
+    together = jax.jit(
+        jax.vmap(lambda c, exclude: union_warp(sources, cameras, rgb, c, grid, exclude=exclude))
+    )(several, jnp.array(excludes))
+    for i, exclude in enumerate(excludes):
+        camera = jax.tree.map(lambda leaf, i=i: leaf[i], several)
+        seen = weight if exclude < 0 else weight.at[exclude].set(0)
+        values, _ = by_oracle(cameras, depths, rgb, seen, camera)
+        np.testing.assert_array_equal(together.values[i], values)
 
 
 def test_without_any_depth_nothing_lands(capture):

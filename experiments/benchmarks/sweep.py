@@ -34,9 +34,11 @@ def run() -> None:
         render = functools.partial(programs.render, state)
         depths = rendered_depths(render, views.cameras, scene)
         sources = jax.jit(block_sources)(views.cameras, depths, views.weight)
-        arms = [make_arm(name, pseudo_settings(preset)).settings for name in ARMS + GRID]
+        arms = [make_arm(name, pseudo_settings(preset)) for name in ARMS + GRID]
+        arms = [arm.settings for arm in sorted(arms, key=lambda arm: arm.outlook)]
+        common = make_arm("diverse", pseudo_settings(preset)).settings
         states, *data = stack_arms([(s, state, depths, sources) for s in arms], len(jax.devices()))
-        alone = state, views, depths, arms[3], sources
+        alone = state, views, depths, common, sources
         programs.make_room(4)  # virtual views need more than photographs; both have the same
         calls = {
             "alone": lambda p=programs, a=alone: p.run("virtual", *a, count=STEPS)[0],

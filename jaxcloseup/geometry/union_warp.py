@@ -123,8 +123,7 @@ def union_warp(
     return _union_warp(sources, cameras, values, camera, pixels, jnp.asarray(exclude, jnp.int32))
 
 
-# How much there is to do depends on the data: a batch that is done at once waits for the most.
-@jax.custom_batching.sequential_vmap
+@jax.custom_batching.custom_vmap
 def _union_warp(sources, cameras, values, camera, pixels, exclude):
     sources, cameras, camera = jax.lax.stop_gradient((sources, cameras, camera))
     chosen = jnp.floor(pixels.reshape(-1, 2)).astype(jnp.int32)
@@ -171,6 +170,34 @@ def _union_warp(sources, cameras, values, camera, pixels, exclude):
     return ForwardWarp(
         values=found.reshape(*shape, -1), depth=depth.reshape(shape), hit=hit.reshape(shape)
     )
+
+
+@_union_warp.def_vmap
+def _one_after_the_other(size, batched, *arguments):
+    """A batch of warps in turn; one that equals the one before takes over its result.
+
+    How much there is to do depends on the data, and done at once all would wait for the most. Arms
+    of a sweep that draw the same camera follow each other.
+    """
+
+    def pick(index):
+        return jax.tree.map(
+            lambda leaf, has_axis: leaf[index] if has_axis else leaf, arguments, tuple(batched)
+        )
+
+    def warp(before, index):
+        now, last = pick(index), pick(jnp.maximum(index - 1, 0))
+        repeated = index > 0
+        for leaf, old, has_axis in zip(*map(jax.tree.leaves, (now, last, batched)), strict=True):
+            repeated &= jnp.all(leaf == old) if has_axis else True
+        result = jax.lax.cond(repeated, lambda: before, lambda: _union_warp(*now))
+        return result, result
+
+    nothing = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(_union_warp, *pick(0))
+    )
+    _, results = jax.lax.scan(warp, nothing, jnp.arange(size))
+    return results, jax.tree.map(lambda _: True, results)
 
 
 def _may_land(sources, camera):
