@@ -1,12 +1,9 @@
 """Scenes by name or from a folder of photographs."""
 
-import concurrent.futures
-import functools
 import logging
 import pathlib
 import warnings
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,29 +11,17 @@ import numpy as np
 from jaxcloseup.batch import Views
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.scenes.bounds import near_far_from_cameras, near_far_from_points
-from jaxcloseup.scenes.distortion import Remap, undistort, undistortion
 from jaxcloseup.scenes.errors import ImageSizeWarning, NearFarWarning, SceneError
 from jaxcloseup.scenes.fields import affine_transform, number
 from jaxcloseup.scenes.formats import FORMATS, Listing, read_listing
-from jaxcloseup.scenes.frames import Frame, frame_intrinsics
-from jaxcloseup.scenes.images import downscale_image, pad_images, read_image, read_mask
+from jaxcloseup.scenes.frames import Frame
+from jaxcloseup.scenes.images import pad_images
+from jaxcloseup.scenes.photographs import Photo, read_photos, resized_intrinsics
 from jaxcloseup.scenes.scene import Scene
 from jaxcloseup.scenes.splits import SPLITS, unique_names
 
 
 _log = logging.getLogger(__name__)
-
-
-class _Photo(NamedTuple):
-    """A photograph after downscaling, and the (width, height) that it had before."""
-
-    rgb: np.ndarray
-    mask: np.ndarray
-    stored_size: tuple[int, int]
-
-    @property
-    def size(self) -> tuple[int, int]:
-        return self.rgb.shape[1], self.rgb.shape[0]
 
 
 def load_scene(
@@ -67,10 +52,11 @@ def load_scene(
     Photographs through lenses that bend are resampled to those of a pinhole camera of the same
     size and focal lengths; pixels that they do not show have weight 0. Photographs of several
     sizes are padded at the right and the bottom with pixels of weight 0, and each camera keeps its
-    own intrinsics. A frame's `mask_path` weighs its pixels: white counts, black does not. Initial
-    points are the COLMAP model's, but for those that fewer than two training photographs see, or
-    come from `ply_file_path`, else from `points3d.ply`. `near` and `far` are the file's, or are
-    estimated, with a warning unless it is from a COLMAP model's points.
+    own intrinsics. A mask weighs their pixels: white counts, black does not. It is a frame's
+    `mask_path`, or lies in `masks` beside the folder of the photographs under the same name
+    (`scenes/masks.py`). Initial points are the COLMAP model's, but for those that fewer than two
+    training photographs see, or come from `ply_file_path`, else from `points3d.ply`. `near`
+    and `far` are the file's, or are estimated, with a warning unless it is from a COLMAP model's points.
 
     Args:
       name_or_path: one of `PROCEDURAL_SCENES`, or a folder; `./table` is the folder of that name.
@@ -132,20 +118,12 @@ def _load(listing: Listing, downscale: int, half_pixel: bool, background: float)
         transform = affine_transform(str(listing.file), "applied_transform", transform)
 
     frames = [frame for members in listing.frames.values() for frame in members]
-    with concurrent.futures.ThreadPoolExecutor() as pool:  # OpenCV decodes without Python's lock
-        find_remap = functools.lru_cache(maxsize=2)(undistortion)  # most captures have one lens
-        read = functools.partial(
-            _read_photo,
-            downscale=downscale,
-            background=background,
-            half_pixel=half_pixel,
-            find_remap=find_remap,
-        )
-        photos = list(pool.map(read, frames))
+    photos = read_photos(frames, downscale=downscale, background=background, half_pixel=half_pixel)
+    _check_masks(listing, photos)
     _warn_sizes(listing, frames, photos)
     intrinsics = np.stack(
         [
-            _intrinsics(frame, photo.stored_size, photo.size, half_pixel)
+            resized_intrinsics(frame, photo.stored_size, photo.size, half_pixel)
             for frame, photo in zip(frames, photos, strict=True)
         ]
     )
@@ -192,49 +170,17 @@ def _load(listing: Listing, downscale: int, half_pixel: bool, background: float)
     )
 
 
-def _read_photo(
-    frame: Frame,
-    *,
-    downscale: int,
-    background: float,
-    half_pixel: bool,
-    find_remap: Callable[..., Remap],
-) -> _Photo:
-    rgb = read_image(frame.file, background=background)
-    height, width = rgb.shape[:2]
-    if downscale > min(width, height):
+def _check_masks(listing: Listing, photos: Sequence[Photo]) -> None:
+    """Complain of masks that leave nothing to train on; `train` comes first in `photos`."""
+    count = len(listing.frames["train"])
+    if not any(photo.mask.any() for photo in photos[:count]):
         raise SceneError(
-            f"{frame.file} is {width} x {height} pixels, so that downscale {downscale} leaves "
-            "nothing of it: take a smaller one."
+            f"{listing.folder}: the masks leave no pixel of the {count} training photographs: "
+            "white is what counts, so invert them if it is black in these."
         )
-    mask = np.full((height, width), 255, np.uint8)
-    if frame.mask:
-        mask = read_mask(frame.mask)
-        if mask.shape != (height, width):
-            raise SceneError(
-                f"{frame.mask} is {mask.shape[1]} x {mask.shape[0]} pixels and its photograph "
-                f"{width} x {height}: give them one size."
-            )
-    if frame.distortion:
-        intrinsics = _intrinsics(frame, (width, height), (width, height), half_pixel).tolist()
-        remap = find_remap(frame.distortion, tuple(intrinsics), width, height)
-        rgb, mask = undistort(rgb, mask, remap)
-    return _Photo(
-        downscale_image(rgb, downscale), downscale_image(mask, downscale), (width, height)
-    )
 
 
-def _intrinsics(
-    frame: Frame, stored: tuple[int, int], wanted: tuple[int, int], half_pixel: bool
-) -> np.ndarray:
-    """fx, fy, cx, cy in pixels of an image of size `wanted`, for a photograph of size `stored`."""
-    size = frame.size or stored
-    return frame_intrinsics(frame, *size, half_pixel=half_pixel) * np.tile(
-        np.divide(wanted, size), 2
-    )
-
-
-def _warn_sizes(listing: Listing, frames: Sequence[Frame], photos: Sequence[_Photo]) -> None:
+def _warn_sizes(listing: Listing, frames: Sequence[Frame], photos: Sequence[Photo]) -> None:
     """Accept images that were resized as a whole, and refuse other sizes than the file's."""
     resized = []
     for frame, photo in zip(frames, photos, strict=True):

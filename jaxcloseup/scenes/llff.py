@@ -13,9 +13,7 @@ import numpy as np
 from jaxcloseup.scenes.errors import SceneError
 from jaxcloseup.scenes.fields import number, rigid_transform
 from jaxcloseup.scenes.frames import Frame
-
-
-_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
+from jaxcloseup.scenes.masks import PICTURES
 
 
 def read_llff(file: pathlib.Path, photographs: pathlib.Path) -> tuple[dict[str, Any], list[Frame]]:
@@ -41,7 +39,7 @@ def read_llff(file: pathlib.Path, photographs: pathlib.Path) -> tuple[dict[str, 
     if rows.dtype.kind not in "fiu":
         raise SceneError(f"{file} holds {rows.dtype} values and not numbers: export it again.")
     found = photographs.iterdir() if photographs.is_dir() else ()
-    files = sorted(path for path in found if path.suffix.lower() in _SUFFIXES)
+    files = sorted(path for path in found if path.suffix.lower() in PICTURES)
     if len(files) != len(rows):
         raise SceneError(
             f"{file} has {len(rows)} poses and {photographs} {len(files)} photographs: restore "
