@@ -56,7 +56,7 @@ def test_no_mask_fits(tmp_path):
     expected = (
         r"masks holds no mask of any of the 3 photographs: for \d+\.png neither \d+\.png\.png"
     )
-    with pytest.raises(SceneError, match=expected + r"png nor \d+\.mask\.png nor \d+ with a pict"):
+    with pytest.raises(SceneError, match=expected + r" nor \d+\.mask\.png nor \d+ with a pict"):
         load_scene(tmp_path)
     write_image(tmp_path / "masks/mask_001.png", HALF)
     with pytest.raises(SceneError, match=expected):

@@ -56,7 +56,8 @@ def load_scene(
     `mask_path`, or lies in `masks` beside the folder of the photographs under the same name
     (`scenes/masks.py`). Initial points are the COLMAP model's, but for those that fewer than two
     training photographs see, or come from `ply_file_path`, else from `points3d.ply`. `near`
-    and `far` are the file's, or are estimated, with a warning unless it is from a COLMAP model's points.
+    and `far` are the file's, or are estimated, with a warning unless a COLMAP model's points give
+    them.
 
     Args:
       name_or_path: one of `PROCEDURAL_SCENES`, or a folder; `./table` is the folder of that name.
