@@ -83,6 +83,8 @@ def load_scene(
     """
     if isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1:
         raise SceneError(f"downscale must be a whole number of at least 1, got {downscale!r}.")
+    if not 0 <= background <= 1:
+        raise SceneError(f"background must be a grey level in [0, 1], got {background!r}.")
     if split not in SPLITS:
         raise SceneError(f"split {split!r} is unknown: choose one of {', '.join(SPLITS)}.")
     if format is not None and format not in FORMATS:
@@ -103,9 +105,15 @@ def load_scene(
                 f"{path} is neither a folder nor a built-in scene: choose one of "
                 f"{', '.join(PROCEDURAL_SCENES)}, or give the path of a capture."
             )
-    if not path.is_dir():
-        raise SceneError(f"{path} is not a folder: give the one that holds the capture.")
-    listing = read_listing(path, format=format, split=split)
+    try:
+        if not path.is_dir():
+            raise SceneError(f"{path} is not a folder: give the one that holds the capture.")
+        listing = read_listing(path, format=format, split=split)
+    except OSError as error:  # of folders; what reads a file says more
+        raise SceneError(
+            f"{error.filename or path!s:.200} cannot be read ({error.strerror}): permit reading "
+            "it, or correct its name where a file lists it."
+        ) from error
     for note in listing.notes:
         _log.info(note)
     scene = _load(listing, downscale, half_pixel, background)
@@ -117,6 +125,11 @@ def _load(listing: Listing, downscale: int, half_pixel: bool, background: float)
     transform = listing.fields.get("applied_transform")
     if transform is not None:
         transform = affine_transform(str(listing.file), "applied_transform", transform)
+        if np.linalg.matrix_rank(transform[:, :3]) < 3:
+            raise SceneError(
+                f"{listing.file}: applied_transform flattens space, so that nothing leads back: "
+                "correct it."
+            )
 
     frames = [frame for members in listing.frames.values() for frame in members]
     photos = read_photos(frames, downscale=downscale, background=background, half_pixel=half_pixel)

@@ -15,7 +15,12 @@ from jaxcloseup.scenes.frames import Frame
 
 
 FOLDER = "masks"
-PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+_PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+
+
+def is_picture(path: pathlib.Path) -> bool:
+    """Whether a file is a photograph or a mask by its name; macOS puts `._a.jpg` beside `a.jpg`."""
+    return path.suffix.lower() in _PICTURES and not path.name.startswith(".")
 
 
 def attach_masks(
@@ -79,9 +84,7 @@ def _places(
 def _pictures(folder: pathlib.Path) -> tuple[pathlib.Path, ...]:
     try:
         return tuple(
-            sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
-            if folder.is_dir()
-            else ()
+            sorted(path for path in folder.iterdir() if is_picture(path)) if folder.is_dir() else ()
         )
     except OSError as error:
         raise SceneError(

@@ -111,6 +111,11 @@ def _read_photo(
     if frame.distortion:
         intrinsics = resized_intrinsics(frame, (width, height), (width, height), half_pixel)
         remap = find_remap(frame.distortion, tuple(intrinsics.tolist()), width, height)
+        if not remap.inside.any():
+            raise SceneError(
+                f"{frame.label}: nothing of the photograph is left when its lens is straightened: "
+                "correct the coefficients of its distortion."
+            )
         whole = np.full((height, width), 255, np.uint8) if mask is None else mask
         rgb, mask = undistort(rgb, whole, remap)
     rgb = downscale_image(rgb, downscale)
