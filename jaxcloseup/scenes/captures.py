@@ -19,6 +19,7 @@ from jaxcloseup.scenes.images import pad_images
 from jaxcloseup.scenes.photographs import Photo, read_photos, resized_intrinsics
 from jaxcloseup.scenes.scene import Scene
 from jaxcloseup.scenes.splits import SPLITS, unique_names
+from jaxcloseup.scenes.triangulation import triangulate
 
 
 _log = logging.getLogger(__name__)
@@ -55,9 +56,9 @@ def load_scene(
     own intrinsics. A mask weighs their pixels: white counts, black does not. It is a frame's
     `mask_path`, or lies in `masks` beside the folder of the photographs under the same name
     (`scenes/masks.py`). Initial points are the COLMAP model's, but for those that fewer than two
-    training photographs see, or come from `ply_file_path`, else from `points3d.ply`. `near`
-    and `far` are the file's, or are estimated, with a warning unless a COLMAP model's points give
-    them.
+    training photographs see, or come from `ply_file_path`, else from `points3d.ply`, else are
+    triangulated from features that neighbouring training photographs share. `near` and `far` are
+    the file's, or are estimated, with a warning unless a COLMAP model's points give them.
 
     Args:
       name_or_path: one of `PROCEDURAL_SCENES`, or a folder; `./table` is the folder of that name.
@@ -143,6 +144,8 @@ def _load(listing: Listing, downscale: int, half_pixel: bool, background: float)
     )
     camtoworld = np.stack([frame.camtoworld for frame in frames])
     sizes = np.array([photo.size for photo in photos])
+    if not len(listing.points):
+        listing = _with_points(listing, photos, camtoworld, intrinsics)
     near, far = _near_far(listing, camtoworld, intrinsics, sizes)
 
     width, height = sizes.max(0).tolist()
@@ -182,6 +185,29 @@ def _load(listing: Listing, downscale: int, half_pixel: bool, background: float)
             **({} if listing.times_nearer is None else {"times_nearer": listing.times_nearer}),
         },
     )
+
+
+def _with_points(
+    listing: Listing, photos: Sequence[Photo], camtoworld: np.ndarray, intrinsics: np.ndarray
+) -> Listing:
+    """A listing without points, with those that its training photographs agree on."""
+    count = len(listing.frames["train"])  # held-out photographs tell nothing of what they show
+    if count < 2:
+        return listing
+    points, rgb = triangulate(
+        [photo.rgb for photo in photos[:count]],
+        [photo.mask for photo in photos[:count]],
+        camtoworld[:count],
+        intrinsics[:count],
+    )
+    if not len(points):
+        return listing
+    note = (
+        f"{listing.folder.resolve().name} comes without points: {len(points)} were triangulated "
+        f"from features of its {count} training photographs"
+    )
+    _log.info(note)
+    return listing._replace(points=points, rgb=rgb, notes=(*listing.notes, note))
 
 
 def _check_masks(listing: Listing, photos: Sequence[Photo]) -> None:
