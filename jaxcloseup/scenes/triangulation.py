@@ -21,7 +21,10 @@ _LEAST_ANGLE = np.radians(1.5)  # between rays; below it depth is a guess
 
 
 class _Features(NamedTuple):
-    """Of one photograph: pixels `[F, 2]` at its own size, unit descriptors `[F, 128]`, colours."""
+    """Of one photograph: pixels `[F, 2]` at its own size, descriptors `[F, 128]` and colours.
+
+    The last two are uint8, which is what SIFT's descriptors are: there may be many photographs.
+    """
 
     pixels: np.ndarray
     descriptors: np.ndarray
@@ -70,12 +73,11 @@ def _find_features(image: np.ndarray, mask: np.ndarray) -> _Features:
     grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
     keypoints, descriptors = sift.detectAndCompute(grey, np.uint8(255) * (usable >= 128))
     if not keypoints:
-        return _Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros((0, 3)))
+        return _Features(np.zeros((0, 2)), np.zeros((0, 128), np.uint8), np.zeros((0, 3)))
     # OpenCV's centres are at whole numbers, ours half a pixel further.
     pixels = (np.array([point.pt for point in keypoints]) + 0.5) / size * [width, height]
     column, row = np.clip(pixels.astype(int), 0, [width - 1, height - 1]).T
-    lengths = np.linalg.norm(descriptors, axis=1, keepdims=True)
-    return _Features(pixels, descriptors / np.maximum(lengths, 1e-6), image[row, column])
+    return _Features(pixels, descriptors.astype(np.uint8), image[row, column])
 
 
 def _neighbours(camtoworld: np.ndarray) -> Iterator[tuple[int, int]]:
@@ -95,7 +97,7 @@ def _match(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Indices into `a` and `b` of descriptors that are each other's clearly best match."""
     if len(a) < 2 or len(b) < 2:
         return np.zeros(0, int), np.zeros(0, int)
-    similar = a @ b.T
+    similar = _unit(a) @ _unit(b).T
     first, best = np.arange(len(a)), similar.argmax(1)
     mutual = similar.argmax(0)[best] == first
     highest = similar[first, best]
@@ -103,6 +105,11 @@ def _match(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     nearest, second = (np.sqrt(np.maximum(2 - 2 * s, 0)) for s in (highest, similar.max(1)))
     keep = mutual & (nearest < _RATIO * second)
     return first[keep], best[keep]
+
+
+def _unit(descriptors: np.ndarray) -> np.ndarray:
+    lengths = np.linalg.norm(descriptors.astype(np.float32), axis=1, keepdims=True)
+    return descriptors / np.maximum(lengths, 1)
 
 
 def _intersect(
