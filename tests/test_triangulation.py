@@ -3,7 +3,8 @@ import numpy as np
 import pytest
 from tiny_capture import write_image, write_json
 
-from jaxcloseup.scenes import load_scene
+from jaxcloseup.scenes import captures, load_scene
+from jaxcloseup.scenes.errors import DuplicateFileWarning
 from jaxcloseup.scenes.triangulation import triangulate
 
 
@@ -79,3 +80,13 @@ def test_a_capture_without_points_gets_some(tmp_path, views):
     write_json(tmp_path / "transforms.json", frames, **lens)
     again = load_scene(tmp_path, downscale=2)
     assert np.median(np.abs(again.points[:, 2] - DEPTH)) < 0.05
+
+
+def test_a_handful_of_points_is_none(tmp_path, views, monkeypatch):
+    few = np.ones((99, 3), np.float32)
+    monkeypatch.setattr(captures, "triangulate", lambda *_: (few, few))
+    write_image(tmp_path / "a.png", views[0][0])
+    pose = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist(), "fl_x": FOCAL}
+    with pytest.warns(DuplicateFileWarning):
+        write_json(tmp_path / "transforms_train.json", [pose, pose])
+        assert load_scene(tmp_path).points.shape == (0, 3)

@@ -22,6 +22,8 @@ from jaxcloseup.scenes.splits import SPLITS, unique_names
 from jaxcloseup.scenes.triangulation import triangulate
 
 
+_LEAST_POINTS = 100  # triangulated; fewer tell too little of where a scene is
+
 _log = logging.getLogger(__name__)
 
 
@@ -200,7 +202,7 @@ def _with_points(
         camtoworld[:count],
         intrinsics[:count],
     )
-    if not len(points):
+    if len(points) < _LEAST_POINTS:
         return listing
     note = (
         f"{listing.folder.resolve().name} comes without points: {len(points)} were triangulated "
