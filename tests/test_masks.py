@@ -76,6 +76,16 @@ def test_folders_of_photographs_have_folders_of_masks(tmp_path):
         load_scene(tmp_path)
 
 
+@pytest.mark.parametrize("beside", ["ngp/masks", "masks"])
+def test_photographs_outside_the_folder(tmp_path, beside):
+    """A photograph is not taken for its own mask."""
+    write_image(tmp_path / "images/a.png")
+    pose = {"file_path": "../images/a.png", "transform_matrix": POSE.tolist(), "fl_x": 9.0}
+    write_json(tmp_path / "ngp/transforms.json", [pose])
+    write_image(tmp_path / beside / "a.png", HALF)
+    assert weights(load_scene(tmp_path / "ngp"))["a"] == pytest.approx(3 / 8)
+
+
 def test_a_mask_is_bent_with_its_photograph(tmp_path):
     """A mask beside the photographs weighs what the same one named by its frame does."""
     lens = {"fl_x": 30.0, "cx": 24.0, "cy": 20.0, "w": 48, "h": 40, "k1": -0.2, "p1": 0.01}

@@ -75,10 +75,11 @@ def _places(
     around = around[: around.index(folder) + 1] if folder in around else around[:2]
     for root in around:
         if (root / FOLDER).is_dir():
-            inner = photograph.parent.relative_to(root)
-            yield root / FOLDER, root / FOLDER / inner
-            if inner.parts:  # beside the folder of images, without its name
-                yield root / FOLDER, root.joinpath(FOLDER, *inner.parts[1:])
+            # A file may list ../images/a.jpg, and no mask lies in masks/../images.
+            inner = [part for part in photograph.parent.relative_to(root).parts if part != ".."]
+            yield root / FOLDER, root.joinpath(FOLDER, *inner)
+            if inner:  # beside the folder of images, without its name
+                yield root / FOLDER, root.joinpath(FOLDER, *inner[1:])
 
 
 def _pictures(folder: pathlib.Path) -> tuple[pathlib.Path, ...]:
