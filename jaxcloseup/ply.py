@@ -41,7 +41,9 @@ def read_vertices(path: str | pathlib.Path) -> np.ndarray:
         try:
             vertices = np.array([tuple(map(float, row.split())) for row in rows], dtype)
         except ValueError as error:
-            raise PlyError(short) from error
+            whole = all(len(row.split()) == len(properties) for row in rows)
+            words = f"{path} has words for numbers in its vertices: export it again."
+            raise PlyError(words if whole else short) from error
         if len(rows) < count:
             raise PlyError(short)
         return vertices
@@ -76,9 +78,15 @@ def _parse_header(path: pathlib.Path, header: bytes) -> tuple[str, int, list[tup
         if vertex[0][:2] != ["element", "vertex"]:
             raise KeyError("vertex")
         properties = [(line[2], _TYPES[line[1]]) for line in vertex if line[0] == "property"]
-        if not {"x", "y", "z"} <= {name for name, _ in properties}:
+        names = [name for name, _ in properties]
+        if not {"x", "y", "z"} <= set(names):
             raise KeyError("x, y, z")
-        return encodings[0], int(vertex[0][2]), properties
+        if len(set(names)) < len(names):
+            raise ValueError("one of its names comes twice")
+        count = int(vertex[0][2])
+        if count < 0:
+            raise ValueError(f"{count} of them")
+        return encodings[0], count, properties
     except (KeyError, IndexError, ValueError) as error:
         raise PlyError(
             f"{path} does not begin with vertices of plain properties x, y, z ({error}): export it "

@@ -1,3 +1,4 @@
+import pathlib
 import warnings
 
 import numpy as np
@@ -73,6 +74,13 @@ def without(key, **changes):
             "off by 0.02",
         ),
         ([frame("train/a.png", transform_matrix=(ROTATED * [1, 1, -1, 1]).tolist())], "mirrors"),
+        (
+            [frame("train/a.png", transform_matrix=[[10**400] * 4] * 4)],
+            "transform_matrix must be a 4x4 matrix",
+        ),
+        ([frame("train/a.png", fx=10**400)], "fx has 401 digits"),
+        ([frame("train/a.png", w=0.5, h=6)], "w must be at least 1 pixel, got 0.5"),
+        ([frame("train/a.png", k1=-1e6)], "nothing of the photograph is left"),
         ([frame("train/a.png", fx=0)], "fx must be greater than 0, got 0"),
         ([frame("train/a.png", fy=-3.0)], "fy must be greater than 0"),
         ([frame("train/a.png", fx=np.nan)], "fx must be a finite number, got nan"),
@@ -110,6 +118,7 @@ def test_wrong_frames(capture, frames, message):
         ({"near": 9.0}, "near 9 is not less than far 9"),
         ({"far": "9"}, "far must be a finite number"),
         ({"applied_transform": [[1]]}, "applied_transform must be a 4x4"),
+        ({"applied_transform": [[0.0] * 4] * 3}, "applied_transform flattens space"),
     ],
 )
 def test_wrong_fields(capture, fields, message):
@@ -139,11 +148,33 @@ def test_wrong_lists(tmp_path, lists, message):
         (b"[]", "not an object"),
         (b'{"frames": "\xff"}', "not UTF-8"),
         (b"", "not JSON at line 1"),
+        (b"[" * 100_000, "nested too deep"),
+        (b'{"near": ' + b"9" * 5000 + b"}", "a number of thousands of digits"),
     ],
 )
 def test_wrong_json(capture, data, message):
     (capture / "transforms_train.json").write_bytes(data)
     with pytest.raises(SceneError, match=message):
+        load_scene(capture)
+
+
+@pytest.mark.parametrize("background", [-0.1, 2, np.nan])
+def test_background_is_a_grey_level(capture, background):
+    with pytest.raises(SceneError, match=r"background must be a grey level in \[0, 1\], got "):
+        load_scene(capture, background=background)
+
+
+def test_what_the_system_refuses(capture, monkeypatch):
+    write_json(capture / "transforms_train.json", [frame("a" * 5000)])
+    with pytest.raises(SceneError, match=r"a cannot be read \(File name too long\)") as error:
+        load_scene(capture)
+    assert len(str(error.value)) < 400
+
+    def refuse(path):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(pathlib.Path, "is_file", refuse)
+    with pytest.raises(SceneError, match=r"\.json cannot be read \(Permission denied\): permit"):
         load_scene(capture)
 
 

@@ -1,4 +1,5 @@
 import struct
+import zlib
 
 import cv2
 import numpy as np
@@ -82,6 +83,24 @@ def test_not_an_image(tmp_path):
         read_image(tmp_path / "b.png")
 
 
+def test_a_header_that_says_the_image_is_huge(tmp_path):
+    write_image(tmp_path / "a.png")
+    data = (tmp_path / "a.png").read_bytes()
+    header = b"IHDR" + struct.pack(">II", 100_000, 100_000) + data[24:29]
+    huge = data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:]
+    (tmp_path / "a.png").write_bytes(huge)
+    with pytest.raises(SceneError, match=r"a\.png says that it is too large to decode"):
+        read_image(tmp_path / "a.png")
+
+
+def test_cmyk_becomes_rgb(tmp_path):
+    """Cyan at full strength takes all the red away."""
+    image = pytest.importorskip("PIL.Image")
+    image.new("CMYK", (WIDTH, HEIGHT), (255, 0, 0, 0)).save(tmp_path / "a.jpg")
+    red, green, blue = read_image(tmp_path / "a.jpg")[2, 3].tolist()
+    assert red < 60 and green > 150 and blue > 150
+
+
 # Points
 
 
@@ -125,6 +144,12 @@ def test_ply_cut_short(tmp_path, encoding):
             read_ply_points(tmp_path / "p.ply")
 
 
+XYZ = (
+    "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\n"
+    "property float z\n{}end_header\n"
+)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -141,6 +166,10 @@ def test_ply_cut_short(tmp_path, encoding):
             "ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n1\n",
             "plain properties x, y, z",
         ),
+        (XYZ.format(-1, ""), "-1 of them"),
+        (XYZ.format(1, "property float x\n") + "1 2 3 4\n", "one of its names comes twice"),
+        (XYZ.format(1, "") + "a b c\n", "has words for numbers"),
+        (XYZ.format(2, "") + "1 2 3\n", "ends before its 2 vertices do"),
     ],
 )
 def test_ply_errors(tmp_path, text, message):

@@ -61,3 +61,14 @@ def test_not_a_numpy_file(capture, data):
     (capture / "poses_bounds.npy").write_bytes(whole[:-9] if data is None else data)
     with pytest.raises(SceneError, match=r"poses_bounds\.npy is not a whole NumPy file"):
         load_scene(capture)
+
+
+def test_hidden_files_are_no_photographs(capture):
+    (capture / "images/._0.png").write_bytes(b"what macOS keeps about a file")
+    assert len(load_scene(capture).train) == 2
+
+
+def test_a_height_of_less_than_a_pixel(capture):
+    np.save(capture / "poses_bounds.npy", change(llff_rows(3)[0], 4, 0.3))
+    with pytest.raises(SceneError, match="height must be at least 1 pixel"):
+        load_scene(capture)

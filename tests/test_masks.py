@@ -1,29 +1,110 @@
-import jax.numpy as jnp
 import numpy as np
+import pytest
+from tiny_capture import HEIGHT, POSE, WIDTH, paper_capture, single_file, write_image, write_json
+from tiny_models import colmap_capture, llff_capture
 
-from jaxcloseup.geometry.masks import depth_consistent, in_bounds, rgb_consistent
-
-
-def test_in_bounds_is_half_open_and_refuses_nan():
-    pixels = jnp.array([[0, 0], [3.99, 1.99], [4, 1], [1, 2], [-0.01, 1], [jnp.nan, 1]])
-    np.testing.assert_array_equal(in_bounds(pixels, 2, 4), [True, True, False, False, False, False])
+from jaxcloseup.scenes import SceneError, load_scene
 
 
-def test_depth_agreement_is_relative_and_needs_a_defined_depth():
-    observed = jnp.array([2.0, 2.1, 2.11, 1.9, 0.0, 2.0, 2.0, jnp.nan])
-    expected = jnp.array([2.0, 2.0, 2.0, 2.0, 2.0, 0.0, -1.0, 2.0])
-    agree = [True, True, False, True, False, False, False, False]
-    np.testing.assert_array_equal(depth_consistent(observed, expected, 0.0501), agree)
+HALF = np.zeros((HEIGHT, WIDTH), np.uint8)
+HALF[:, :3] = 255
 
 
-def test_infinite_tolerance_accepts_every_point_in_front():
-    observed, expected = jnp.array([9.0, 0.0, 1.0]), jnp.array([2.0, 2.0, -1.0])
-    np.testing.assert_array_equal(
-        depth_consistent(observed, expected, jnp.inf), [True, True, False]
+def single(folder):
+    single_file(folder, 3)
+    return folder
+
+
+def weights(scene):
+    """Mean weight of each photograph by its name, of all splits."""
+    found = {}
+    for split, names in scene.names.items():
+        views = getattr(scene, split)
+        found |= dict(zip(names, np.asarray(views.weight).mean((1, 2)).tolist(), strict=True))
+    return found
+
+
+@pytest.mark.parametrize("make", [single, llff_capture, colmap_capture])
+@pytest.mark.parametrize("name", ["{}.png", "{}.JPG", "{}.png.png", "{}.mask.png"])
+def test_black_is_ignored_in_every_format(tmp_path, make, name):
+    if make is colmap_capture:
+        pytest.importorskip("pycolmap")
+    make(tmp_path)
+    for photograph in (tmp_path / "images").iterdir():
+        write_image(tmp_path / "masks" / name.format(photograph.stem), HALF)
+    scene = load_scene(tmp_path)
+    assert "3 of 3 photographs have a mask" in scene.metadata["notes"][-1]
+    np.testing.assert_allclose(list(weights(scene).values()), 3 / 8, atol=0.02)
+    np.testing.assert_allclose(scene.train.weight[0, :, :2], 1, atol=0.02)
+    assert (np.asarray(scene.train.weight[0, :, 6:]) == 0).all()
+
+
+def test_some_masks_are_noted(tmp_path, caplog):
+    single_file(tmp_path, 3)
+    write_image(tmp_path / "masks/001.png", HALF)
+    with caplog.at_level("INFO", "jaxcloseup"):
+        scene = load_scene(tmp_path)
+    assert weights(scene) == pytest.approx({"000": 1, "001": 3 / 8, "002": 1})
+    assert f"{tmp_path.name}: 1 of 3 photographs have a mask; the others are kept whole" in (
+        caplog.messages
     )
 
 
-def test_colours_agree_in_every_channel_or_not_at_all():
-    a = jnp.array([[0.5, 0.5, 0.5], [0.5, 0.5, 0.5], [0.5, 0.5, 0.5]])
-    b = jnp.array([[0.54, 0.46, 0.5], [0.5, 0.5, 0.56], [0.5, 0.55, 0.5]])
-    np.testing.assert_array_equal(rgb_consistent(a, b, 0.049), [True, False, False])
+def test_no_mask_fits(tmp_path):
+    single_file(tmp_path, 3)
+    (tmp_path / "masks").mkdir()
+    expected = (
+        r"masks holds no mask of any of the 3 photographs: for \d+\.png neither \d+\.png\.png"
+    )
+    with pytest.raises(SceneError, match=expected + r" nor \d+\.mask\.png nor \d+ with a pict"):
+        load_scene(tmp_path)
+    write_image(tmp_path / "masks/mask_001.png", HALF)
+    with pytest.raises(SceneError, match=expected):
+        load_scene(tmp_path)
+
+
+def test_folders_of_photographs_have_folders_of_masks(tmp_path):
+    paper_capture(tmp_path)
+    write_image(tmp_path / "masks/train/a.png", HALF)
+    write_image(tmp_path / "masks/b.png", HALF)
+    scene = load_scene(tmp_path)
+    np.testing.assert_allclose(scene.train.weight.mean((1, 2)), [3 / 8, 3 / 8])
+    np.testing.assert_allclose(scene.test.weight.mean(), 1)
+    write_image(tmp_path / "masks/a.png", HALF)
+    (tmp_path / "masks/train/a.png").unlink()
+    with pytest.raises(SceneError, match=r"masks/a\.png may be the mask of .*train/a\.png and of"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("beside", ["ngp/masks", "masks"])
+def test_photographs_outside_the_folder(tmp_path, beside):
+    """A photograph is not taken for its own mask."""
+    write_image(tmp_path / "images/a.png")
+    pose = {"file_path": "../images/a.png", "transform_matrix": POSE.tolist(), "fl_x": 9.0}
+    write_json(tmp_path / "ngp/transforms.json", [pose])
+    write_image(tmp_path / beside / "a.png", HALF)
+    assert weights(load_scene(tmp_path / "ngp"))["a"] == pytest.approx(3 / 8)
+
+
+def test_a_mask_is_bent_with_its_photograph(tmp_path):
+    """A mask beside the photographs weighs what the same one named by its frame does."""
+    lens = {"fl_x": 30.0, "cx": 24.0, "cy": 20.0, "w": 48, "h": 40, "k1": -0.2, "p1": 0.01}
+    mask = np.zeros((40, 48), np.uint8)
+    mask[5:30, 10:40] = 255
+    write_image(tmp_path / "images/a.png", np.full((40, 48, 3), 90, np.uint8))
+    pose = {"file_path": "images/a.png", "transform_matrix": POSE.tolist()}
+    write_image(tmp_path / "other/x.png", mask)
+    write_json(tmp_path / "transforms.json", [{**pose, "mask_path": "other/x.png"}], **lens)
+    named = np.asarray(load_scene(tmp_path).train.weight)
+    assert (named[0] != mask / 255).any()
+    write_json(tmp_path / "transforms.json", [pose], **lens)
+    write_image(tmp_path / "masks/a.png", mask)
+    np.testing.assert_array_equal(load_scene(tmp_path).train.weight, named)
+
+
+def test_masks_that_leave_nothing(tmp_path):
+    single_file(tmp_path, 2)
+    for name in ("000", "001"):
+        write_image(tmp_path / f"masks/{name}.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    with pytest.raises(SceneError, match="masks leave no pixel of the 1 training photographs"):
+        load_scene(tmp_path)

@@ -1,12 +1,9 @@
 """Scenes by name or from a folder of photographs."""
 
-import concurrent.futures
-import functools
 import logging
 import pathlib
 import warnings
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,29 +11,20 @@ import numpy as np
 from jaxcloseup.batch import Views
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.scenes.bounds import near_far_from_cameras, near_far_from_points
-from jaxcloseup.scenes.distortion import Remap, undistort, undistortion
 from jaxcloseup.scenes.errors import ImageSizeWarning, NearFarWarning, SceneError
 from jaxcloseup.scenes.fields import affine_transform, number
 from jaxcloseup.scenes.formats import FORMATS, Listing, read_listing
-from jaxcloseup.scenes.frames import Frame, frame_intrinsics
-from jaxcloseup.scenes.images import downscale_image, pad_images, read_image, read_mask
+from jaxcloseup.scenes.frames import Frame
+from jaxcloseup.scenes.images import pad_images
+from jaxcloseup.scenes.photographs import Photo, read_photos, resized_intrinsics
 from jaxcloseup.scenes.scene import Scene
 from jaxcloseup.scenes.splits import SPLITS, unique_names
+from jaxcloseup.scenes.triangulation import triangulate
 
+
+_LEAST_POINTS = 100  # triangulated; fewer tell too little of where a scene is
 
 _log = logging.getLogger(__name__)
-
-
-class _Photo(NamedTuple):
-    """A photograph after downscaling, and the (width, height) that it had before."""
-
-    rgb: np.ndarray
-    mask: np.ndarray
-    stored_size: tuple[int, int]
-
-    @property
-    def size(self) -> tuple[int, int]:
-        return self.rgb.shape[1], self.rgb.shape[0]
 
 
 def load_scene(
@@ -67,10 +55,12 @@ def load_scene(
     Photographs through lenses that bend are resampled to those of a pinhole camera of the same
     size and focal lengths; pixels that they do not show have weight 0. Photographs of several
     sizes are padded at the right and the bottom with pixels of weight 0, and each camera keeps its
-    own intrinsics. A frame's `mask_path` weighs its pixels: white counts, black does not. Initial
-    points are the COLMAP model's, but for those that fewer than two training photographs see, or
-    come from `ply_file_path`, else from `points3d.ply`. `near` and `far` are the file's, or are
-    estimated, with a warning unless it is from a COLMAP model's points.
+    own intrinsics. A mask weighs their pixels: white counts, black does not. It is a frame's
+    `mask_path`, or lies in `masks` beside the folder of the photographs under the same name
+    (`scenes/masks.py`). Initial points are the COLMAP model's, but for those that fewer than two
+    training photographs see, or come from `ply_file_path`, else from `points3d.ply`, else are
+    triangulated from features that neighbouring training photographs share. `near` and `far` are
+    the file's, or are estimated, with a warning unless a COLMAP model's points give them.
 
     Args:
       name_or_path: one of `PROCEDURAL_SCENES`, or a folder; `./table` is the folder of that name.
@@ -96,6 +86,8 @@ def load_scene(
     """
     if isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1:
         raise SceneError(f"downscale must be a whole number of at least 1, got {downscale!r}.")
+    if not 0 <= background <= 1:
+        raise SceneError(f"background must be a grey level in [0, 1], got {background!r}.")
     if split not in SPLITS:
         raise SceneError(f"split {split!r} is unknown: choose one of {', '.join(SPLITS)}.")
     if format is not None and format not in FORMATS:
@@ -116,9 +108,15 @@ def load_scene(
                 f"{path} is neither a folder nor a built-in scene: choose one of "
                 f"{', '.join(PROCEDURAL_SCENES)}, or give the path of a capture."
             )
-    if not path.is_dir():
-        raise SceneError(f"{path} is not a folder: give the one that holds the capture.")
-    listing = read_listing(path, format=format, split=split)
+    try:
+        if not path.is_dir():
+            raise SceneError(f"{path} is not a folder: give the one that holds the capture.")
+        listing = read_listing(path, format=format, split=split)
+    except OSError as error:  # of folders; what reads a file says more
+        raise SceneError(
+            f"{error.filename or path!s:.200} cannot be read ({error.strerror}): permit reading "
+            "it, or correct its name where a file lists it."
+        ) from error
     for note in listing.notes:
         _log.info(note)
     scene = _load(listing, downscale, half_pixel, background)
@@ -130,27 +128,26 @@ def _load(listing: Listing, downscale: int, half_pixel: bool, background: float)
     transform = listing.fields.get("applied_transform")
     if transform is not None:
         transform = affine_transform(str(listing.file), "applied_transform", transform)
+        if np.linalg.matrix_rank(transform[:, :3]) < 3:
+            raise SceneError(
+                f"{listing.file}: applied_transform flattens space, so that nothing leads back: "
+                "correct it."
+            )
 
     frames = [frame for members in listing.frames.values() for frame in members]
-    with concurrent.futures.ThreadPoolExecutor() as pool:  # OpenCV decodes without Python's lock
-        find_remap = functools.lru_cache(maxsize=2)(undistortion)  # most captures have one lens
-        read = functools.partial(
-            _read_photo,
-            downscale=downscale,
-            background=background,
-            half_pixel=half_pixel,
-            find_remap=find_remap,
-        )
-        photos = list(pool.map(read, frames))
+    photos = read_photos(frames, downscale=downscale, background=background, half_pixel=half_pixel)
+    _check_masks(listing, photos)
     _warn_sizes(listing, frames, photos)
     intrinsics = np.stack(
         [
-            _intrinsics(frame, photo.stored_size, photo.size, half_pixel)
+            resized_intrinsics(frame, photo.stored_size, photo.size, half_pixel)
             for frame, photo in zip(frames, photos, strict=True)
         ]
     )
     camtoworld = np.stack([frame.camtoworld for frame in frames])
     sizes = np.array([photo.size for photo in photos])
+    if not len(listing.points):
+        listing = _with_points(listing, photos, camtoworld, intrinsics)
     near, far = _near_far(listing, camtoworld, intrinsics, sizes)
 
     width, height = sizes.max(0).tolist()
@@ -192,49 +189,40 @@ def _load(listing: Listing, downscale: int, half_pixel: bool, background: float)
     )
 
 
-def _read_photo(
-    frame: Frame,
-    *,
-    downscale: int,
-    background: float,
-    half_pixel: bool,
-    find_remap: Callable[..., Remap],
-) -> _Photo:
-    rgb = read_image(frame.file, background=background)
-    height, width = rgb.shape[:2]
-    if downscale > min(width, height):
+def _with_points(
+    listing: Listing, photos: Sequence[Photo], camtoworld: np.ndarray, intrinsics: np.ndarray
+) -> Listing:
+    """A listing without points, with those that its training photographs agree on."""
+    count = len(listing.frames["train"])  # held-out photographs tell nothing of what they show
+    if count < 2:
+        return listing
+    points, rgb = triangulate(
+        [photo.rgb for photo in photos[:count]],
+        [photo.mask for photo in photos[:count]],
+        camtoworld[:count],
+        intrinsics[:count],
+    )
+    if len(points) < _LEAST_POINTS:
+        return listing
+    note = (
+        f"{listing.folder.resolve().name} comes without points: {len(points)} were triangulated "
+        f"from features of its {count} training photographs"
+    )
+    _log.info(note)
+    return listing._replace(points=points, rgb=rgb, notes=(*listing.notes, note))
+
+
+def _check_masks(listing: Listing, photos: Sequence[Photo]) -> None:
+    """Complain of masks that leave nothing to train on; `train` comes first in `photos`."""
+    count = len(listing.frames["train"])
+    if not any(photo.mask.any() for photo in photos[:count]):
         raise SceneError(
-            f"{frame.file} is {width} x {height} pixels, so that downscale {downscale} leaves "
-            "nothing of it: take a smaller one."
+            f"{listing.folder}: the masks leave no pixel of the {count} training photographs: "
+            "white is what counts, so invert them if it is black in these."
         )
-    mask = np.full((height, width), 255, np.uint8)
-    if frame.mask:
-        mask = read_mask(frame.mask)
-        if mask.shape != (height, width):
-            raise SceneError(
-                f"{frame.mask} is {mask.shape[1]} x {mask.shape[0]} pixels and its photograph "
-                f"{width} x {height}: give them one size."
-            )
-    if frame.distortion:
-        intrinsics = _intrinsics(frame, (width, height), (width, height), half_pixel).tolist()
-        remap = find_remap(frame.distortion, tuple(intrinsics), width, height)
-        rgb, mask = undistort(rgb, mask, remap)
-    return _Photo(
-        downscale_image(rgb, downscale), downscale_image(mask, downscale), (width, height)
-    )
 
 
-def _intrinsics(
-    frame: Frame, stored: tuple[int, int], wanted: tuple[int, int], half_pixel: bool
-) -> np.ndarray:
-    """fx, fy, cx, cy in pixels of an image of size `wanted`, for a photograph of size `stored`."""
-    size = frame.size or stored
-    return frame_intrinsics(frame, *size, half_pixel=half_pixel) * np.tile(
-        np.divide(wanted, size), 2
-    )
-
-
-def _warn_sizes(listing: Listing, frames: Sequence[Frame], photos: Sequence[_Photo]) -> None:
+def _warn_sizes(listing: Listing, frames: Sequence[Frame], photos: Sequence[Photo]) -> None:
     """Accept images that were resized as a whole, and refuse other sizes than the file's."""
     resized = []
     for frame, photo in zip(frames, photos, strict=True):

@@ -43,10 +43,15 @@ def check_files(
             _check_binary(path, data, count_parameters)
         else:
             _check_text(path, data, count_parameters)
+    for path in (folder / "rigs.bin", folder / "frames.bin"):  # of COLMAP 3.12, and optional
+        if suffix == ".bin" and path.is_file():
+            _check_binary(path, path.read_bytes(), count_parameters)
 
 
 def _check_binary(path, data, count_parameters):
-    walk = {"cameras": _walk_camera, "images": _walk_image, "points3D": _walk_point}[path.stem]
+    walk = _WALKS[path.stem]
+    if not data:
+        raise SceneError(f"{path} is empty: copy or export it again.")
     count, end = int.from_bytes(data[:8], "little"), 8
     for record in range(count if len(data) >= 8 else 1):
         try:
@@ -85,6 +90,27 @@ def _walk_image(path, data, at, _):
 def _walk_point(path, data, at, _):
     (track,) = struct.unpack_from("<Q", data, at + 43)
     return at + 51 + 8 * track
+
+
+def _walk_rig(path, data, at, _):
+    _, sensors = struct.unpack_from("<II", data, at)
+    at += 8 + 8 * min(sensors, 1)  # the first is the origin, the others have a pose or none
+    for _ in range(sensors - 1):
+        *_, has_pose = struct.unpack_from("<iIB", data, at)
+        at += 9 + 56 * has_pose
+    return at
+
+
+def _walk_frame(path, data, at, _):
+    frame, _, *pose, photographs = struct.unpack_from("<II7dI", data, at)
+    _check_pose(f"{path}: frame {frame}", pose)
+    return at + 68 + 16 * photographs
+
+
+_WALKS = {
+    **{"cameras": _walk_camera, "images": _walk_image, "points3D": _walk_point},
+    **{"rigs": _walk_rig, "frames": _walk_frame},
+}
 
 
 def _check_text(path, data, count_parameters):

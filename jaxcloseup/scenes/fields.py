@@ -1,6 +1,7 @@
 """Checks of the values that files give; messages name the file and the field."""
 
 import math
+import sys
 from typing import Any
 
 import numpy as np
@@ -8,8 +9,13 @@ import numpy as np
 from jaxcloseup.scenes.errors import SceneError
 
 
+_LARGEST = int(sys.float_info.max)  # whole numbers in JSON have no bound
+
+
 def number(label: str, key: str, value: Any, *, above: float = -math.inf) -> float:
     """`value` as a float, which must be finite and greater than `above`."""
+    if isinstance(value, int) and abs(value) > _LARGEST:
+        raise SceneError(f"{label}: {key} has {len(str(value))} digits, too many: correct it.")
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise SceneError(f"{label}: {key} must be a finite number, got {value!r}: correct it.")
     if value <= above:
@@ -17,11 +23,19 @@ def number(label: str, key: str, value: Any, *, above: float = -math.inf) -> flo
     return float(value)
 
 
+def side(label: str, key: str, value: Any) -> int:
+    """`value` as an image's width or height in pixels."""
+    pixels = number(label, key, value, above=0)
+    if pixels < 1:
+        raise SceneError(f"{label}: {key} must be at least 1 pixel, got {value}: correct it.")
+    return round(pixels)
+
+
 def affine_transform(label: str, key: str, value: Any) -> np.ndarray:
     """A `[3, 4]` float64 matrix out of a 3x4 or 4x4 list of lists."""
     try:
         matrix = np.array(value, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         matrix = np.zeros(())
     if matrix.shape not in ((3, 4), (4, 4)):
         raise SceneError(f"{label}: {key} must be a 4x4 matrix of numbers: correct it.")

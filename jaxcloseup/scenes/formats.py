@@ -9,6 +9,7 @@ from jaxcloseup.scenes.colmap import holds_model, read_colmap
 from jaxcloseup.scenes.errors import SceneError
 from jaxcloseup.scenes.frames import Frame
 from jaxcloseup.scenes.llff import read_llff
+from jaxcloseup.scenes.masks import attach_masks
 from jaxcloseup.scenes.points import read_ply_points
 from jaxcloseup.scenes.splits import divide, listed_split, split_of_file, warn_duplicates
 from jaxcloseup.scenes.transforms import read_transforms
@@ -87,8 +88,9 @@ def read_listing(path: pathlib.Path, *, format: str | None = None, split: str) -
     points, rgb = content.points
     division = divide(called, content.frames, given, split, points)
     warn_duplicates(folder, division.frames)
-    keep = _seen_in_training(division.frames, len(points))
-    notes = [note, *division.notes]
+    frames, masked = attach_masks(folder, division.frames)
+    keep = _seen_in_training(frames, len(points))
+    notes = [note, *division.notes, *masked]
     if not keep.all():
         notes.append(
             f"{called}: {np.sum(~keep)} of {len(keep)} points, which fewer than two training "
@@ -99,7 +101,7 @@ def read_listing(path: pathlib.Path, *, format: str | None = None, split: str) -
         folder=folder,
         file=content.file,
         fields=content.fields,
-        frames=division.frames,
+        frames=frames,
         points=points[keep],
         rgb=rgb[keep],
         notes=tuple(notes),

@@ -58,12 +58,14 @@ def _decode(path: pathlib.Path) -> np.ndarray:
         data = np.fromfile(path, np.uint8)
     except OSError as error:
         raise SceneError(f"{path} cannot be read ({error.strerror}): restore the file.") from error
-    image = None
+    image, large = None, False
     if data.size and not _is_truncated_jpeg(data.tobytes()):
         try:
             image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)  # ignores EXIF, keeps alpha and depth
-        except cv2.error:
-            image = None
+        except cv2.error as error:
+            large = "MAX_IMAGE" in str(error) or error.code == cv2.Error.StsNoMem
+    if large:
+        raise SceneError(f"{path} says that it is too large to decode: shrink or export it again.")
     if image is None:
         raise SceneError(
             f"{path} is not a readable image, or it is truncated: copy or export it again."

@@ -11,11 +11,9 @@ from typing import Any
 import numpy as np
 
 from jaxcloseup.scenes.errors import SceneError
-from jaxcloseup.scenes.fields import number, rigid_transform
+from jaxcloseup.scenes.fields import number, rigid_transform, side
 from jaxcloseup.scenes.frames import Frame
-
-
-_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
+from jaxcloseup.scenes.masks import is_picture
 
 
 def read_llff(file: pathlib.Path, photographs: pathlib.Path) -> tuple[dict[str, Any], list[Frame]]:
@@ -41,7 +39,7 @@ def read_llff(file: pathlib.Path, photographs: pathlib.Path) -> tuple[dict[str, 
     if rows.dtype.kind not in "fiu":
         raise SceneError(f"{file} holds {rows.dtype} values and not numbers: export it again.")
     found = photographs.iterdir() if photographs.is_dir() else ()
-    files = sorted(path for path in found if path.suffix.lower() in _SUFFIXES)
+    files = sorted(path for path in found if is_picture(path))
     if len(files) != len(rows):
         raise SceneError(
             f"{file} has {len(rows)} poses and {photographs} {len(files)} photographs: restore "
@@ -54,12 +52,9 @@ def read_llff(file: pathlib.Path, photographs: pathlib.Path) -> tuple[dict[str, 
 
 def _frame(file: pathlib.Path, photograph: pathlib.Path, row: np.ndarray) -> Frame:
     label = f"{file}: row of {photograph.name}"
-    height, width, focal = (
-        number(label, name, value, above=0)
-        for name, value in zip(
-            ("height", "width", "focal length"), row[4:15:5].tolist(), strict=True
-        )
-    )
+    height, width, focal = row[4:15:5].tolist()
+    size = side(label, "width", width), side(label, "height", height)
+    focal = number(label, "focal length", focal, above=0)
     near, far = (
         number(label, name, value, above=0)
         for name, value in zip(("near bound", "far bound"), row[15:].tolist(), strict=True)
@@ -76,6 +71,6 @@ def _frame(file: pathlib.Path, photograph: pathlib.Path, row: np.ndarray) -> Fra
         file=photograph,
         mask=None,
         camtoworld=rigid_transform(label, "pose", pose),
-        size=(round(width), round(height)),
+        size=size,
         lens=({"fl_x": focal}, {}),
     )

@@ -57,7 +57,7 @@ def split_of_file(folder: pathlib.Path, frames: Sequence[Frame]) -> dict[str, li
         return None
     try:
         fields = json.loads(file.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise SceneError(
             f"{file} is not readable as JSON ({error}): correct or drop it."
         ) from error

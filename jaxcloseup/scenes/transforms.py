@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxcloseup.scenes.distortion import COEFFICIENTS, read_distortion
 from jaxcloseup.scenes.errors import SceneError, UnknownKeyWarning
-from jaxcloseup.scenes.fields import number, rigid_transform
+from jaxcloseup.scenes.fields import rigid_transform, side
 from jaxcloseup.scenes.frames import Frame, check_photographs, frame_intrinsics
 
 
@@ -71,6 +71,10 @@ def _read_json(path: pathlib.Path) -> dict[str, Any]:
         ) from error
     except UnicodeDecodeError as error:
         raise SceneError(f"{path}: not UTF-8 text: save it again as UTF-8.") from error
+    except (ValueError, RecursionError) as error:
+        raise SceneError(
+            f"{path}: nested too deep, or a number of thousands of digits: is it the right file?"
+        ) from error
     if not isinstance(fields, dict):
         raise SceneError(f'{path}: not an object with a list of "frames": is it the right file?')
     return fields
@@ -84,7 +88,7 @@ def _read_frame(path: pathlib.Path, fields: dict[str, Any], entry: dict[str, Any
     lens = {**fields, **entry}
     if ("w" in lens) != ("h" in lens):
         raise SceneError(f"{label}: w and h belong together: give both or neither.")
-    size = tuple(int(number(label, key, lens[key], above=0)) for key in "wh" if key in lens)
+    size = tuple(side(label, key, lens[key]) for key in "wh" if key in lens)
     if "transform_matrix" not in entry:
         raise SceneError(f"{label}: no transform_matrix: give its camera-to-world pose.")
     pose = rigid_transform(label, "transform_matrix", entry["transform_matrix"])

@@ -1,0 +1,92 @@
+import cv2
+import numpy as np
+import pytest
+from tiny_capture import write_image, write_json
+
+from jaxcloseup.scenes import captures, load_scene
+from jaxcloseup.scenes.errors import DuplicateFileWarning
+from jaxcloseup.scenes.triangulation import triangulate
+
+
+WIDTH, HEIGHT, FOCAL = 240, 180, 200.0
+LENS = np.array([FOCAL, FOCAL, 118.0, 91.0])
+DEPTH = 5.0
+
+
+@pytest.fixture(scope="module")
+def views():
+    """Four photographs of a textured plane, z = 5 of the world, and their OpenCV poses."""
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 256, (90, 120, 3), np.uint8)
+    texture = cv2.GaussianBlur(
+        cv2.resize(noise, (480, 360), interpolation=cv2.INTER_CUBIC), (0, 0), 1
+    )
+    # A texel is 0.025 wide, as is a pixel at that distance; the middle one lies at x = y = 0.
+    plane = np.array([[0.025, 0, -6.0], [0, 0.025, -4.5], [0, 0, DEPTH]])
+    images, poses = [], []
+    for i in range(4):
+        rotation = cv2.Rodrigues(np.array([0.03 * i, -0.1 * i + 0.15, 0.05 * i]))[0]
+        position = np.array([0.6 * i - 0.9, 0.1 * i, 0.2 * i])
+        centre = [[FOCAL, 0, LENS[2] - 0.5], [0, FOCAL, LENS[3] - 0.5], [0, 0, 1]]
+        towards = plane - np.array([[0, 0, 1.0]]) * position[:, None]
+        images.append(cv2.warpPerspective(texture, centre @ rotation.T @ towards, (WIDTH, HEIGHT)))
+        poses.append(np.column_stack([rotation, position]))
+    return images, np.array(poses)
+
+
+def test_points_lie_on_a_plane(views):
+    images, poses = views
+    masks = [np.full((HEIGHT, WIDTH), 255, np.uint8)] * 4
+    points, rgb = triangulate(images, masks, poses, np.array([LENS] * 4))
+    assert len(points) > 300 and points.dtype == rgb.dtype == np.float32
+    error = np.abs(points[:, 2] / DEPTH - 1)
+    assert np.mean(error < 0.01) > 0.98 and np.median(error) < 0.002
+    assert rgb.min() >= 0 and rgb.max() <= 1
+
+
+def test_masked_features_do_not_count(views):
+    images, poses = views
+    masks = [np.zeros((HEIGHT, WIDTH), np.uint8) for _ in images]
+    lenses = np.array([LENS] * 4)
+    assert triangulate(images, masks, poses, lenses)[0].shape == (0, 3)
+    masks[0][:, :120] = masks[1][:, :120] = 255
+    points, _ = triangulate(images, masks, poses, lenses)
+    column = ((points - poses[0, :, 3]) @ poses[0, :, :3])[:, :2].T[0]
+    assert len(points) and (column < 0.1).all()
+
+
+def test_one_place_gives_no_points(views):
+    images, poses = views
+    masks = [np.full((HEIGHT, WIDTH), 255, np.uint8)] * 2
+    points, _ = triangulate(images[:2], masks, poses[[0, 0]], np.array([LENS] * 2))
+    assert points.shape == (0, 3)
+
+
+def test_a_capture_without_points_gets_some(tmp_path, views):
+    """From training photographs only, and near and far from them."""
+    frames = []
+    for i, (image, pose) in enumerate(zip(*views, strict=True)):
+        write_image(tmp_path / f"{i}.png", image)
+        matrix = np.vstack([pose * [1, -1, -1, 1], [0, 0, 0, 1]]).tolist()
+        frames.append({"file_path": f"{i}.png", "transform_matrix": matrix})
+    lens = dict(zip(("fl_x", "fl_y", "cx", "cy"), LENS.tolist(), strict=True))
+    write_json(tmp_path / "transforms.json", frames, **lens, near=None, far=None)
+    with pytest.warns(UserWarning, match="from the points"):
+        scene = load_scene(tmp_path)
+    assert scene.names["train"] == ["1", "2", "3"]
+    assert np.median(np.abs(scene.points[:, 2] - DEPTH)) < 0.02
+    assert 2 < scene.near < 4.5 and 5 < scene.far < 10
+    assert "were triangulated from features of its 3 training" in scene.metadata["notes"][-1]
+    write_json(tmp_path / "transforms.json", frames, **lens)
+    again = load_scene(tmp_path, downscale=2)
+    assert np.median(np.abs(again.points[:, 2] - DEPTH)) < 0.05
+
+
+def test_a_handful_of_points_is_none(tmp_path, views, monkeypatch):
+    few = np.ones((99, 3), np.float32)
+    monkeypatch.setattr(captures, "triangulate", lambda *_: (few, few))
+    write_image(tmp_path / "a.png", views[0][0])
+    pose = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist(), "fl_x": FOCAL}
+    with pytest.warns(DuplicateFileWarning):
+        write_json(tmp_path / "transforms_train.json", [pose, pose])
+        assert load_scene(tmp_path).points.shape == (0, 3)
