@@ -21,6 +21,10 @@ NAMED_ARMS: dict[str, dict[str, Any]] = {
 ARMS_IN_TURN = ("oracle", "resolved", "test_time")  # labelled once, before their first step
 
 
+# Of settings that may not be any number from 0 on.
+BOUNDS = {"label_share": (0.0, 1.0), "magnification": (1.0, np.inf), "num_sources": (1.0, np.inf)}
+
+
 class Arm(NamedTuple):
     """One arm.
 
@@ -83,6 +87,8 @@ def _parse(name):
         if not equals:
             known = ", ".join(["baseline", *NAMED_ARMS, *ARMS_IN_TURN])
             raise ValueError(f"--arms={name} is not an arm: name {known}, or setting=number")
+        if field in changes:
+            raise ValueError(f"--arms={name} sets {field} twice: leave one out")
         changes[field] = values[0] if len(values) == 1 else values
     return changes
 
@@ -98,6 +104,9 @@ def _change(settings, arm, field, value):
             + ", ".join(sorted(fields))
             + ", of which magnification is a range as in 2:8"
         )
+    low, high = BOUNDS.get(field, (0.0, np.inf))
+    if np.min(value) < low or np.max(value) > high:
+        raise ValueError(f"--arms={arm}: {field} lies between {low:g} and {high:g}")
     changed = holder.replace(**{field: jnp.asarray(value, old.dtype)})
     return changed if holder is settings else settings.replace(pose=changed)
 

@@ -34,13 +34,19 @@ class Perceptual(NamedTuple):
 
 
 def find_perceptual(folder: str | None = None) -> Perceptual:
-    """The LPIPS networks whose weights are found, in `folder` or where they usually are."""
+    """The LPIPS networks whose weights are found, in `folder` or where they usually are.
+
+    Raises:
+      ValueError: a folder is named and has none.
+    """
     networks, reasons = {}, {}
     for backbone in BACKBONES:
         try:
             networks[backbone] = load_lpips(backbone, folder)
         except LpipsError as error:
             reasons[backbone] = str(error)
+    if folder is not None and not networks:
+        raise ValueError(f"--lpips_weights={folder}: {reasons[BACKBONES[0]]}")
     return Perceptual(networks, reasons)
 
 
@@ -133,6 +139,8 @@ def score(
         counted = np.where(seen >= least, weight, 0)
         for key, value in _masked_metrics(image, truth, counted).items():
             values[f"{key}_seen{least}"] = value
+        share = (counted > 0).sum() / max((np.asarray(weight) > 0).sum(), 1)
+        values[f"coverage_seen{least}"] = share
     if target.surface is not None:
         values |= surface_error(target.camera, rendering, target.surface)
     if target.landmarks is not None:
@@ -231,7 +239,6 @@ def _masked_metrics(image, truth, weight):
     return {
         "psnr": psnr(image, truth, weight=weight),
         "ssim": _ssim(image, truth, weight=weight),
-        "coverage": jnp.mean(weight > 0),
     }
 
 

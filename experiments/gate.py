@@ -37,8 +37,8 @@ def verdict(found: Mapping[str, Any]) -> str:
     used = "labels are used" if weight == 1 else f"labels weigh {weight:.0%} of their share"
     used = used if weight else "no labels are used"
     return (
-        f"{used}, for on {found['agreement']:.0%} of left-out photographs they agree closely "
-        f"(none under {AGREEMENT[0]:.0%}, all from {AGREEMENT[1]:.0%})"
+        f"{used}, for on {found['agreement']:.0%} of the pixels of left-out photographs they agree "
+        f"closely (none under {AGREEMENT[0]:.0%}, all from {AGREEMENT[1]:.0%})"
     )
 
 

@@ -24,7 +24,7 @@ from experiments.evaluation import (
 )
 from experiments.gate import print_gate, weigh_labels
 from experiments.loop import Programs, run_stage
-from experiments.manifest import about_scene, write_manifest
+from experiments.manifest import about_scene, hash_data, write_manifest
 from experiments.pictures import comparisons, label_pictures, write_renders
 from experiments.presets import Preset, initial_points, pseudo_settings
 from experiments.report import in_short, write_json, write_report
@@ -38,7 +38,7 @@ from jaxcloseup.geometry.union_warp import block_sources
 from jaxcloseup.pseudo import label_views
 from jaxcloseup.scenes import Scene
 from jaxcloseup.splats import Surfels
-from jaxcloseup.train import init_state, labelled_depth
+from jaxcloseup.train import TrainState, init_state, labelled_depth
 
 
 STAGES = ("baseline", "control", "closeup", "test_time")
@@ -70,7 +70,7 @@ def run(
       load_options: what `load_scene` was given, to load the scene again; for the manifest.
     """
     key_init, key_audit, key_pictures = jax.random.split(jax.random.key(seed), 3)
-    key_depths, key_points = jax.random.fold_in(key_init, 1), jax.random.fold_in(key_init, 2)
+    key_points = jax.random.fold_in(key_init, 2)
     scene = dataclasses.replace(scene, train=jax.device_put(scene.train))
     views, size = scene.train, scene.train.cameras
     print(
@@ -80,6 +80,7 @@ def run(
     programs = Programs(preset, scene)
     identity = {"scene": scene.name, "seed": seed, "config": config(preset), **names}
     identity |= {"resolution": [size.width, size.height], "version": jaxcloseup.__version__}
+    identity["data_sha256"] = hash_data(scene)
     checkpoints = Checkpoints(output_dir / "checkpoints", identity)
     settings = pseudo_settings(preset)
     seconds: dict[str, float] = {}
@@ -108,12 +109,10 @@ def run(
             stages[stage] = {}
             for split, of_split in held_out.items():
                 rendered = functools.partial(programs.render, state)
-                stages[stage][split], renderings[stage, split] = evaluate(
-                    rendered, of_split, perceptual
-                )
-                folder = output_dir / "renders" / stage / split
-                write_renders(folder, renderings[stage, split], scene)
+                stages[stage][split], seen = evaluate(rendered, of_split, perceptual)
+                write_renders(output_dir / "renders" / stage / split, seen, scene)
                 if split in targets:
+                    renderings[stage, split] = seen
                     print(f"{stage:>9} {split}: {in_short(stages[stage][split])}", flush=True)
             if len(held_out) > len(targets):
                 print(f"{stage:>9} {ladder_in_short(stages[stage])}", flush=True)
@@ -126,13 +125,7 @@ def run(
     baseline = train("baseline", "photographs", state, views, steps=preset.baseline_steps)
     render = functools.partial(programs.render, baseline)
     with timed(seconds, "depths"):
-        depths = rendered_depths(
-            render,
-            size,
-            scene,
-            key=key_depths if preset.train.perturbed_depth else None,
-            divided=not preset.train.undivided_depth,
-        )
+        depths = training_depths(programs, baseline, seed)
         sources = jax.jit(block_sources)(views.cameras, depths, views.weight)
         exact = exact_depths(scene, views.cameras) if scene.surface else None
         targets = targets_by_split(scene, depths, exact, render)
@@ -145,7 +138,7 @@ def run(
             print_gate(gate)
     use_labels = gate is None or gate["weight"] > 0
     steps = preset.closeup_steps
-    if "control" in to_run or not use_labels:
+    if "control" in to_run or ("closeup" in to_run and not use_labels):
         control = train("control", "photographs", baseline, views, steps=steps)
         score("control", control)
     if "closeup" in to_run:
@@ -158,7 +151,8 @@ def run(
     if "test_time" in to_run and scene.test is not None:
         with timed(seconds, "test_time_labels"):
             cameras = scene.test.cameras
-            data = cameras, rendered_depths(render, cameras, scene), views, depths, settings
+            seen = rendered_depths(render, cameras, scene, near=0.0)
+            data = cameras, seen, views, depths, settings
             labels = jax.jit(label_views)(*data, sources=sources)
         per_view = len(scene.test) if names["method"] == "surfels" else 1
         kind, data = (
@@ -200,10 +194,23 @@ def run(
         "config": config(preset),
         "versions": versions(),
     }
-    write_manifest(output_dir, manifest, seconds)
     write_json(output_dir / "results.json", results)
     write_report(output_dir / "report.html", results, pictures)
+    write_manifest(output_dir, manifest, seconds)
     return results
+
+
+def training_depths(programs: Programs, state: TrainState, seed: int) -> jax.Array:
+    """Depths `[V, H, W]` of the training views as the preset makes labels with, of a seed's run."""
+    train, scene = programs.preset.train, programs.scene
+    key_init, _, _ = jax.random.split(jax.random.key(seed), 3)
+    return rendered_depths(
+        functools.partial(programs.render, state),
+        scene.train.cameras,
+        scene,
+        key=jax.random.fold_in(key_init, 1) if train.perturbed_depth else None,
+        divided=not train.undivided_depth,
+    )
 
 
 def rendered_depths(
@@ -211,14 +218,18 @@ def rendered_depths(
     cameras: Camera,
     scene: Scene,
     *,
+    near: float | None = None,
     key: jax.Array | None = None,
     divided: bool = True,
 ) -> jax.Array:
-    """`render_depths` of stacked cameras, by a `render` that makes room where images need it."""
+    """`render_depths` of stacked cameras, by a `render` that makes room where images need it.
+
+    `near` is the scene's by default; close-ups may be nearer to the surface than any photograph.
+    """
     count = cameras.intrinsics.shape[0]
     keys = [None] * count if key is None else jax.random.split(key, count)
     seen = (render(camera_at(cameras, i), keys[i]) for i in range(count))
-    limits = {"near": scene.near, "far": scene.far, "divided": divided}
+    limits = {"near": scene.near if near is None else near, "far": scene.far, "divided": divided}
     return jnp.stack([labelled_depth(one, **limits) for one in seen])
 
 

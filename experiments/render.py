@@ -29,7 +29,7 @@ from experiments.finished import RunError, choose_stage, load_run_scene, read_ru
 from experiments.gate import print_gate, weigh_labels
 from experiments.loop import Programs, TrainingError
 from experiments.output_dir import check_unused
-from experiments.pipeline import rendered_depths
+from experiments.pipeline import training_depths
 from experiments.presets import pseudo_settings
 from experiments.set_up import set_up
 from jaxcloseup.artifacts.checkpoints import CheckpointError
@@ -123,9 +123,7 @@ def _render() -> None:
     fine_tuned = FLAGS.fine_tune or FLAGS.target is not None
     depths = None
     if FLAGS.support or fine_tuned:
-        depths = rendered_depths(
-            functools.partial(programs.render, state), scene.train.cameras, scene
-        )
+        depths = training_depths(programs, state, record.identity["seed"])
     if fine_tuned:
         state = fine_tune(programs, state, depths, shots, most=FLAGS.target_steps)
     seen_from = depths if FLAGS.support else None

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from experiments.gate import verdict
 from experiments.plots import Curve, line_plot
-from experiments.zoom_ladder import gain_over, zoom_curves
+from experiments.zoom_ladder import gains_over, zoom_curves
 from jaxcloseup.artifacts.images import png_data_uri
 from jaxcloseup.files import write_file
 
@@ -139,8 +139,8 @@ def _zoom_plots(stages):
         "ordinary views.</p><div class=plots>",
         line_plot(curves, y="PSNR (dB)", title="PSNR", **axis),
     ]
-    if "control" in stages:
-        gains = [gain_over(curves, "control", curve) for curve in curves]
+    gains = gains_over(curves, "control")
+    if gains:
         axis |= {"y": "PSNR above control (dB)"}
         parts.append(line_plot(gains, title="Gain", **axis))
     return [*parts, "</div>"]

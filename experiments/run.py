@@ -44,6 +44,7 @@ def main(argv: list[str]) -> None:
         )
         load_options = command_line.load_options_from_flags(preset)
         scene = command_line.load(FLAGS.scene, load_options)
+        perceptual = find_perceptual(FLAGS.lpips_weights)
         output_dir.mkdir(parents=True, exist_ok=True)
     except (SceneError, OSError, ValueError) as error:
         sys.exit(f"experiments.run: {error}")
@@ -56,7 +57,7 @@ def main(argv: list[str]) -> None:
             names=command_line.names_from_flags(),
             to_run=FLAGS.stages,
             save_every=FLAGS.save_every,
-            perceptual=find_perceptual(FLAGS.lpips_weights),
+            perceptual=perceptual,
             load_options=load_options,
         )
     except (TrainingError, CheckpointError, OSError) as error:

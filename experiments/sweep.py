@@ -8,6 +8,8 @@ goes on to the same tables.
 """
 
 import functools
+import json
+import os
 import pathlib
 import sys
 from collections.abc import Mapping, Sequence
@@ -30,14 +32,14 @@ from experiments.evaluation import (
 )
 from experiments.fixed_labels import labels_of_less_error, true_close_ups
 from experiments.loop import HOSTS_WAIT, Programs, TrainingError, run_stage
-from experiments.manifest import about_scene, write_manifest
-from experiments.pipeline import config, rendered_depths, timed, versions
+from experiments.manifest import NAME as MANIFEST
+from experiments.manifest import about_scene, hash_data, write_manifest
+from experiments.pipeline import config, rendered_depths, timed, training_depths, versions
 from experiments.presets import Preset, initial_points, pseudo_settings
 from experiments.set_up import set_up
 from experiments.sweep_report import print_sweep, write_sweep
 from experiments.zoom_ladder import ladder_targets
 from jaxcloseup.artifacts.checkpoints import CheckpointError, Checkpoints
-from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.geometry.union_warp import SourceBlocks, block_sources
 from jaxcloseup.pseudo import PseudoSettings, label_views
 from jaxcloseup.scenes import Scene, SceneError
@@ -114,7 +116,14 @@ def run_sweep(
     identity |= {"arms": {arm.name: str(jax.device_get(arm.settings)) for arm in chosen}}
     identity |= {"resolution": [views.cameras.width, views.cameras.height]}
     identity |= {"max_parallel": max_parallel, "devices": len(jax.devices())}
-    identity |= {"version": jaxcloseup.__version__}
+    identity |= {"version": jaxcloseup.__version__, "data_sha256": hash_data(scene)}
+    together = [(arm, seed) for arm in chosen for seed in range(seeds)]
+    in_turn = [(arm, seed) for arm, seed in together if arm.in_turn]
+    together = [pair for pair in together if not pair[0].in_turn and pair[0].name != "baseline"]
+    # Side by side, arms that look from the same places share their forward warps.
+    together.sort(key=lambda pair: (pair[1], pair[0].outlook))
+    # Rows of what is kept are told apart by their place.
+    identity["together"] = [[arm.name, seed] for arm, seed in together]
     checkpoints = Checkpoints(folder, identity)
     seconds = {} if seconds is None else seconds
 
@@ -124,8 +133,8 @@ def run_sweep(
 
     starts = []
 
-    def start_from(state, skipped):
-        depths = _depths(programs, state, views.cameras)
+    def start_from(state, seed, skipped):
+        depths = training_depths(programs, state, seed)
         sources = jax.jit(block_sources)(views.cameras, depths, views.weight)
         return _Start(state, depths, sources, skipped)
 
@@ -136,18 +145,13 @@ def run_sweep(
         steps = preset.baseline_steps
         name = f"baseline_{seed}"
         state, history = stage(name, programs, "photographs", state, views, steps=steps)
-        starts.append(start_from(state, _skipped(history)))
+        starts.append(start_from(state, seed, _skipped(history)))
     exact = exact_depths(scene, views.cameras) if scene.surface else None
     render = functools.partial(programs.render, starts[0].state)
     targets = targets_by_split(scene, starts[0].depths, exact, render)
     if exact is not None:
         targets |= ladder_targets(scene, exact)
 
-    together = [(arm, seed) for arm in chosen for seed in range(seeds)]
-    in_turn = [(arm, seed) for arm, seed in together if arm.in_turn]
-    together = [pair for pair in together if not pair[0].in_turn and pair[0].name != "baseline"]
-    # Side by side, arms that look from the same places share their forward warps.
-    together.sort(key=lambda pair: (pair[1], pair[0].outlook))
     results: dict[str, Any] = {arm.name: {} for arm in chosen}
 
     def score(arm, seed, state, skipped):
@@ -162,7 +166,7 @@ def run_sweep(
         start = starts[seed]
         flag = jnp.full_like(start.state.buffers.expected, expected)
         buffers = start.state.buffers.replace(expected=flag)
-        return start_from(start.state.replace(buffers=buffers), start.skipped)
+        return start_from(start.state.replace(buffers=buffers), seed, start.skipped)
 
     def begin(arm, seed):
         if arm.expected_depth is None:
@@ -184,7 +188,8 @@ def run_sweep(
     for arm, seed in in_turn:
         start = starts[seed]
         steps = preset.closeup_steps
-        depths_of = functools.partial(_depths, programs, start.state)
+        render = functools.partial(programs.render, start.state)
+        depths_of = functools.partial(rendered_depths, render, scene=scene, near=0.0)
         data = scene, start.depths, exact
         if arm.depth_error is not None:
             data = *data, depths_of, arm.settings
@@ -240,15 +245,11 @@ def _train_together(stage, name, programs, views, group, begun):
     return stage(name, programs, "arms", states, views, *data, steps=steps)
 
 
-def _depths(programs: Programs, state: TrainState, cameras: Camera) -> jax.Array:
-    return rendered_depths(functools.partial(programs.render, state), cameras, programs.scene)
-
-
-def _join_hosts() -> None:
-    """Have the devices of all hosts, if there are several."""
+def _hosts() -> tuple[str, int, int] | None:
+    """Address of the first host, how many there are and which this is, or None for one alone."""
     hosts = FLAGS.coordinator, FLAGS.num_processes, FLAGS.process_id
     if hosts == (None, None, None):
-        return
+        return None
     if None in hosts or FLAGS.process_id >= FLAGS.num_processes:
         raise ValueError(
             "several hosts need --coordinator, --num_processes and, below it, --process_id: give "
@@ -256,8 +257,7 @@ def _join_hosts() -> None:
         )
     if FLAGS.output_dir is None:
         raise ValueError("several hosts need one folder that all of them see: give --output_dir")
-    # Hosts that are done wait for the first one, which writes the tables.
-    jax.distributed.initialize(*hosts, shutdown_timeout_seconds=HOSTS_WAIT)
+    return hosts
 
 
 def _check_flags(preset: Preset) -> None:
@@ -279,6 +279,20 @@ def _check_flags(preset: Preset) -> None:
         print("warning: without the arm control there are no gains in the tables")
 
 
+def _check_scenes(captures: Sequence[Scene], output_dir: pathlib.Path) -> None:
+    given, names = ",".join(FLAGS.scenes), {scene.name for scene in captures}
+    if len(names) < len(captures):
+        raise ValueError(f"--scenes={given} has two of one name: sweep them one at a time")
+    kept = output_dir / MANIFEST
+    if FLAGS.resume and kept.exists():
+        before = json.loads(kept.read_bytes())["scenes"]
+        if set(before) != names:
+            raise ValueError(
+                f"--scenes={given} are not those of {output_dir}, {','.join(before)}: resume it as "
+                "it was begun"
+            )
+
+
 def main(argv: list[str]) -> None:
     """Run the sweep of the flags on every scene."""
     if len(argv) > 1:
@@ -286,23 +300,25 @@ def main(argv: list[str]) -> None:
     set_up()
     names = command_line.names_from_flags()
     try:
-        _join_hosts()
+        hosts = _hosts()
+        first = hosts is None or hosts[-1] == 0
         preset = command_line.preset_from_flags()
         _check_flags(preset)
         output_dir = pathlib.Path(FLAGS.output_dir or "")
-        if jax.process_index() == 0:
+        if first:
             output_dir = command_line.choose_output_dir(
                 FLAGS.output_dir, "sweep", FLAGS.method, resume=FLAGS.resume
             )
+        perceptual = find_perceptual(FLAGS.lpips_weights)
         load_options = command_line.load_options_from_flags(preset)
         captures = [command_line.load(name, load_options) for name in FLAGS.scenes]
-        if len({scene.name for scene in captures}) < len(captures):
-            raise ValueError(
-                f"--scenes={','.join(FLAGS.scenes)} has two of one name: sweep them one at a time"
-            )
+        _check_scenes(captures, output_dir)
         output_dir.mkdir(parents=True, exist_ok=True)
     except (SceneError, OSError, ValueError) as error:
         sys.exit(f"experiments.sweep: {error}")
+    if hosts is not None:
+        # Hosts that are done wait for the first one, which writes the tables.
+        jax.distributed.initialize(*hosts, shutdown_timeout_seconds=HOSTS_WAIT)
     about = {**names, "config": config(preset), "versions": versions()}
     manifest = about | {"seeds": list(range(FLAGS.seeds)), "arms": FLAGS.arms}
     manifest["scenes"] = {scene.name: about_scene(scene, load_options) for scene in captures}
@@ -310,7 +326,7 @@ def main(argv: list[str]) -> None:
     seconds: dict[str, dict[str, float]] = {scene.name: {} for scene in captures}
     try:
         # One that is resumed may yet turn out to be another sweep.
-        if jax.process_index() == 0 and not FLAGS.resume:
+        if first and not FLAGS.resume:
             write_manifest(output_dir, manifest)
         for scene in captures:
             found[scene.name] = run_sweep(
@@ -321,16 +337,20 @@ def main(argv: list[str]) -> None:
                 output_dir / "checkpoints" / scene.name,
                 names=names,
                 max_parallel=FLAGS.max_parallel,
-                perceptual=find_perceptual(FLAGS.lpips_weights),
+                perceptual=perceptual,
                 seconds=seconds[scene.name],
             )
-            if jax.process_index() == 0:
+            if first:
                 write_sweep(output_dir, found, about)
-        if jax.process_index() == 0:
+        if first:
             write_manifest(output_dir, manifest, seconds)
     except (TrainingError, CheckpointError, OSError) as error:
-        sys.exit(f"experiments.sweep: {error}")
-    if jax.process_index() == 0:
+        if hosts is None:
+            sys.exit(f"experiments.sweep: {error}")
+        # The others would wait for this one at the end: without it they are told to stop.
+        print(f"experiments.sweep: {error}", file=sys.stderr, flush=True)
+        os._exit(1)
+    if first:
         print_sweep(found)
         print(f"report: {output_dir / 'report.html'}")
 

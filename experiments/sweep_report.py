@@ -32,11 +32,13 @@ class Row(NamedTuple):
       arm: its name.
       split: of the views.
       psnr: mean over scenes, seeds and views, dB.
-      spread: standard deviation over seeds of the mean over scenes and views; None of one seed.
+      spread: standard deviation over seeds of the mean over scenes and views, of those seeds that
+        have all of them; None of one seed.
       ssim: mean.
       lpips: mean, with VGG.
       gain: mean difference of PSNR from control, or None without one.
-      low, high: its 95 % interval.
+      low, high: its 95 % interval; None of a single view.
+      count: images, of all scenes, seeds and views, that the means are over.
       skipped: steps that were not finite, of all seeds and scenes.
     """
 
@@ -49,12 +51,13 @@ class Row(NamedTuple):
     gain: float | None
     low: float | None
     high: float | None
+    count: int
     skipped: int
 
 
 def paired_bootstrap(
     differences: Sequence[np.ndarray], *, resamples: int = RESAMPLES, share: float = 0.95
-) -> tuple[float, float]:
+) -> tuple[float, float] | tuple[None, None]:
     """Interval of the mean of paired differences, by resampling groups of them.
 
     Args:
@@ -64,6 +67,8 @@ def paired_bootstrap(
       share: of the resampled means that lie within.
     """
     means = np.array([np.mean(group) for group in differences])
+    if len(means) < 2:
+        return None, None
     chosen = np.random.default_rng(0).integers(0, len(means), (resamples, len(means)))
     low, high = np.quantile(means[chosen].mean(axis=1), [(1 - share) / 2, (1 + share) / 2])
     return float(low), float(high)
@@ -85,7 +90,8 @@ def rows(scenes: Mapping[str, Mapping[str, Any]]) -> list[Row]:
             by_seed: dict[str, list[float]] = {}
             for (_, seed, _), value in psnr.items():
                 by_seed.setdefault(seed, []).append(value)
-            seeds = [float(np.mean(values)) for values in by_seed.values()]
+            most = max(map(len, by_seed.values()))
+            seeds = [float(np.mean(values)) for values in by_seed.values() if len(values) == most]
             skipped = sum(
                 result["skipped"]
                 for of_scene in scenes.values()
@@ -99,6 +105,7 @@ def rows(scenes: Mapping[str, Mapping[str, Any]]) -> list[Row]:
                     float(np.std(seeds, ddof=1)) if len(seeds) > 1 else None,
                     *(_mean(scenes, arm, split, metric) for metric in ("ssim", "lpips_vgg")),
                     *(gain_over_control(scenes, arm, split) or (None, None, None)),
+                    len(psnr),
                     skipped,
                 )
             )
@@ -107,7 +114,7 @@ def rows(scenes: Mapping[str, Mapping[str, Any]]) -> list[Row]:
 
 def gain_over_control(
     scenes: Mapping[str, Mapping[str, Any]], arm: str, split: str
-) -> tuple[float, float, float] | None:
+) -> tuple[float, float | None, float | None] | None:
     """Mean difference of an arm's PSNR from control, and its interval; None if there is none."""
     if arm == "control":
         return None
@@ -132,8 +139,9 @@ def gain_curves(scenes: Mapping[str, Mapping[str, Any]]) -> list[Curve]:
             if gain is not None:
                 found[m] = gain
         if found:
-            columns = map(list, zip(*found.values(), strict=True))
-            curves.append(Curve(arm, list(found), *columns))
+            gains, lows, highs = map(list, zip(*found.values(), strict=True))
+            known = (lows, highs) if None not in lows else ()
+            curves.append(Curve(arm, list(found), gains, *known))
     return curves
 
 
@@ -227,10 +235,22 @@ def _cells(found):
             number(row.ssim, "{:.4f}"),
             number(row.lpips, "{:.4f}"),
             number(row.gain, "{:+.3f}"),
-            "-" if row.gain is None else f"{row.low:+.3f} to {row.high:+.3f}",
+            "-" if row.low is None else f"{row.low:+.3f} to {row.high:+.3f}",
+            str(row.count),
             str(row.skipped),
         ]
         for row in found
     ]
-    header = ["views", "arm", "PSNR (dB)", "s.d.", "SSIM", "LPIPS", "gain (dB)", "95 %", "skipped"]
+    header = [
+        "views",
+        "arm",
+        "PSNR (dB)",
+        "s.d.",
+        "SSIM",
+        "LPIPS",
+        "gain (dB)",
+        "95 %",
+        "n",
+        "skipped",
+    ]
     return [header, *body]

@@ -88,11 +88,16 @@ def zoom_curves(stages: Mapping[str, Mapping[str, Any]], metric: str = "psnr") -
     return curves
 
 
-def gain_over(curves: Sequence[Curve], base: str, curve: Curve) -> Curve:
-    """A curve less that of the stage `base`, where both have points."""
-    below = next(dict(zip(c.x, c.y, strict=True)) for c in curves if c.name == base)
-    known = [(x, y - below[x]) for x, y in zip(curve.x, curve.y, strict=True) if x in below]
-    return Curve(curve.name, *map(list, zip(*known, strict=True)))
+def gains_over(curves: Sequence[Curve], base: str) -> list[Curve]:
+    """Curves less that of the stage `base`, where both have points."""
+    named = {curve.name: dict(zip(curve.x, curve.y, strict=True)) for curve in curves}
+    below = named.get(base, {})
+    gains = []
+    for curve in curves:
+        known = [(x, y - below[x]) for x, y in zip(curve.x, curve.y, strict=True) if x in below]
+        if known:
+            gains.append(Curve(curve.name, *map(list, zip(*known, strict=True))))
+    return gains
 
 
 def ladder_in_short(splits: Mapping[str, Any]) -> str:

@@ -16,6 +16,7 @@ import numpy as np
 from flax import struct
 from jax import lax
 
+from jaxcloseup.numerics import safe_norm
 from jaxcloseup.torch_file import TorchFileError, read_tensors
 
 
@@ -94,7 +95,7 @@ def lpips(weights: LpipsWeights, image: jax.Array, target: jax.Array) -> jax.Arr
     both = jnp.stack([image, target]).reshape(-1, *image.shape[-3:])
     total = jnp.zeros((both.shape[0] // 2,), both.dtype)
     for features, head in zip(_features(weights, both), weights.heads, strict=True):
-        norm = jnp.sqrt(jnp.sum(features**2, axis=-1, keepdims=True))
+        norm = safe_norm(features, keepdims=True)
         first, second = jnp.split(features / (norm + 1e-10), 2)
         difference = (first - second) ** 2
         total += jnp.mean(jnp.sum(difference * head[None, None, None], axis=-1), axis=(1, 2))

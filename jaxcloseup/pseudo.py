@@ -49,7 +49,7 @@ class PseudoSettings:
         which there is no label; inf: off.
       num_sources: `[]` photographs whose colours are averaged: the source view, and those that see
         most of the virtual pixels under small angles. 1 in the paper.
-      rate: `[]` factor on the learning rates of steps with labels.
+      rate: `[]` factor on what the optimizer changes in steps with labels.
     """
 
     pose: PoseSettings

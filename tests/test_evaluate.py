@@ -29,7 +29,7 @@ def write_images(folder, images):
 
 @pytest.fixture
 def pair(tmp_path):
-    """Two renders, one off by 51 in one of four rows and columns' blocks, and their truth."""
+    """Two renders, one off by 51 in its upper half, and their truth."""
     truth = np.random.default_rng(0).integers(0, 200, (16, 24, 3), np.uint8)
     off = truth.copy()
     off[:8] += 51

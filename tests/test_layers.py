@@ -19,7 +19,7 @@ MAY_IMPORT = {
     "batch": {"geometry"},
     "rendered_loss": {"numerics", "field", "batch"},
     "metrics": {"numerics"},
-    "lpips": {"torch_file"},
+    "lpips": {"numerics", "torch_file"},
     "volume": {"numerics", "geometry", "field"},
     "splats": {"numerics", "geometry", "field", "metrics"},
     "pseudo": {"numerics", "geometry", "field", "batch"},

@@ -65,6 +65,16 @@ def test_batches_are_their_images_one_by_one(random_weights):
     np.testing.assert_array_equal(lpips(weights, a, a), 0)
 
 
+def test_gradients_are_finite_where_no_feature_is(random_weights):
+    """Far below every bias all rectified features are 0."""
+    weights = random_weights["alex"]
+    kernel, bias = weights.convolutions[0]
+    dead = weights.replace(convolutions=((kernel, bias - 1e3), *weights.convolutions[1:]))
+    a, b = pair(np.random.default_rng(0), 40, 33)
+    gradient = jax.grad(lambda image: lpips(dead, image, b))(a)
+    assert jnp.all(jnp.isfinite(gradient))
+
+
 def test_small_images_are_refused(random_weights):
     with pytest.raises(ValueError, match="31 pixels a side"):
         lpips(random_weights["alex"], jnp.zeros((30, 40, 3)), jnp.zeros((30, 40, 3)))

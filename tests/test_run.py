@@ -235,7 +235,8 @@ def test_an_unknown_scene_is_one_sentence(parsed_flags, tmp_path):
 
 def test_format_and_split_reach_the_capture(parsed_flags, capture_folder, capsys):
     with flagsaver.flagsaver(format="transforms", split="every8"):
-        scene = command_line.scene_from_flags(str(capture_folder), 1)
+        options = command_line.load_options_from_flags(TINY)
+        scene = command_line.load(str(capture_folder), options)
         names = command_line.names_from_flags()
     assert (names["format"], names["split"]) == ("transforms", "every8")
     assert scene.metadata["split"] == "every8" and scene.test is None

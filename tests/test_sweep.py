@@ -176,6 +176,14 @@ def test_rows_are_means_over_everything_and_gains_are_paired():
     assert better.low == pytest.approx(1)
     assert better.high == pytest.approx(3)
     assert better.skipped == 4
+    assert (control.count, better.count) == (6, 8)
+    # A seed that lacks a view is no other seed's equal.
+    del scenes["a"]["better"]["1"]["splits"]["test"]["views"]["1"]
+    assert rows(scenes)[1].spread is None
+
+
+def test_a_single_view_has_no_interval():
+    assert paired_bootstrap([np.array([0.3, 0.4])]) == (None, None)
 
 
 def test_the_interval_is_that_of_the_mean():
@@ -197,6 +205,10 @@ def test_the_interval_is_that_of_the_mean():
         ("replace=1", "replace takes no such value"),
         ("rgb_tolerance=nan", "rgb_tolerance takes no such value"),
         ("magnification=8:2", "magnification is a range"),
+        ("magnification=0:4", "magnification lies between 1 and inf"),
+        ("label_share=1.5", "label_share lies between 0 and 1"),
+        ("rate=-1", "rate lies between 0 and inf"),
+        ("rate=1+rate=2", "sets rate twice"),
     ],
 )
 def test_a_name_that_is_no_arm_is_one_sentence(name, message):

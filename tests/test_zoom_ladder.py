@@ -11,7 +11,7 @@ import pytest
 from experiments.plots import Curve, line_plot
 from experiments.zoom_ladder import (
     MAGNIFICATIONS,
-    gain_over,
+    gains_over,
     ladder_in_short,
     ladder_targets,
     zoom_curves,
@@ -85,7 +85,8 @@ def test_curves_and_gains():
         Curve("control", [1, 4], [30.0, 25.0]),
         Curve("closeup", [1, 4, 16], [29.5, 26.0, 20.0]),
     ]
-    assert gain_over(curves, "control", curves[1]) == Curve("closeup", [1, 4], [-0.5, 1.0])
+    assert gains_over(curves, "control")[1] == Curve("closeup", [1, 4], [-0.5, 1.0])
+    assert gains_over(curves[1:], "control") == []
     assert ladder_in_short(stages["control"]).endswith("4x nearer 25.00, 16x nearer -")
 
 

@@ -115,9 +115,6 @@ def _lens(file: pathlib.Path, camera: Any) -> tuple[dict[str, Any], tuple[int, i
     return {"camera_model": camera.model_name, **lens}, size
 
 
-_SIDES = ("width", "height")
-
-
 def _check_names(source: pathlib.Path, names: list[str]) -> None:
     if not names:
         raise SceneError(

@@ -88,6 +88,11 @@ def _walk_image(path, data, at, _):
 
 
 def _walk_point(path, data, at, _):
+    point, *position = struct.unpack_from("<Q3d", data, at)
+    if not all(map(math.isfinite, position)):
+        raise SceneError(
+            f"{path}: point {point} has a position that is not finite: export the model again."
+        )
     (track,) = struct.unpack_from("<Q", data, at + 43)
     return at + 51 + 8 * track
 

@@ -1,5 +1,6 @@
 """Which photographs of a capture are trained on and which are held out."""
 
+import collections
 import json
 import pathlib
 import warnings
@@ -69,7 +70,9 @@ def split_of_file(folder: pathlib.Path, frames: Sequence[Frame]) -> dict[str, li
             UnknownKeyWarning,
             stacklevel=2,
         )
-    by_name = {frame.file.name: frame for frame in frames}
+    # A name that photographs of several folders have says nothing by itself.
+    bases = collections.Counter(frame.file.name for frame in frames)
+    by_name = {frame.file.name: frame for frame in frames if bases[frame.file.name] == 1}
     by_name |= {frame.listed: frame for frame in frames}
     lists = {key: (key, fields[key]) for key in fields if key in _SPLIT_FILE_KEYS and fields[key]}
     chosen = _choose(file, lists, by_name.get, "name")
