@@ -48,7 +48,7 @@ def kept(capture_folder, tmp_path_factory):
         state = state.replace(params=state.params.replace(**flat))
     write_manifest(folder, about_scene(scene, {"downscale": 1}) | {"seed": 0})
     size = [plane.WIDTH, plane.HEIGHT]
-    identity = {"scene": scene.name, "config": config(PRESET), "resolution": size}
+    identity = {"scene": scene.name, "config": config(PRESET), "resolution": size, "seed": 0}
     checkpoints = Checkpoints(folder / "checkpoints", identity | {"version": "1"})
     for stage in ("baseline", "closeup"):
         checkpoints.save(stage, 3, state, {"history": [], "growth": 1})
