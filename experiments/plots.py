@@ -50,7 +50,7 @@ def line_plot(
       level: where a thin horizontal line is drawn.
     """
     with plt.style.context(["tableau-colorblind10", _STYLE]):
-        figure, axes = plt.subplots(figsize=(6, 3.8), layout="constrained")
+        figure, axes = plt.subplots(figsize=(6.5, 3.6), layout="constrained")
         for curve, marker in zip(curves, "os^Dvx*P" * len(curves), strict=False):
             (line,) = axes.plot(curve.x, curve.y, marker=marker, label=curve.name, markersize=4)
             if curve.low is not None:
@@ -65,7 +65,7 @@ def line_plot(
             axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
         axes.set(xlabel=x, ylabel=y, title=title)
         axes.grid(alpha=0.3)
-        axes.legend(frameon=False)
+        axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
         text = io.StringIO()
         figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
         plt.close(figure)
