@@ -73,6 +73,13 @@ flags.DEFINE_integer(
 flags.DEFINE_bool("support", True, "also render what photographs saw; needs their depth first")
 
 
+# What else there is to say of these ways alone.
+_FOR = {
+    **dict.fromkeys(("frames", "width", "height"), ("orbit", "from")),
+    **dict.fromkeys(("pixel", "magnification"), ("from",)),
+}
+
+
 def main(argv: list[str]) -> None:
     """Render what the flags say."""
     if len(argv) > 1:
@@ -244,8 +251,11 @@ def _chosen_way() -> str:
             "exactly one of --views, --camera_path, --target, --orbit and --from says what to "
             f"render, and {named}"
         )
-    if given[0] not in ("orbit", "from") and (FLAGS.width or FLAGS.height):
-        raise CameraError(f"--{given[0]} has sizes of its own: leave out --width and --height")
+    for flag, ways in _FOR.items():
+        if FLAGS[flag].value != FLAGS[flag].default and given[0] not in ways:
+            raise CameraError(f"--{flag} says nothing of --{given[0]}: leave it out")
+    if FLAGS.target_steps is not None and not (FLAGS.fine_tune or given[0] == "target"):
+        raise CameraError("--target_steps needs --fine_tune or --target: leave it out, or add one")
     if FLAGS.fps is not None and not 0 < FLAGS.fps <= 1000:
         raise CameraError(f"--fps={FLAGS.fps:g} must be above 0 and at most 1000")
     if given[0] == "from":
