@@ -17,7 +17,7 @@ _CACHE = "JAXCLOSEUP_TEST_CACHE"
 
 
 def pytest_configure(config):
-    """Keep compiled programs for all processes of this session: many tests need the same ones."""
+    """Keep compiled programs for all processes of this run: many tests need the same ones."""
     if not hasattr(config, "workerinput"):
         os.environ[_CACHE] = tempfile.mkdtemp()
     jax.config.update("jax_compilation_cache_dir", os.environ[_CACHE])
