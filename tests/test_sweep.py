@@ -289,7 +289,7 @@ found = test_sweep.sweep_tiny(scene, folder / "sweep", ("control", "diverse"), 1
 
 
 def start(script, *arguments, devices=1):
-    """A Python of its own, on so many devices of this host, with the programs that this run has compiled."""
+    """A Python of its own, on so many devices of this host, that has what is compiled already."""
     tests = pathlib.Path(__file__).parent
     environment = os.environ | {
         "JAX_PLATFORMS": "cpu",
