@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxcloseup.batch import Views, camera_at, to_float
+from jaxcloseup.batch import Views, camera_at, look_up, to_float
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points, points_to_pixels
 from jaxcloseup.geometry.masks import depth_consistent, in_bounds, rgb_consistent
 from jaxcloseup.geometry.poses import PoseSettings, four_anchors, sample_closeup_camera
@@ -164,16 +164,10 @@ def make_label(
 def _read_source(camera, points, index, views, depths, settings):
     """What view `index` shows at points `[..., 3]`, and its weight, 0 where that is no label."""
     source = camera_at(views.cameras, index)
-    landed, landed_depth = points_to_pixels(source, points)
-    maps = jnp.stack([depths[index], views.weight[index]], axis=-1)
-    observed, weight = jnp.moveaxis(backward_warp(maps, landed, order=0), -1, 0)
-    known = (
-        (landed_depth > 0)
-        & in_bounds(landed, source.height, source.width)
-        & (weight > 0)
-        & depth_consistent(observed, landed_depth, settings.depth_tolerance)
-        & (_cosine_between(camera, source, points) >= _least_cosine(settings))
-    )
+    maps = depths[index], views.weight[index]
+    landed, _, weight = look_up(source, *maps, points, settings.depth_tolerance)
+    near_enough = _cosine_between(camera, source, points) >= _least_cosine(settings)
+    known = (weight > 0) & near_enough
     colour = backward_warp(to_float(views.rgb[index]), landed)
     return jnp.where(known[..., None], colour, 0), jnp.where(known, weight, 0)
 
@@ -183,14 +177,10 @@ def _rank_sources(camera, points, first, views, depths, settings):
 
     def score(view):
         source, depth, weight = view
-        landed, landed_depth = points_to_pixels(source, points)
-        observed, weight = (
-            backward_warp(array[..., None], landed, order=0)[..., 0] for array in (depth, weight)
-        )
         tolerance = jnp.minimum(settings.depth_tolerance, _RANKING_TOLERANCE)
+        _, _, weight = look_up(source, depth, weight, points, tolerance)
         cosine = _cosine_between(camera, source, points)
-        sees = depth_consistent(observed, landed_depth, tolerance) & (weight > 0)
-        sees &= (landed_depth > 0) & (cosine >= _least_cosine(settings))
+        sees = (weight > 0) & (cosine >= _least_cosine(settings))
         return jnp.sum(jnp.where(sees, cosine, 0))
 
     scores = jax.lax.map(score, (views.cameras, depths, views.weight))

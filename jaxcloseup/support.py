@@ -6,10 +6,8 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxcloseup.batch import Views
-from jaxcloseup.geometry.cameras import Camera, pixels_to_points, points_to_pixels
-from jaxcloseup.geometry.masks import depth_consistent
-from jaxcloseup.geometry.warp import backward_warp
+from jaxcloseup.batch import Views, look_up
+from jaxcloseup.geometry.cameras import Camera, pixels_to_points
 from jaxcloseup.numerics import safe_divide
 
 
@@ -61,11 +59,8 @@ def find_support(
 
     def add_view(found, view):
         source, view_depth, weight = view
-        landed, landed_depth = points_to_pixels(source, points)
-        maps = jnp.stack([view_depth, weight], axis=-1)
-        observed, weight = jnp.moveaxis(backward_warp(maps, landed, order=0), -1, 0)
-        confirmed = depth_consistent(observed, landed_depth, tolerance)
-        saw = (depth > 0) & (weight > 0) & confirmed
+        _, landed_depth, weight = look_up(source, view_depth, weight, points, tolerance)
+        saw = (depth > 0) & (weight > 0)
         footprint = safe_divide(landed_depth / _focal(source), own_side)
         finest = jnp.where(saw, jnp.minimum(found.footprint, footprint), found.footprint)
         return Support(found.count + saw.astype(jnp.int32), finest), None
