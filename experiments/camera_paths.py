@@ -3,7 +3,6 @@
 Poses are camera-to-world in the scene's own world: for a capture that of its `transforms*.json`.
 """
 
-import json
 import math
 import pathlib
 from typing import Any, NamedTuple
@@ -14,7 +13,8 @@ import numpy as np
 from jaxcloseup.batch import Views, camera_at
 from jaxcloseup.geometry.cameras import Camera, pixels_to_points
 from jaxcloseup.geometry.poses import closeup_position
-from jaxcloseup.scenes import Scene
+from jaxcloseup.scenes import Scene, SceneError
+from jaxcloseup.scenes.fields import read_object
 
 
 FPS = 30.0
@@ -61,17 +61,9 @@ def read_camera_path(path: pathlib.Path) -> Shots:
       CameraError: names the file, the entry and the field.
     """
     try:
-        fields = json.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise CameraError(f"{path} cannot be read ({error.strerror}): name a camera path") from None
-    except json.JSONDecodeError as error:
-        raise CameraError(
-            f"{path}: not JSON at line {error.lineno} ({error.msg}): export the camera path again"
-        ) from None
-    except UnicodeDecodeError:
-        raise CameraError(f"{path}: not UTF-8 text: export the camera path again") from None
-    if not isinstance(fields, dict):
-        raise CameraError(f"{path}: not an object with a camera_path: is it the right file?")
+        fields = read_object(path, "a camera_path")
+    except SceneError as error:
+        raise CameraError(str(error)) from None
     kind = fields.get("camera_type", "perspective")
     if kind != "perspective":
         raise CameraError(f"{path}: camera_type is {kind!r}: only perspective can be rendered")

@@ -1,6 +1,8 @@
 """Checks of the values that files give; messages name the file and the field."""
 
+import json
 import math
+import pathlib
 import sys
 from typing import Any
 
@@ -59,3 +61,24 @@ def rigid_transform(label: str, key: str, value: Any) -> np.ndarray:
     if np.linalg.det(rotation) < 0:
         raise SceneError(f"{label}: {key} mirrors space: flip one axis of its rotation.")
     return matrix
+
+
+def read_object(path: pathlib.Path, holds: str) -> dict[str, Any]:
+    """The object of a JSON file, which `holds` what a sentence on another file would miss."""
+    try:
+        fields = json.loads(path.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise SceneError(f"{path} cannot be read ({error.strerror}): restore the file.") from error
+    except json.JSONDecodeError as error:
+        raise SceneError(
+            f"{path}: not JSON at line {error.lineno} ({error.msg}): correct it."
+        ) from error
+    except UnicodeDecodeError as error:
+        raise SceneError(f"{path}: not UTF-8 text: save it again as UTF-8.") from error
+    except (ValueError, RecursionError) as error:
+        raise SceneError(
+            f"{path}: nested too deep, or a number of thousands of digits: is it the right file?"
+        ) from error
+    if not isinstance(fields, dict):
+        raise SceneError(f"{path}: not an object with {holds}: is it the right file?")
+    return fields

@@ -4,7 +4,6 @@ Poses in the files are camera-to-world in OpenGL's frame (x right, y up, z backw
 this module in OpenCV's (x right, y down, z forward), and nothing else knows of the difference.
 """
 
-import json
 import pathlib
 import warnings
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 
 from jaxcloseup.scenes.distortion import COEFFICIENTS, read_distortion
 from jaxcloseup.scenes.errors import SceneError, UnknownKeyWarning
-from jaxcloseup.scenes.fields import rigid_transform, side
+from jaxcloseup.scenes.fields import read_object, rigid_transform, side
 from jaxcloseup.scenes.frames import Frame, check_photographs, frame_intrinsics
 
 
@@ -41,7 +40,7 @@ def read_transforms(path: pathlib.Path) -> tuple[dict[str, Any], list[Frame]]:
     Raises:
       SceneError: names the file, the frame and the field, and says what to do.
     """
-    fields = _read_json(path)
+    fields = read_object(path, 'a list of "frames"')
     entries = fields.get("frames")
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise SceneError(f'{path}: "frames" must be a list of objects, one for each photograph.')
@@ -58,26 +57,6 @@ def read_transforms(path: pathlib.Path) -> tuple[dict[str, Any], list[Frame]]:
     frames = [_read_frame(path, fields, entry) for entry in entries]
     check_photographs(path, frames)
     return fields, frames
-
-
-def _read_json(path: pathlib.Path) -> dict[str, Any]:
-    try:
-        fields = json.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise SceneError(f"{path} cannot be read ({error.strerror}): restore the file.") from error
-    except json.JSONDecodeError as error:
-        raise SceneError(
-            f"{path}: not JSON at line {error.lineno} ({error.msg}): correct it."
-        ) from error
-    except UnicodeDecodeError as error:
-        raise SceneError(f"{path}: not UTF-8 text: save it again as UTF-8.") from error
-    except (ValueError, RecursionError) as error:
-        raise SceneError(
-            f"{path}: nested too deep, or a number of thousands of digits: is it the right file?"
-        ) from error
-    if not isinstance(fields, dict):
-        raise SceneError(f'{path}: not an object with a list of "frames": is it the right file?')
-    return fields
 
 
 def _read_frame(path: pathlib.Path, fields: dict[str, Any], entry: dict[str, Any]) -> Frame:
