@@ -10,6 +10,9 @@ import pytest
 from tiny_runs import write_plane
 
 
+# Arms of sweeps are spread over all devices; read when the first array is made.
+DEVICES = "--xla_force_host_platform_device_count=8"
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {DEVICES}".strip()
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 

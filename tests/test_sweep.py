@@ -95,6 +95,7 @@ def test_an_arm_is_the_run_alone(preset, capture_folder):
     assert not any(metrics["skipped"])
     different = [float(jnp.abs(x[0] - x[2]).max()) for x in jax.tree.leaves(together.params)]
     assert max(different) > 1e-4  # control and diverse
+    assert len(jax.devices()) == 8  # four arms, and four copies of the last
     for leaf in jax.tree.leaves(together.params):
         assert len({shard.device for shard in leaf.addressable_shards}) == len(jax.devices())
 
@@ -108,7 +109,7 @@ def test_an_arm_that_diverges_takes_no_other_down(capture_folder, capsys):
             states, *data = stack_arms([arms[0], second, arms[2]], len(jax.devices()))
             both.append(programs.run("arms", states, views, *data, count=2))
     (healthy, _), (after, metrics) = both
-    assert metrics["skipped"] == [0, 2, 0]
+    assert metrics["skipped"][:3] == [0, 2, 0]  # then copies of the last, one a device
     assert "skipped, not finite" in capsys.readouterr().out
     for i in (0, 2):
         pick = functools.partial(jax.tree.map, lambda leaf, i=i: leaf[i])
@@ -264,19 +265,13 @@ def test_an_arm_may_have_labels_from_the_other_depth(capture_folder, tmp_path):
     scene = load_scene(str(capture_folder))
     arms = ["diverse", "expected_depth=0", "expected_depth=1"]
     names = {"method": "surfels", "preset": "tiny"}
-    preset = dataclasses.replace(TINY_SURFELS, label_share=0.5)
+    preset = dataclasses.replace(TINY_SMOOTH, label_share=0.5)
     with jax.numpy_dtype_promotion("standard"):
         found = run_sweep(scene, preset, arms, 1, tmp_path, names=names)
     as_ever, median, expected = (found[arm]["0"]["splits"]["test"]["psnr"] for arm in arms)
     assert as_ever == median
     assert as_ever != expected
 
-
-DEVICES = """
-assert len(jax.devices()) == 8
-folder = write_plane(pathlib.Path(sys.argv[1]))
-test_sweep.test_an_arm_is_the_run_alone(test_sweep.TINY_STEPS, folder)
-"""
 
 HOSTS = """
 jax.distributed.initialize("127.0.0.1:" + sys.argv[2], 2, int(sys.argv[3]))
@@ -288,12 +283,12 @@ found = test_sweep.sweep_tiny(scene, folder / "sweep", ("control", "diverse"), 1
 """
 
 
-def start(script, *arguments, devices=1):
-    """A Python of its own, on so many devices of this host, that has what is compiled already."""
+def start(script, *arguments):
+    """A Python of its own, on one device, that has what is compiled already."""
     tests = pathlib.Path(__file__).parent
     environment = os.environ | {
         "JAX_PLATFORMS": "cpu",
-        "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
+        "XLA_FLAGS": "--xla_force_host_platform_device_count=1",
         "PYTHONPATH": os.pathsep.join([str(tests.parent), str(tests)]),
         "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir,
     }
@@ -311,23 +306,18 @@ def finish(process):
     assert process.returncode == 0, error[-2000:]
 
 
-def test_arms_are_spread_over_all_devices(tmp_path):
-    """On eight devices of the host, four arms and four copies of the last give what one gives."""
-    finish(start(DEVICES, tmp_path, devices=8))
-
-
 def test_arms_are_spread_over_hosts(capture_folder, tmp_path):
     """Two processes that know each other end with what one ends with; the first one writes."""
     (tmp_path / "capture").symlink_to(capture_folder)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
+    scene = load_scene(str(capture_folder))
+    whole = sweep_tiny(scene, tmp_path / "alone", ("control", "diverse"), 1)
     for process in [start(HOSTS, tmp_path, port, i) for i in range(2)]:
         finish(process)
     hosts = [json.loads((tmp_path / f"host{i}.json").read_text()) for i in range(2)]
     assert hosts[0] == hosts[1]
-    scene = load_scene(str(capture_folder))
-    whole = sweep_tiny(scene, tmp_path / "alone", ("control", "diverse"), 1)
     for arm, by_seed in whole.items():
         for seed, result in by_seed.items():
             for split, metrics in result["splits"].items():
