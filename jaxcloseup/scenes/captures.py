@@ -14,14 +14,14 @@ from jaxcloseup.scenes.bounds import near_far_from_cameras, near_far_from_points
 from jaxcloseup.scenes.errors import ImageSizeWarning, NearFarWarning, SceneError
 from jaxcloseup.scenes.fields import affine_transform, number
 from jaxcloseup.scenes.formats import FORMATS, Listing, read_listing
-from jaxcloseup.scenes.frames import Frame
 from jaxcloseup.scenes.images import pad_images
-from jaxcloseup.scenes.photographs import Photo, read_photos, resized_intrinsics
+from jaxcloseup.scenes.photographs import Photo, Reading, read_photos
 from jaxcloseup.scenes.scene import Scene
 from jaxcloseup.scenes.splits import SPLITS, unique_names
 from jaxcloseup.scenes.triangulation import triangulate
 
 
+_ZOOM = 4
 _LEAST_POINTS = 100  # triangulated; fewer tell too little of where a scene is
 
 _log = logging.getLogger(__name__)
@@ -35,6 +35,7 @@ def load_scene(
     background: float = 1.0,
     format: str | None = None,
     split: str = "given",
+    zoom: int | None = None,
 ) -> Scene:
     """A built-in scene by its name, or a capture from its folder.
 
@@ -71,15 +72,20 @@ def load_scene(
       split: `given`: as the capture says; `every8`: every 8th photograph by name is `test_far`;
         `closest`: the tenth of the photographs that are nearest to what they see, by the median
         depth of its points over the focal length in pixels, is `test`, and of the rest every 8th
-        is `test_far`.
+        is `test_far`; `zoom`: every 8th photograph is `test_far`, the rest is trained on reduced
+        `zoom` times more, and of every 8th of these one part of their own size, not reduced, is
+        `test`: exactly `zoom` times as fine, from the same place. It is that of `zoom` x `zoom`
+        with most detail: squared differences of neighbouring pixels that count.
+      zoom: whole number of at least 2, of split `zoom` alone; None: 4.
 
     Returns:
       The scene. For a folder, `metadata` holds `path`, `downscale`, `files` and `sizes` (the path
       and, before padding, the (width, height) of each photograph, by split) and
       `applied_transform` (`[3, 4]`, from the capture's original world to this one, or None),
       `format`, `split`, `notes` (sentences on what was read and how it was divided) and, for
-      `closest`, `times_nearer` (how many times nearer each view of `test` is than the median
-      training photograph).
+      `closest` and `zoom`, `times_nearer` (how many times nearer, or finer, each view of `test` is
+      than the median training photograph); for `zoom` `corners` (of each view of `test` the first
+      pixel (x, y) in its photograph, reduced by `downscale`).
 
     Raises:
       SceneError: one sentence that names the file and the field and says what to do.
@@ -92,6 +98,11 @@ def load_scene(
         raise SceneError(f"split {split!r} is unknown: choose one of {', '.join(SPLITS)}.")
     if format is not None and format not in FORMATS:
         raise SceneError(f"format {format!r} is unknown: choose one of {', '.join(FORMATS)}.")
+    if zoom is not None and split != "zoom":
+        raise SceneError(f"zoom is of split zoom, and split is {split}: leave zoom out.")
+    if zoom is not None and (isinstance(zoom, bool) or not isinstance(zoom, int) or zoom < 2):
+        raise SceneError(f"zoom must be a whole number of at least 2, got {zoom!r}.")
+    zoom = (zoom or _ZOOM) if split == "zoom" else 1
     path = pathlib.Path(name_or_path)
     if len(path.parts) == 1 and str(name_or_path) == path.name:
         from jaxcloseup.scenes.procedural import PROCEDURAL_SCENES, procedural_scene
@@ -111,7 +122,7 @@ def load_scene(
     try:
         if not path.is_dir():
             raise SceneError(f"{path} is not a folder: give the one that holds the capture.")
-        listing = read_listing(path, format=format, split=split)
+        listing = read_listing(path, format=format, split=split, zoom=zoom)
     except OSError as error:  # of folders; what reads a file says more
         raise SceneError(
             f"{error.filename or path!s:.200} cannot be read ({error.strerror}): permit reading "
@@ -119,12 +130,12 @@ def load_scene(
         ) from error
     for note in listing.notes:
         _log.info(note)
-    scene = _load(listing, downscale, half_pixel, background)
+    scene = _load(listing, Reading(downscale, zoom, background, half_pixel))
     scene.metadata.update(path=path, split=split)
     return scene
 
 
-def _load(listing: Listing, downscale: int, half_pixel: bool, background: float) -> Scene:
+def _load(listing: Listing, reading: Reading) -> Scene:
     transform = listing.fields.get("applied_transform")
     if transform is not None:
         transform = affine_transform(str(listing.file), "applied_transform", transform)
@@ -134,39 +145,48 @@ def _load(listing: Listing, downscale: int, half_pixel: bool, background: float)
                 "correct it."
             )
 
-    frames = [frame for members in listing.frames.values() for frame in members]
-    photos = read_photos(frames, downscale=downscale, background=background, half_pixel=half_pixel)
-    _check_masks(listing, photos)
-    _warn_sizes(listing, frames, photos)
-    intrinsics = np.stack(
-        [
-            resized_intrinsics(frame, photo.stored_size, photo.size, half_pixel)
-            for frame, photo in zip(frames, photos, strict=True)
-        ]
-    )
-    camtoworld = np.stack([frame.camtoworld for frame in frames])
+    parts = read_photos(listing.frames, reading)
+    photos = [photo for members in parts.values() for photo in members]
+    _check_masks(listing, parts["train"])
+    _warn_sizes(listing, photos)
+    intrinsics = np.stack([photo.intrinsics(reading.half_pixel) for photo in photos])
+    camtoworld = np.stack([photo.frame.camtoworld for photo in photos])
     sizes = np.array([photo.size for photo in photos])
     if not len(listing.points):
-        listing = _with_points(listing, photos, camtoworld, intrinsics)
+        listing = _with_points(listing, parts["train"], camtoworld, intrinsics)
     near, far = _near_far(listing, camtoworld, intrinsics, sizes)
 
     width, height = sizes.max(0).tolist()
-    ends = np.cumsum([len(members) for members in listing.frames.values()])[:-1]
-    parts = dict(zip(listing.frames, np.split(np.arange(len(frames)), ends), strict=True))
+    ends = np.cumsum([len(members) for members in parts.values()])[:-1]
+    rows = dict(zip(parts, np.split(np.arange(len(photos)), ends), strict=True))
     views = {
         split: Views(
             cameras=Camera(
-                camtoworld=jnp.asarray(camtoworld[part], jnp.float32),
-                intrinsics=jnp.asarray(intrinsics[part], jnp.float32),
+                camtoworld=jnp.asarray(camtoworld[rows[split]], jnp.float32),
+                intrinsics=jnp.asarray(intrinsics[rows[split]], jnp.float32),
                 height=height,
                 width=width,
             ),
-            rgb=jnp.asarray(pad_images([photos[i].rgb for i in part], height, width)),
-            weight=jnp.asarray(pad_images([photos[i].mask for i in part], height, width)) / 255,
+            rgb=jnp.asarray(pad_images([photo.rgb for photo in part], height, width)),
+            weight=jnp.asarray(pad_images([photo.mask for photo in part], height, width)) / 255,
         )
         for split, part in parts.items()
     }
-    files = {split: [frame.file for frame in part] for split, part in listing.frames.items()}
+    files = {split: [photo.frame.file for photo in part] for split, part in parts.items()}
+    names = {split: unique_names(paths) for split, paths in files.items()}
+    metadata = {
+        "downscale": reading.downscale,
+        "files": files,
+        "sizes": {split: [photo.size for photo in part] for split, part in parts.items()},
+        "applied_transform": transform,
+        "format": listing.format,
+        "notes": listing.notes,
+    }
+    if listing.times_nearer is not None:
+        metadata["times_nearer"] = listing.times_nearer
+    if reading.zoom > 1:
+        metadata["corners"] = [photo.corner for photo in parts["test"]]
+        names["test"] = [f"{name}_zoom{reading.zoom}" for name in names["test"]]
     return Scene(
         name=listing.folder.resolve().name,
         train=views["train"],
@@ -176,29 +196,24 @@ def _load(listing: Listing, downscale: int, half_pixel: bool, background: float)
         rgb=listing.rgb,
         near=near,
         far=far,
-        names={split: unique_names(paths) for split, paths in files.items()},
-        metadata={
-            "downscale": downscale,
-            "files": files,
-            "sizes": {split: [photos[i].size for i in part] for split, part in parts.items()},
-            "applied_transform": transform,
-            "format": listing.format,
-            "notes": listing.notes,
-            **({} if listing.times_nearer is None else {"times_nearer": listing.times_nearer}),
-        },
+        names=names,
+        metadata=metadata,
     )
 
 
 def _with_points(
     listing: Listing, photos: Sequence[Photo], camtoworld: np.ndarray, intrinsics: np.ndarray
 ) -> Listing:
-    """A listing without points, with those that its training photographs agree on."""
-    count = len(listing.frames["train"])  # held-out photographs tell nothing of what they show
+    """A listing without points, with those that its training photographs agree on.
+
+    `photos` are these, and the first of the poses and intrinsics are theirs.
+    """
+    count = len(photos)  # held-out photographs tell nothing of what they show
     if count < 2:
         return listing
     points, rgb = triangulate(
-        [photo.rgb for photo in photos[:count]],
-        [photo.mask for photo in photos[:count]],
+        [photo.rgb for photo in photos],
+        [photo.mask for photo in photos],
         camtoworld[:count],
         intrinsics[:count],
     )
@@ -213,19 +228,19 @@ def _with_points(
 
 
 def _check_masks(listing: Listing, photos: Sequence[Photo]) -> None:
-    """Complain of masks that leave nothing to train on; `train` comes first in `photos`."""
-    count = len(listing.frames["train"])
-    if not any(photo.mask.any() for photo in photos[:count]):
+    """Complain of masks that leave nothing of the training photographs."""
+    if not any(photo.mask.any() for photo in photos):
         raise SceneError(
-            f"{listing.folder}: the masks leave no pixel of the {count} training photographs: "
-            "white is what counts, so invert them if it is black in these."
+            f"{listing.folder}: the masks leave no pixel of the {len(photos)} training "
+            "photographs: white is what counts, so invert them if it is black in these."
         )
 
 
-def _warn_sizes(listing: Listing, frames: Sequence[Frame], photos: Sequence[Photo]) -> None:
+def _warn_sizes(listing: Listing, photos: Sequence[Photo]) -> None:
     """Accept images that were resized as a whole, and refuse other sizes than the file's."""
     resized = []
-    for frame, photo in zip(frames, photos, strict=True):
+    for photo in {(photo.frame.file, photo.frame.size): photo for photo in photos}.values():
+        frame = photo.frame
         (width, height), (w, h) = photo.stored_size, frame.size or photo.stored_size
         if (width, height) == (w, h):
             continue

@@ -61,7 +61,9 @@ class _Content(NamedTuple):
     points: tuple[np.ndarray, np.ndarray]
 
 
-def read_listing(path: pathlib.Path, *, format: str | None = None, split: str) -> Listing:
+def read_listing(
+    path: pathlib.Path, *, format: str | None = None, split: str, zoom: int = 1
+) -> Listing:
     """The photographs of a folder by split; `load_scene` documents formats and splits.
 
     Raises:
@@ -86,8 +88,9 @@ def read_listing(path: pathlib.Path, *, format: str | None = None, split: str) -
     )
     given = content.given or (split_of_file(folder, content.frames) if split == "given" else None)
     points, rgb = content.points
-    division = divide(called, content.frames, given, split, points)
-    warn_duplicates(folder, division.frames)
+    division = divide(called, content.frames, given, split, points, zoom)
+    if split != "zoom":  # whose close-ups are what training photographs do not show
+        warn_duplicates(folder, division.frames)
     frames, masked = attach_masks(folder, division.frames)
     keep = _seen_in_training(frames, len(points))
     notes = [note, *division.notes, *masked]

@@ -4,9 +4,10 @@ import concurrent.futures
 import functools
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from jaxcloseup.scenes.distortion import Remap, undistort, undistortion
@@ -18,54 +19,82 @@ from jaxcloseup.scenes.images import downscale_image, read_image, read_mask
 _MOST_AT_ONCE = 4  # each holds a few times its own size: 12 megapixels take some 100 MB
 
 
-class Photo(NamedTuple):
-    """A photograph after downscaling.
+class Reading(NamedTuple):
+    """How photographs are made ready.
 
     Attributes:
-      rgb: `[H, W, 3]` uint8.
-      mask: `[H, W]` uint8, 255 where it counts.
-      stored_size: the (width, height) that it had before.
+      downscale: whole number by which they shrink, by averaging areas.
+      zoom: whole number by which they shrink further; if not 1, the frames of `test` are close-ups,
+        parts of training photographs that do not.
+      background: grey level in [0, 1] behind transparent pixels.
+      half_pixel: whether the files count pixel centres at whole numbers.
     """
 
+    downscale: int = 1
+    zoom: int = 1
+    background: float = 1.0
+    half_pixel: bool = False
+
+
+class Photo(NamedTuple):
+    """A photograph after downscaling, or a part of it.
+
+    Attributes:
+      frame: what was read.
+      rgb: `[H, W, 3]` uint8.
+      mask: `[H, W]` uint8, 255 where it counts.
+      stored_size: the (width, height) that the photograph had before.
+      scaled: the (width, height) of the whole photograph at this scale; of one that is trimmed so
+        that a whole number of pixels become one, possibly fractions.
+      corner: (x, y) in it of the part's first pixel.
+    """
+
+    frame: Frame
     rgb: np.ndarray
     mask: np.ndarray
     stored_size: tuple[int, int]
+    scaled: tuple[float, float]
+    corner: tuple[int, int] = (0, 0)
 
     @property
     def size(self) -> tuple[int, int]:
         """Its (width, height)."""
         return self.rgb.shape[1], self.rgb.shape[0]
 
+    def intrinsics(self, half_pixel: bool) -> np.ndarray:
+        """fx, fy, cx, cy `[4]` in its pixels; `half_pixel` as `Reading` has it."""
+        whole = _resized_intrinsics(self.frame, self.stored_size, self.scaled, half_pixel)
+        return whole - np.array([0, 0, *self.corner])
 
-def read_photos(
-    frames: Sequence[Frame], *, downscale: int, background: float, half_pixel: bool
-) -> list[Photo]:
-    """The photographs of `frames`; at full size no more than `_MOST_AT_ONCE` are in memory.
 
-    Args:
-      frames: what to read.
-      downscale: whole number by which they shrink, by averaging areas.
-      background: grey level in [0, 1] behind transparent pixels.
-      half_pixel: whether the files count pixel centres at whole numbers.
+def read_photos(splits: Mapping[str, Sequence[Frame]], reading: Reading) -> dict[str, list[Photo]]:
+    """The photographs of each split; at full size no more than `_MOST_AT_ONCE` are in memory.
 
     Raises:
       SceneError: a photograph or its mask that cannot be read, or sizes that do not fit.
     """
+    # A close-up is cut while the photograph that it is a part of is there anyway.
+    parts = splits.get("test", ()) if reading.zoom > 1 else ()
+    closeups = {frame.file for frame in parts}
+    whole = {split: of for split, of in splits.items() if not closeups or split != "test"}
+    frames = [frame for members in whole.values() for frame in members]
     read = functools.partial(
         _read_photo,
-        downscale=downscale,
-        background=background,
-        half_pixel=half_pixel,
+        reading=reading,
         find_remap=_one_at_a_time(functools.lru_cache(maxsize=2)(undistortion)),  # mostly one lens
     )
     workers = min(_MOST_AT_ONCE, os.cpu_count() or 1)
     # OpenCV decodes without Python's lock.
     with concurrent.futures.ThreadPoolExecutor(workers) as pool:
-        return list(pool.map(read, frames))
+        made = list(pool.map(read, frames, [frame.file in closeups for frame in frames]))
+    first = iter(photos[0] for photos in made)
+    found = {split: [next(first) for _ in members] for split, members in whole.items()}
+    found["test" if closeups else ""] = [photo for photos in made for photo in photos[1:]]
+    return {split: found[split] for split in splits}
 
 
-def resized_intrinsics(
-    frame: Frame, stored: tuple[int, int], wanted: tuple[int, int], half_pixel: bool
+def _resized_intrinsics(
+    frame: Frame, stored: tuple[int, int], wanted: tuple[float, float], half_pixel: bool
 ) -> np.ndarray:
     """fx, fy, cx, cy in pixels of an image of size `wanted`, for a photograph of size `stored`."""
     size = frame.size or stored
@@ -86,19 +115,17 @@ def _one_at_a_time(function: Callable[..., Remap]) -> Callable[..., Remap]:
 
 
 def _read_photo(
-    frame: Frame,
-    *,
-    downscale: int,
-    background: float,
-    half_pixel: bool,
-    find_remap: Callable[..., Remap],
-) -> Photo:
-    rgb = read_image(frame.file, background=background)
-    height, width = rgb.shape[:2]
-    if downscale > min(width, height):
+    frame: Frame, closeup: bool, *, reading: Reading, find_remap: Callable[..., Remap]
+) -> list[Photo]:
+    """A photograph and, if `closeup`, the part of it with most detail at its full size."""
+    rgb = read_image(frame.file, background=reading.background)
+    stored = width, height = rgb.shape[1], rgb.shape[0]
+    if reading.downscale * reading.zoom > min(stored):
+        factors = f"downscale {reading.downscale}"
+        factors += f" times zoom {reading.zoom}" if reading.zoom > 1 else ""
         raise SceneError(
-            f"{frame.file} is {width} x {height} pixels, so that downscale {downscale} leaves "
-            "nothing of it: take a smaller one."
+            f"{frame.file} is {width} x {height} pixels, so that {factors} leaves nothing of it: "
+            "take a smaller one."
         )
     mask = None
     if frame.mask:
@@ -109,7 +136,7 @@ def _read_photo(
                 f"{width} x {height}: give them one size."
             )
     if frame.distortion:
-        intrinsics = resized_intrinsics(frame, (width, height), (width, height), half_pixel)
+        intrinsics = _resized_intrinsics(frame, stored, stored, reading.half_pixel)
         remap = find_remap(frame.distortion, tuple(intrinsics.tolist()), width, height)
         if not remap.inside.any():
             raise SceneError(
@@ -118,9 +145,44 @@ def _read_photo(
             )
         whole = np.full((height, width), 255, np.uint8) if mask is None else mask
         rgb, mask = undistort(rgb, whole, remap)
-    rgb = downscale_image(rgb, downscale)
+    rgb = downscale_image(rgb, reading.downscale)
     if mask is None:
         mask = np.full(rgb.shape[:2], 255, np.uint8)
     else:
-        mask = downscale_image(mask, downscale)
-    return Photo(rgb, mask, (width, height))
+        mask = downscale_image(mask, reading.downscale)
+    photo = Photo(frame, rgb, mask, stored, (rgb.shape[1], rgb.shape[0]))
+    return _zoomed(photo, reading.zoom, closeup) if reading.zoom > 1 else [photo]
+
+
+def _zoomed(photo: Photo, zoom: int, closeup: bool) -> list[Photo]:
+    """A photograph whose pixels are exactly `zoom` of those before, and perhaps a close-up.
+
+    Both have one size: of the photograph's `zoom` x `zoom` parts the close-up is the one with most
+    detail. A rest at the right and the bottom that fills no pixel is left out.
+    """
+    width, height = (side // zoom for side in photo.size)
+    rgb, mask = (image[: height * zoom, : width * zoom] for image in (photo.rgb, photo.mask))
+    small = photo._replace(
+        rgb=downscale_image(rgb, zoom),
+        mask=downscale_image(mask, zoom),
+        scaled=(photo.size[0] / zoom, photo.size[1] / zoom),
+    )
+    if not closeup:
+        return [small]
+    corners = [(x * width, y * height) for y in range(zoom) for x in range(zoom)]
+    parts = [np.s_[y : y + height, x : x + width] for x, y in corners]
+    detail = [_detail(rgb[part], mask[part]) for part in parts]
+    best = int(np.argmax(detail))
+    part = parts[best]
+    # Copied, for a view would keep the whole photograph in memory.
+    rgb, mask = rgb[part].copy(), mask[part].copy()
+    return [small, photo._replace(rgb=rgb, mask=mask, corner=corners[best])]
+
+
+def _detail(rgb: np.ndarray, mask: np.ndarray) -> float:
+    """The squared differences of neighbours that both count, of brightness, all together."""
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    weight = mask.astype(np.float32) / 255
+    across = np.diff(grey, axis=1) ** 2 * weight[:, 1:] * weight[:, :-1]
+    down = np.diff(grey, axis=0) ** 2 * weight[1:] * weight[:-1]
+    return float(across.sum() + down.sum())

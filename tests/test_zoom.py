@@ -1,0 +1,144 @@
+"""`split="zoom"`: photographs of a texture that is a function of the direction of rays."""
+
+import warnings
+
+import numpy as np
+import pytest
+from tiny_capture import frame, write_image, write_json
+
+from jaxcloseup.scenes import SceneError, load_scene
+
+
+SIZE = (47, 35)
+LENS = {"fx": 41.0, "fy": 43.0, "cx": 22.3, "cy": 18.6}
+
+
+def colours(directions):
+    """Of a world at infinity, [..., 3] in levels; about 30 of them lie between two pixels."""
+    x, y, z = np.moveaxis(directions / np.linalg.norm(directions, axis=-1, keepdims=True), -1, 0)
+    waves = [np.sin(19 * x + 3 * z), np.sin(17 * y + 5 * x), np.sin(13 * (x + y + z))]
+    return 127.5 + 120 * np.stack(waves, -1)
+
+
+def turned(angle):
+    """An OpenGL pose, turned about y and moved."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.array([[cos, 0, sin, angle], [0, 1, 0, 2], [-sin, 0, cos, 0], [0, 0, 0, 1]])
+
+
+def photograph(pose, lens=LENS, size=SIZE, first=0.5):
+    """What the capture's camera takes; `first` is the coordinate of the first pixel's centre."""
+    column, row = np.meshgrid(first + np.arange(size[0]), first + np.arange(size[1]))
+    x, y = (column - lens["cx"]) / lens["fx"], (row - lens["cy"]) / lens["fy"]
+    return np.rint(colours(np.stack([x, -y, -np.ones_like(x)], -1) @ pose[:3, :3].T)).astype("u1")
+
+
+def seen(cameras, index, offsets=((0.0, 0.0),)):
+    """Mean colours [H, W, 3] along loaded cameras' rays through pixel centres moved by offsets."""
+    pose = np.asarray(cameras.camtoworld[index], np.float64)
+    fx, fy, cx, cy = np.asarray(cameras.intrinsics[index], np.float64)
+    column, row = np.meshgrid(np.arange(cameras.width) + 0.5, np.arange(cameras.height) + 0.5)
+    ahead = [
+        np.stack([(column + x - cx) / fx, (row + y - cy) / fy, np.ones_like(row)], -1)
+        for x, y in offsets
+    ]
+    return np.mean([colours(directions @ pose[:, :3].T) for directions in ahead], 0)
+
+
+@pytest.fixture
+def capture(tmp_path):
+    """19 photographs; 3 are held out and of the rest the 1st and the 9th have close-ups."""
+    poses = [turned(0.05 * i) for i in range(19)]
+    frames = [
+        frame(f"images/{i:02d}.png", **LENS, transform_matrix=pose.tolist())
+        for i, pose in enumerate(poses)
+    ]
+    for entry, pose in zip(frames, poses, strict=True):
+        write_image(tmp_path / entry["file_path"], photograph(pose))
+    write_json(tmp_path / "transforms.json", frames)
+    return tmp_path
+
+
+@pytest.mark.parametrize("zoom", [2, 3, 4])
+def test_rays_of_all_pixels_meet_their_colours(capture, zoom):
+    """No part of a pixel is lost, whatever rests the sides leave."""
+    scene = load_scene(capture, split="zoom", zoom=zoom)
+    assert scene.names["test_far"] == ["00", "08", "16"] and len(scene.train) == 16
+    assert scene.names["test"] == [f"01_zoom{zoom}", f"10_zoom{zoom}"]
+    width, height = SIZE[0] // zoom, SIZE[1] // zoom
+    inner = (np.arange(zoom) + 0.5) / zoom - 0.5
+    inner = [(x, y) for y in inner for x in inner]
+    for views, offsets in ((scene.test, [(0, 0)]), (scene.train, inner), (scene.test_far, inner)):
+        assert views.rgb.shape[1:] == (height, width, 3) and (np.asarray(views.weight) == 1).all()
+        for index in range(len(views)):
+            expected = seen(views.cameras, index, offsets)
+            np.testing.assert_allclose(views.rgb[index], expected, atol=1.2)
+    focal = np.asarray(scene.train.cameras.intrinsics[0, :2])
+    np.testing.assert_allclose(scene.test.cameras.intrinsics[:, :2], [focal * zoom] * 2, rtol=1e-6)
+    np.testing.assert_array_equal(
+        scene.test.cameras.camtoworld, scene.train.cameras.camtoworld[np.array([0, 8])]
+    )
+    assert scene.metadata["times_nearer"] == (zoom, zoom)
+
+
+def test_zoom_comes_on_top_of_downscale(capture):
+    scene = load_scene(capture, split="zoom", zoom=3, downscale=2)
+    offsets = [(x, y) for y in (-0.25, 0.25) for x in (-0.25, 0.25)]
+    assert scene.train.rgb.shape[1:] == scene.test.rgb.shape[1:] == (5, 7, 3)
+    # 47 x 35 is no multiple of 2, so that pixels of 2.04 x 2.06 are averaged.
+    for index in range(2):
+        difference = np.asarray(scene.test.rgb[index]) - seen(scene.test.cameras, index, offsets)
+        assert np.abs(difference).mean() < 3
+    focal = np.asarray(scene.train.cameras.intrinsics[0, :2])
+    np.testing.assert_allclose(scene.test.cameras.intrinsics[0, :2], 3 * focal, rtol=1e-6)
+
+
+def test_a_photograph_is_decoded_once_and_nobody_is_warned(capture, monkeypatch):
+    from jaxcloseup.scenes import photographs
+
+    read, original = [], photographs.read_image
+    monkeypatch.setattr(
+        photographs, "read_image", lambda path, **kw: read.append(path.name) or original(path, **kw)
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scene = load_scene(capture, split="zoom")
+    assert sorted(read) == [f"{i:02d}.png" for i in range(19)]
+    assert scene.metadata["files"]["test"][0] == scene.metadata["files"]["train"][0]
+    note = scene.metadata["notes"][1]
+    assert "16 training photographs are reduced 4 times more" in note
+    assert "every 8th of them, not reduced, 2 in all, is test: 4 times as fine" in note
+
+
+def test_the_close_up_is_where_most_detail_counts(tmp_path):
+    rng = np.random.default_rng(0)
+    image = np.full((24, 32, 3), 90, np.uint8)
+    image[12:18, 8:16] = rng.integers(0, 256, (6, 8, 3))
+    image[6:12, 24:32] = rng.integers(60, 120, (6, 8, 3))
+    write_image(tmp_path / "images/a.png", image)
+    write_json(tmp_path / "transforms.json", [frame("images/a.png")])
+    scene = load_scene(tmp_path, split="zoom")
+    assert scene.metadata["corners"] == [(8, 12)] and scene.test_far is None
+    np.testing.assert_array_equal(scene.test.rgb[0], image[12:18, 8:16])
+    mask = np.full((24, 32), 255, np.uint8)
+    mask[12:18, 8:16] = 0
+    mask[8, 26] = 0
+    write_image(tmp_path / "masks/a.png", mask)
+    scene = load_scene(tmp_path, split="zoom")
+    assert scene.metadata["corners"] == [(24, 6)]
+    np.testing.assert_array_equal(scene.test.weight[0] * 255, mask[6:12, 24:32])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"zoom": 4}, "zoom is of split zoom, and split is given: leave zoom out"),
+        ({"split": "zoom", "zoom": 1}, "zoom must be a whole number of at least 2, got 1"),
+        ({"split": "zoom", "zoom": 2.5}, "zoom must be a whole number of at least 2, got 2.5"),
+        ({"split": "zoom", "zoom": True}, "zoom must be a whole number of at least 2, got True"),
+        ({"split": "zoom", "downscale": 9}, r"47 x 35 pixels, so that downscale 9 times zoom 4 le"),
+    ],
+)
+def test_wrong_zooms(capture, options, message):
+    with pytest.raises(SceneError, match=message):
+        load_scene(capture, **options)
