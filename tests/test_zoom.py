@@ -96,9 +96,12 @@ def test_zoom_comes_on_top_of_downscale(capture):
 def test_a_photograph_is_decoded_once_and_nobody_is_warned(capture, monkeypatch):
     from jaxcloseup.scenes import photographs
 
-    read, original = [], photographs.read_image
+    read, decode = [], photographs.read_image
+    monkeypatch.setenv("XDG_CACHE_HOME", str(capture / "cache"))
     monkeypatch.setattr(
-        photographs, "read_image", lambda path, **kw: read.append(path.name) or original(path, **kw)
+        photographs,
+        "read_image",
+        lambda path, *a, **k: read.append(path.name) or decode(path, *a, **k),
     )
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -65,7 +65,9 @@ def load_scene(
 
     Args:
       name_or_path: one of `PROCEDURAL_SCENES`, or a folder; `./table` is the folder of that name.
-      downscale: whole number by which photographs shrink, by averaging areas.
+      downscale: whole number by which photographs shrink, by averaging areas. For 2, 4 and 8 a
+        folder `images_2`, ... beside `images` is taken as it is, if all of them are in it. What is
+        reduced here is kept in `$XDG_CACHE_HOME/jaxcloseup/photographs`.
       half_pixel: the files count pixel centres at whole numbers, as the paper's do.
       background: grey level in [0, 1] behind transparent pixels.
       format: read `transforms`, `colmap` or `llff` and nothing else; None: the first that is there.
@@ -122,7 +124,7 @@ def load_scene(
     try:
         if not path.is_dir():
             raise SceneError(f"{path} is not a folder: give the one that holds the capture.")
-        listing = read_listing(path, format=format, split=split, zoom=zoom)
+        listing = read_listing(path, format=format, split=split, zoom=zoom, downscale=downscale)
     except OSError as error:  # of folders; what reads a file says more
         raise SceneError(
             f"{error.filename or path!s:.200} cannot be read ({error.strerror}): permit reading "
@@ -241,6 +243,8 @@ def _warn_sizes(listing: Listing, photos: Sequence[Photo]) -> None:
     resized = []
     for photo in {(photo.frame.file, photo.frame.size): photo for photo in photos}.values():
         frame = photo.frame
+        if frame.reduced:
+            continue
         (width, height), (w, h) = photo.stored_size, frame.size or photo.stored_size
         if (width, height) == (w, h):
             continue

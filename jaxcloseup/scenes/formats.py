@@ -11,6 +11,7 @@ from jaxcloseup.scenes.frames import Frame
 from jaxcloseup.scenes.llff import read_llff
 from jaxcloseup.scenes.masks import attach_masks
 from jaxcloseup.scenes.points import read_ply_points
+from jaxcloseup.scenes.reduced import attach_reduced
 from jaxcloseup.scenes.splits import divide, listed_split, split_of_file, warn_duplicates
 from jaxcloseup.scenes.transforms import read_transforms
 
@@ -62,9 +63,9 @@ class _Content(NamedTuple):
 
 
 def read_listing(
-    path: pathlib.Path, *, format: str | None = None, split: str, zoom: int = 1
+    path: pathlib.Path, *, format: str | None = None, split: str, zoom: int = 1, downscale: int = 1
 ) -> Listing:
-    """The photographs of a folder by split; `load_scene` documents formats and splits.
+    """The photographs of a folder by split; `load_scene` documents the arguments.
 
     Raises:
       SceneError: no known file in the folder, or something wrong in one.
@@ -92,8 +93,9 @@ def read_listing(
     if split != "zoom":  # whose close-ups are what training photographs do not show
         warn_duplicates(folder, division.frames)
     frames, masked = attach_masks(folder, division.frames)
+    frames, reduced = attach_reduced(called, frames, downscale)
     keep = _seen_in_training(frames, len(points))
-    notes = [note, *division.notes, *masked]
+    notes = [note, *division.notes, *masked, *reduced]
     if not keep.all():
         notes.append(
             f"{called}: {np.sum(~keep)} of {len(keep)} points, which fewer than two training "

@@ -41,7 +41,7 @@ def attach_masks(
     holders = sorted({holder for found in places.values() for holder, _ in found})
     if not holders:
         return splits, ()
-    pictures = functools.cache(_pictures)  # folders are listed once, however many photographs
+    pictures = functools.cache(list_pictures)  # folders are listed once, however many photographs
     found = {}
     for frame in waiting:
         masks = (_find(pictures(place), frame.file) for _, place in places[frame.file])
@@ -82,7 +82,8 @@ def _places(
                 yield root / FOLDER, root.joinpath(FOLDER, *inner[1:])
 
 
-def _pictures(folder: pathlib.Path) -> tuple[pathlib.Path, ...]:
+def list_pictures(folder: pathlib.Path) -> tuple[pathlib.Path, ...]:
+    """The pictures in a folder, sorted; of one that is not there, none."""
     try:
         return tuple(
             sorted(path for path in folder.iterdir() if is_picture(path)) if folder.is_dir() else ()

@@ -13,7 +13,8 @@ import numpy as np
 from jaxcloseup.scenes.distortion import Remap, undistort, undistortion
 from jaxcloseup.scenes.errors import SceneError
 from jaxcloseup.scenes.frames import Frame, frame_intrinsics
-from jaxcloseup.scenes.images import downscale_image, read_image, read_mask
+from jaxcloseup.scenes.images import downscale_image, read_file, read_image, read_mask
+from jaxcloseup.scenes.photo_cache import content_hash, kept
 
 
 _MOST_AT_ONCE = 4  # each holds a few times its own size: 12 megapixels take some 100 MB
@@ -118,18 +119,65 @@ def _read_photo(
     frame: Frame, closeup: bool, *, reading: Reading, find_remap: Callable[..., Remap]
 ) -> list[Photo]:
     """A photograph and, if `closeup`, the part of it with most detail at its full size."""
-    rgb = read_image(frame.file, background=reading.background)
+    picture = read_file(frame.reduced or frame.file)
+    mask = read_file(frame.mask) if frame.mask else None
+    make = functools.partial(_make_photo, frame, closeup, picture, mask, reading, find_remap)
+    if frame.reduced or reading.downscale * reading.zoom == 1:
+        return make()
+    # All that the result depends on.
+    key = ["area", cv2.__version__, closeup, reading._replace(half_pixel=False)]
+    key += [content_hash(picture), content_hash(mask), frame.size, frame.distortion]
+    if frame.distortion:
+        size = frame.size or (1, 1)
+        key += frame_intrinsics(frame, *size, half_pixel=reading.half_pixel).tolist()
+    arrays = kept(repr(key), lambda: _pack(make()))
+    return _unpack(frame, arrays)
+
+
+def _pack(photos: Sequence[Photo]) -> dict[str, np.ndarray]:
+    return {
+        f"{name}{i}": np.asarray(value)
+        for i, photo in enumerate(photos)
+        for name, value in photo._asdict().items()
+        if name != "frame"
+    }
+
+
+def _unpack(frame: Frame, arrays: dict[str, np.ndarray]) -> list[Photo]:
+    names = Photo._fields[1:]
+    photos = []
+    for i in range(len(arrays) // len(names)):
+        rgb, mask, *pairs = (arrays[f"{name}{i}"] for name in names)
+        photos.append(Photo(frame, rgb, mask, *(tuple(pair.tolist()) for pair in pairs)))
+    return photos
+
+
+def _make_photo(
+    frame: Frame,
+    closeup: bool,
+    picture: np.ndarray,
+    mask_picture: np.ndarray | None,
+    reading: Reading,
+    find_remap: Callable[..., Remap],
+) -> list[Photo]:
+    rgb = read_image(frame.reduced or frame.file, background=reading.background, data=picture)
     stored = width, height = rgb.shape[1], rgb.shape[0]
-    if reading.downscale * reading.zoom > min(stored):
-        factors = f"downscale {reading.downscale}"
+    downscale = reading.downscale
+    if frame.reduced:
+        _check_reduced(frame, stored, downscale)
+        downscale = 1
+    if downscale * reading.zoom > min(stored):
+        factors = f"downscale {downscale}"
         factors += f" times zoom {reading.zoom}" if reading.zoom > 1 else ""
         raise SceneError(
             f"{frame.file} is {width} x {height} pixels, so that {factors} leaves nothing of it: "
             "take a smaller one."
         )
     mask = None
-    if frame.mask:
-        mask = read_mask(frame.mask)
+    if mask_picture is not None:
+        mask = read_mask(frame.mask, data=mask_picture)
+        if frame.reduced and mask.shape[::-1] == frame.size:
+            mask = cv2.resize(mask, stored, interpolation=cv2.INTER_AREA)
         if mask.shape != (height, width):
             raise SceneError(
                 f"{frame.mask} is {mask.shape[1]} x {mask.shape[0]} pixels and its photograph "
@@ -145,13 +193,23 @@ def _read_photo(
             )
         whole = np.full((height, width), 255, np.uint8) if mask is None else mask
         rgb, mask = undistort(rgb, whole, remap)
-    rgb = downscale_image(rgb, reading.downscale)
+    rgb = downscale_image(rgb, downscale)
     if mask is None:
         mask = np.full(rgb.shape[:2], 255, np.uint8)
     else:
-        mask = downscale_image(mask, reading.downscale)
+        mask = downscale_image(mask, downscale)
     photo = Photo(frame, rgb, mask, stored, (rgb.shape[1], rgb.shape[0]))
     return _zoomed(photo, reading.zoom, closeup) if reading.zoom > 1 else [photo]
+
+
+def _check_reduced(frame: Frame, size: tuple[int, int], downscale: int) -> None:
+    """Complain of a size that no way of rounding gives."""
+    if any(abs(side - whole / downscale) > 1 for side, whole in zip(size, frame.size, strict=True)):
+        raise SceneError(
+            f"{frame.reduced} is {size[0]} x {size[1]} pixels, which is not {frame.size[0]} x "
+            f"{frame.size[1]} reduced {downscale} times: make it again, or name its folder "
+            "otherwise to have photographs reduced here."
+        )
 
 
 def _zoomed(photo: Photo, zoom: int, closeup: bool) -> list[Photo]:
