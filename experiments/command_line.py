@@ -13,6 +13,7 @@ from experiments.output_dir import check_unused
 from experiments.presets import PRESETS, Preset, with_classic_density
 from jaxcloseup.scenes import Scene, load_scene
 from jaxcloseup.scenes.formats import FORMATS
+from jaxcloseup.scenes.photographs import ALPHA_MODES
 from jaxcloseup.scenes.splits import SPLITS
 
 
@@ -80,7 +81,14 @@ flags.DEFINE_integer(
     "of --split=zoom: how many times finer than the training photographs test is; default: 4",
     lower_bound=2,
 )
-_OF_CAPTURE = ("format", "split", "zoom")
+flags.DEFINE_bool("invert_masks", False, "masks are white where photographs are to be ignored")
+flags.DEFINE_enum(
+    "alpha_mode",
+    "blend",
+    list(ALPHA_MODES),
+    "transparent pixels of photographs show a white background, or weigh as a mask does",
+)
+_OF_CAPTURE = ("format", "split", "zoom", "invert_masks", "alpha_mode")
 _OF_METHOD = {"nerf": ("compute_dtype",), "surfels": ("density", "colour_ridge")}
 
 

@@ -2,6 +2,7 @@
 
 import warnings
 
+import jax
 import numpy as np
 import pytest
 from tiny_capture import frame, write_image, write_json
@@ -35,8 +36,8 @@ def photograph(pose, lens=LENS, size=SIZE, first=0.5):
 
 def seen(cameras, index, offsets=((0.0, 0.0),)):
     """Mean colours [H, W, 3] along loaded cameras' rays through pixel centres moved by offsets."""
-    pose = np.asarray(cameras.camtoworld[index], np.float64)
-    fx, fy, cx, cy = np.asarray(cameras.intrinsics[index], np.float64)
+    pose = np.asarray(cameras.camtoworld, np.float64)[index]
+    fx, fy, cx, cy = np.asarray(cameras.intrinsics, np.float64)[index]
     column, row = np.meshgrid(np.arange(cameras.width) + 0.5, np.arange(cameras.height) + 0.5)
     ahead = [
         np.stack([(column + x - cx) / fx, (row + y - cy) / fy, np.ones_like(row)], -1)
@@ -70,14 +71,13 @@ def test_rays_of_all_pixels_meet_their_colours(capture, zoom):
     inner = [(x, y) for y in inner for x in inner]
     for views, offsets in ((scene.test, [(0, 0)]), (scene.train, inner), (scene.test_far, inner)):
         assert views.rgb.shape[1:] == (height, width, 3) and (np.asarray(views.weight) == 1).all()
-        for index in range(len(views)):
-            expected = seen(views.cameras, index, offsets)
-            np.testing.assert_allclose(views.rgb[index], expected, atol=1.2)
-    focal = np.asarray(scene.train.cameras.intrinsics[0, :2])
-    np.testing.assert_allclose(scene.test.cameras.intrinsics[:, :2], [focal * zoom] * 2, rtol=1e-6)
-    np.testing.assert_array_equal(
-        scene.test.cameras.camtoworld, scene.train.cameras.camtoworld[np.array([0, 8])]
+        for index, rgb in enumerate(np.asarray(views.rgb)):
+            np.testing.assert_allclose(rgb, seen(views.cameras, index, offsets), atol=1.2)
+    train, test = (jax.tree.map(np.asarray, views.cameras) for views in (scene.train, scene.test))
+    np.testing.assert_allclose(
+        test.intrinsics[:, :2], zoom * train.intrinsics[[0, 8], :2], rtol=1e-6
     )
+    np.testing.assert_array_equal(test.camtoworld, train.camtoworld[[0, 8]])
     assert scene.metadata["times_nearer"] == (zoom, zoom)
 
 
@@ -86,11 +86,12 @@ def test_zoom_comes_on_top_of_downscale(capture):
     offsets = [(x, y) for y in (-0.25, 0.25) for x in (-0.25, 0.25)]
     assert scene.train.rgb.shape[1:] == scene.test.rgb.shape[1:] == (5, 7, 3)
     # 47 x 35 is no multiple of 2, so that pixels of 2.04 x 2.06 are averaged.
-    for index in range(2):
-        difference = np.asarray(scene.test.rgb[index]) - seen(scene.test.cameras, index, offsets)
-        assert np.abs(difference).mean() < 3
-    focal = np.asarray(scene.train.cameras.intrinsics[0, :2])
-    np.testing.assert_allclose(scene.test.cameras.intrinsics[0, :2], 3 * focal, rtol=1e-6)
+    for index, rgb in enumerate(np.asarray(scene.test.rgb)):
+        assert np.abs(rgb - seen(scene.test.cameras, index, offsets)).mean() < 3
+    focal = np.asarray(scene.train.cameras.intrinsics)[0, :2]
+    np.testing.assert_allclose(
+        np.asarray(scene.test.cameras.intrinsics)[0, :2], 3 * focal, rtol=1e-6
+    )
 
 
 def test_a_photograph_is_decoded_once_and_nobody_is_warned(capture, monkeypatch):

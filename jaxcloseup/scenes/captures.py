@@ -11,11 +11,12 @@ import numpy as np
 from jaxcloseup.batch import Views
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.scenes.bounds import near_far_from_cameras, near_far_from_points
-from jaxcloseup.scenes.errors import ImageSizeWarning, NearFarWarning, SceneError
+from jaxcloseup.scenes.checks import check_weights, warn_sizes
+from jaxcloseup.scenes.errors import NearFarWarning, SceneError
 from jaxcloseup.scenes.fields import affine_transform, number
 from jaxcloseup.scenes.formats import FORMATS, Listing, read_listing
 from jaxcloseup.scenes.images import pad_images
-from jaxcloseup.scenes.photographs import Photo, Reading, read_photos
+from jaxcloseup.scenes.photographs import ALPHA_MODES, Photo, Reading, read_photos
 from jaxcloseup.scenes.scene import Scene
 from jaxcloseup.scenes.splits import SPLITS, unique_names
 from jaxcloseup.scenes.triangulation import triangulate
@@ -36,6 +37,8 @@ def load_scene(
     format: str | None = None,
     split: str = "given",
     zoom: int | None = None,
+    invert_masks: bool = False,
+    alpha_mode: str = "blend",
 ) -> Scene:
     """A built-in scene by its name, or a capture from its folder.
 
@@ -57,11 +60,13 @@ def load_scene(
     size and focal lengths; pixels that they do not show have weight 0. Photographs of several
     sizes are padded at the right and the bottom with pixels of weight 0, and each camera keeps its
     own intrinsics. A mask weighs their pixels: white counts, black does not. It is a frame's
-    `mask_path`, or lies in `masks` beside the folder of the photographs under the same name
-    (`scenes/masks.py`). Initial points are the COLMAP model's, but for those that fewer than two
-    training photographs see, or come from `ply_file_path`, else from `points3d.ply`, else are
-    triangulated from features that neighbouring training photographs share. `near` and `far` are
-    the file's, or are estimated, with a warning unless a COLMAP model's points give them.
+    `mask_path`, or lies in `masks` beside the folder of the photographs under the same name, or
+    beside its photograph as `a.jpg.png` or `a.mask.png` (`scenes/masks.py`).
+
+    Initial points are the COLMAP model's, but for those that fewer than two training photographs
+    see, or come from `ply_file_path`, else from `points3d.ply`, else are triangulated from features
+    that neighbouring training photographs share. `near` and `far` are the file's, or are estimated,
+    with a warning unless a COLMAP model's points give them.
 
     Args:
       name_or_path: one of `PROCEDURAL_SCENES`, or a folder; `./table` is the folder of that name.
@@ -79,6 +84,9 @@ def load_scene(
         `test`: exactly `zoom` times as fine, from the same place. It is that of `zoom` x `zoom`
         with most detail: squared differences of neighbouring pixels that count.
       zoom: whole number of at least 2, of split `zoom` alone; None: 4.
+      invert_masks: white is ignored and black counts.
+      alpha_mode: `blend`: transparent pixels show the background; `mask`: they weigh as much as
+        they are opaque, and their colours are those in the file.
 
     Returns:
       The scene. For a folder, `metadata` holds `path`, `downscale`, `files` and `sizes` (the path
@@ -105,15 +113,26 @@ def load_scene(
     if zoom is not None and (isinstance(zoom, bool) or not isinstance(zoom, int) or zoom < 2):
         raise SceneError(f"zoom must be a whole number of at least 2, got {zoom!r}.")
     zoom = (zoom or _ZOOM) if split == "zoom" else 1
+    if alpha_mode not in ALPHA_MODES:
+        raise SceneError(
+            f"alpha_mode {alpha_mode!r} is unknown: choose one of {', '.join(ALPHA_MODES)}."
+        )
+    reading = Reading(downscale, zoom, background, half_pixel, alpha_mode, invert_masks)
     path = pathlib.Path(name_or_path)
     if len(path.parts) == 1 and str(name_or_path) == path.name:
         from jaxcloseup.scenes.procedural import PROCEDURAL_SCENES, procedural_scene
 
         if path.name in PROCEDURAL_SCENES:
-            if split != "given" or format is not None:
+            of_captures = {
+                "split": split != "given",
+                "format": format is not None,
+                "invert_masks": invert_masks,
+                "alpha_mode": alpha_mode != "blend",
+            }
+            if given := [name for name, chosen in of_captures.items() if chosen]:
                 raise SceneError(
-                    f"{path} is a built-in scene with a split of its own: leave out "
-                    f"{'split' if split != 'given' else 'format'}."
+                    f"{path} is a built-in scene with a split of its own and no masks: leave out "
+                    f"{given[0]}."
                 )
             return procedural_scene(path.name, downscale=downscale)
         if not path.exists():
@@ -132,7 +151,7 @@ def load_scene(
         ) from error
     for note in listing.notes:
         _log.info(note)
-    scene = _load(listing, Reading(downscale, zoom, background, half_pixel))
+    scene = _load(listing, reading)
     scene.metadata.update(path=path, split=split)
     return scene
 
@@ -149,8 +168,8 @@ def _load(listing: Listing, reading: Reading) -> Scene:
 
     parts = read_photos(listing.frames, reading)
     photos = [photo for members in parts.values() for photo in members]
-    _check_masks(listing, parts["train"])
-    _warn_sizes(listing, photos)
+    check_weights(listing.folder, listing.frames, photos, reading)
+    warn_sizes(listing.file.parent, photos)
     intrinsics = np.stack([photo.intrinsics(reading.half_pixel) for photo in photos])
     camtoworld = np.stack([photo.frame.camtoworld for photo in photos])
     sizes = np.array([photo.size for photo in photos])
@@ -227,43 +246,6 @@ def _with_points(
     )
     _log.info(note)
     return listing._replace(points=points, rgb=rgb, notes=(*listing.notes, note))
-
-
-def _check_masks(listing: Listing, photos: Sequence[Photo]) -> None:
-    """Complain of masks that leave nothing of the training photographs."""
-    if not any(photo.mask.any() for photo in photos):
-        raise SceneError(
-            f"{listing.folder}: the masks leave no pixel of the {len(photos)} training "
-            "photographs: white is what counts, so invert them if it is black in these."
-        )
-
-
-def _warn_sizes(listing: Listing, photos: Sequence[Photo]) -> None:
-    """Accept images that were resized as a whole, and refuse other sizes than the file's."""
-    resized = []
-    for photo in {(photo.frame.file, photo.frame.size): photo for photo in photos}.values():
-        frame = photo.frame
-        if frame.reduced:
-            continue
-        (width, height), (w, h) = photo.stored_size, frame.size or photo.stored_size
-        if (width, height) == (w, h):
-            continue
-        # Resizing rounds each side to whole pixels: its aspect agrees to within one of them.
-        if abs(width * h / w - height) > 1 and abs(height * w / h - width) > 1:
-            swapped = (w, h) == (height, width)
-            turned = ", turned as by an EXIF orientation" if swapped else ""
-            raise SceneError(
-                f"{frame.label}: the image is {width} x {height} pixels, but w and h are {w} x {h}"
-                f"{turned}: restore the image that the camera was solved for, or correct w and h."
-            )
-        resized.append(f"{frame.listed} is {width} x {height} and not {w} x {h}")
-    if resized:
-        more = f" and {len(resized) - 1} more" if len(resized) > 1 else ""
-        warnings.warn(
-            f"{listing.file.parent}: {resized[0]}{more}; intrinsics were scaled to the images.",
-            ImageSizeWarning,
-            stacklevel=2,
-        )
 
 
 def _near_far(

@@ -23,28 +23,39 @@ def read_file(path: pathlib.Path) -> np.ndarray:
 
 
 def read_image(
-    path: pathlib.Path, *, background: float = 1.0, data: np.ndarray | None = None
+    path: pathlib.Path,
+    *,
+    background: float = 1.0,
+    keep_alpha: bool = False,
+    data: np.ndarray | None = None,
 ) -> np.ndarray:
     """A photograph as uint8 `[H, W, 3]`, red first.
 
     Grey becomes RGB, 16 bits become 8, and transparency is composited over the grey level
     `background` in [0, 1]. Pixels stay as they are stored: an EXIF orientation is not applied,
-    because cameras are solved for, and transforms refer to, the stored pixels. `data` are the
-    file's bytes where they have been read already.
+    because cameras are solved for, and transforms refer to, the stored pixels.
+
+    Args:
+      path: of the file.
+      background: behind transparent pixels.
+      keep_alpha: composite over black, and give alpha as a fourth channel if the file has one.
+      data: the file's bytes where they have been read already.
 
     Raises:
       SceneError: the file is missing, truncated, damaged or not a picture of 8 or 16 bits.
     """
-    image = _decode(path, read_file(path) if data is None else data)
+    image, alpha = _decode(path, read_file(path) if data is None else data), None
     if image.ndim == 2:
         image = image[..., None]
     if image.shape[-1] in (2, 4):
-        alpha = image[..., -1:].astype(np.float32) / 255
-        image = np.rint(image[..., :-1] * alpha + 255 * background * (1 - alpha)).astype(np.uint8)
+        image, alpha = image[..., :-1], image[..., -1:]
+        share, behind = alpha.astype(np.float32) / 255, 0.0 if keep_alpha else 255 * background
+        image = np.rint(image * share + behind * (1 - share)).astype(np.uint8)
     # OpenCV stores blue first.
-    return (
-        np.repeat(image, 3, -1) if image.shape[-1] == 1 else np.ascontiguousarray(image[..., ::-1])
-    )
+    image = np.repeat(image, 3, -1) if image.shape[-1] == 1 else image[..., ::-1]
+    if keep_alpha and alpha is not None:
+        image = np.concatenate([image, alpha], -1)
+    return np.ascontiguousarray(image)
 
 
 def read_mask(path: pathlib.Path, *, data: np.ndarray | None = None) -> np.ndarray:

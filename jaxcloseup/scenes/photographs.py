@@ -17,6 +17,7 @@ from jaxcloseup.scenes.images import downscale_image, read_file, read_image, rea
 from jaxcloseup.scenes.photo_cache import content_hash, kept
 
 
+ALPHA_MODES = ("blend", "mask")
 _MOST_AT_ONCE = 4  # each holds a few times its own size: 12 megapixels take some 100 MB
 
 
@@ -29,12 +30,16 @@ class Reading(NamedTuple):
         parts of training photographs that do not.
       background: grey level in [0, 1] behind transparent pixels.
       half_pixel: whether the files count pixel centres at whole numbers.
+      alpha_mode: one of `ALPHA_MODES`: transparent pixels show the background, or weigh less.
+      invert_masks: whether white is what masks ignore.
     """
 
     downscale: int = 1
     zoom: int = 1
     background: float = 1.0
     half_pixel: bool = False
+    alpha_mode: str = "blend"
+    invert_masks: bool = False
 
 
 class Photo(NamedTuple):
@@ -160,7 +165,9 @@ def _make_photo(
     reading: Reading,
     find_remap: Callable[..., Remap],
 ) -> list[Photo]:
-    rgb = read_image(frame.reduced or frame.file, background=reading.background, data=picture)
+    file = frame.reduced or frame.file
+    keep_alpha = reading.alpha_mode == "mask"
+    rgb = read_image(file, background=reading.background, keep_alpha=keep_alpha, data=picture)
     stored = width, height = rgb.shape[1], rgb.shape[0]
     downscale = reading.downscale
     if frame.reduced:
@@ -170,12 +177,13 @@ def _make_photo(
         factors = f"downscale {downscale}"
         factors += f" times zoom {reading.zoom}" if reading.zoom > 1 else ""
         raise SceneError(
-            f"{frame.file} is {width} x {height} pixels, so that {factors} leaves nothing of it: "
+            f"{file} is {width} x {height} pixels, so that {factors} leaves nothing of it: "
             "take a smaller one."
         )
     mask = None
     if mask_picture is not None:
         mask = read_mask(frame.mask, data=mask_picture)
+        mask = 255 - mask if reading.invert_masks else mask
         if frame.reduced and mask.shape[::-1] == frame.size:
             mask = cv2.resize(mask, stored, interpolation=cv2.INTER_AREA)
         if mask.shape != (height, width):
@@ -199,7 +207,18 @@ def _make_photo(
     else:
         mask = downscale_image(mask, downscale)
     photo = Photo(frame, rgb, mask, stored, (rgb.shape[1], rgb.shape[0]))
-    return _zoomed(photo, reading.zoom, closeup) if reading.zoom > 1 else [photo]
+    photos = _zoomed(photo, reading.zoom, closeup) if reading.zoom > 1 else [photo]
+    return [_without_alpha(photo) for photo in photos] if rgb.shape[-1] == 4 else photos
+
+
+def _without_alpha(photo: Photo) -> Photo:
+    """A photograph `[H, W, 4]`, drawn over black, as its own colours and what they weigh."""
+    alpha = photo.rgb[..., 3].astype(np.float32) / 255
+    own = photo.rgb[..., :3] / np.maximum(alpha, 1 / 255)[..., None]
+    return photo._replace(
+        rgb=np.rint(np.minimum(own, 255)).astype(np.uint8),
+        mask=np.rint(photo.mask * alpha).astype(np.uint8),
+    )
 
 
 def _check_reduced(frame: Frame, size: tuple[int, int], downscale: int) -> None:
@@ -239,8 +258,10 @@ def _zoomed(photo: Photo, zoom: int, closeup: bool) -> list[Photo]:
 
 def _detail(rgb: np.ndarray, mask: np.ndarray) -> float:
     """The squared differences of neighbours that both count, of brightness, all together."""
-    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    grey = cv2.cvtColor(rgb[..., :3], cv2.COLOR_RGB2GRAY).astype(np.float32)
     weight = mask.astype(np.float32) / 255
+    if rgb.shape[-1] == 4:
+        weight *= rgb[..., 3] / np.float32(255)
     across = np.diff(grey, axis=1) ** 2 * weight[:, 1:] * weight[:, :-1]
     down = np.diff(grey, axis=0) ** 2 * weight[1:] * weight[:-1]
     return float(across.sum() + down.sum())
