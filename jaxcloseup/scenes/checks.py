@@ -27,7 +27,9 @@ def check_weights(
         raise SceneError(f"{folder}: no photograph is transparent anywhere: leave out alpha_mode.")
     if not any(mask.any() for mask in masks):
         advice = "white is what counts, so invert them with invert_masks if it is black in these"
-        if reading.invert_masks:
+        if not any(frame.mask for frame in frames["train"]):
+            advice = "opaque pixels are what counts, so leave out alpha_mode"
+        elif reading.invert_masks:
             advice = "black is what counts, so leave out invert_masks if it is white in these"
         raise SceneError(
             f"{folder}: the masks leave no pixel of the {len(masks)} training photographs: "
