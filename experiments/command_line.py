@@ -13,6 +13,7 @@ from experiments.output_dir import check_unused
 from experiments.presets import PRESETS, Preset, with_classic_density
 from jaxcloseup.scenes import Scene, load_scene
 from jaxcloseup.scenes.formats import FORMATS
+from jaxcloseup.scenes.photographs import ALPHA_MODES
 from jaxcloseup.scenes.splits import SPLITS
 
 
@@ -70,9 +71,24 @@ flags.DEFINE_enum(
     "split",
     "given",
     list(SPLITS),
-    "photographs that are held out: as the capture says; every 8th by name, as test_far; or the "
-    "closest tenth, as test, and of the rest every 8th",
+    "photographs that are held out: as the capture says; every 8th by name, as test_far; the "
+    "closest tenth, as test, and of the rest every 8th; zoom: every 8th, as test_far, while the "
+    "rest is reduced --zoom times more, and parts of some of these that are not reduced, as test",
 )
+flags.DEFINE_integer(
+    "zoom",
+    None,
+    "of --split=zoom: how many times finer than the training photographs test is; default: 4",
+    lower_bound=2,
+)
+flags.DEFINE_bool("invert_masks", False, "masks are white where photographs are to be ignored")
+flags.DEFINE_enum(
+    "alpha_mode",
+    "blend",
+    list(ALPHA_MODES),
+    "transparent pixels of photographs show a white background, or weigh as a mask does",
+)
+_OF_CAPTURE = ("format", "split", "zoom", "invert_masks", "alpha_mode")
 _OF_METHOD = {"nerf": ("compute_dtype",), "surfels": ("density", "colour_ridge")}
 
 
@@ -107,14 +123,18 @@ def preset_from_flags() -> Preset:
 def names_from_flags() -> dict[str, str]:
     """What tells runs apart beside their configuration, for reports and checkpoints."""
     names = {"method": FLAGS.method, "preset": FLAGS.preset}
-    chosen = {key: FLAGS[key] for key in ("format", "split")}
-    return names | {key: flag.value for key, flag in chosen.items() if flag.value != flag.default}
+    return names | _given(*_OF_CAPTURE)
 
 
 def load_options_from_flags(preset: Preset) -> dict[str, Any]:
     """What `load_scene` is given beside a scene's name."""
     options = {name: FLAGS[name].value for name in ("half_pixel", "format", "split")}
-    return {"downscale": preset.downscale, **options}
+    return {"downscale": preset.downscale, **options, **_given(*_OF_CAPTURE)}
+
+
+def _given(*names: str) -> dict[str, Any]:
+    """The flags of these that are not at their defaults."""
+    return {name: FLAGS[name].value for name in names if FLAGS[name].value != FLAGS[name].default}
 
 
 def load(name: str, options: Mapping[str, Any]) -> Scene:

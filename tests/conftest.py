@@ -20,9 +20,12 @@ _CACHE = "JAXCLOSEUP_TEST_CACHE"
 
 
 def pytest_configure(config):
-    """Keep compiled programs for all processes of this run: many tests need the same ones."""
+    """Keep compiled programs for all processes of this run: many tests need the same ones.
+
+    What else is kept between runs must not come from the user's cache, nor go there.
+    """
     if not hasattr(config, "workerinput"):
-        os.environ[_CACHE] = tempfile.mkdtemp()
+        os.environ[_CACHE] = os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp()
     jax.config.update("jax_compilation_cache_dir", os.environ[_CACHE])
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 

@@ -25,7 +25,7 @@ MAY_IMPORT = {
     "pseudo": {"numerics", "geometry", "field", "batch"},
     "support": {"numerics", "geometry", "batch"},
     "train": {"numerics", "geometry", "field", "batch", "pseudo", "rendered_loss"},
-    "scenes": {"ply", "numerics", "geometry", "batch"},
+    "scenes": {"files", "ply", "numerics", "geometry", "batch"},
     "artifacts": {"files", "ply", "numerics", "geometry", "batch", "splats"},
 }
 LIBRARIES_OF_GEOMETRY = {"jax", "chex", "flax", "typing", "jaxcloseup"}

@@ -108,3 +108,85 @@ def test_masks_that_leave_nothing(tmp_path):
         write_image(tmp_path / f"masks/{name}.png", np.zeros((HEIGHT, WIDTH), np.uint8))
     with pytest.raises(SceneError, match="masks leave no pixel of the 1 training photographs"):
         load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("make", [single, llff_capture, colmap_capture])
+@pytest.mark.parametrize("name", ["{0.name}.png", "{0.stem}.mask.png"])
+def test_masks_beside_photographs(tmp_path, make, name):
+    """They are no photographs themselves."""
+    if make is colmap_capture:
+        pytest.importorskip("pycolmap")
+    make(tmp_path)
+    for photograph in sorted((tmp_path / "images").iterdir()):
+        write_image(tmp_path / "images" / name.format(photograph), HALF)
+    scene = load_scene(tmp_path)
+    assert "3 of 3 photographs have a mask" in scene.metadata["notes"][-1]
+    np.testing.assert_allclose(list(weights(scene).values()), 3 / 8)
+    write_image(tmp_path / "masks/unlike.png", HALF)
+    with pytest.raises(SceneError, match="masks holds no mask of any of the 3 photographs"):
+        load_scene(tmp_path)
+
+
+def test_what_is_listed_is_no_mask(tmp_path):
+    names = ["a.png", "a.png.png", "b.mask.png"]
+    for name in names:
+        write_image(tmp_path / "images" / name, HALF)
+    frames = [
+        {"file_path": f"images/{name}", "transform_matrix": POSE.tolist(), "fl_x": 9.0}
+        for name in names
+    ]
+    write_json(tmp_path / "transforms_train.json", frames)
+    scene = load_scene(tmp_path)
+    assert len(scene.train) == 3 and (np.asarray(scene.train.weight) == 1).all()
+
+
+def test_a_mask_of_nothing_is_a_photograph(tmp_path):
+    llff_capture(tmp_path)
+    (tmp_path / "images/1.png").rename(tmp_path / "images/1.mask.png")
+    scene = load_scene(tmp_path, downscale=1)
+    assert sorted(weights(scene)) == ["0", "1.mask", "2"]
+    assert set(weights(scene).values()) == {1.0}
+
+
+def test_inverted_masks(tmp_path):
+    paper_capture(tmp_path)
+    with pytest.raises(SceneError, match="no photograph has a mask to invert: leave out invert_m"):
+        load_scene(tmp_path, invert_masks=True)
+    write_image(tmp_path / "masks/train/a.png", HALF)
+    scene = load_scene(tmp_path, invert_masks=True)
+    np.testing.assert_array_equal(scene.train.weight[0], 1 - np.asarray(HALF) / 255)
+    assert (np.asarray(scene.train.weight[1]) == 1).all()  # without a mask nothing is inverted
+    for name in "ab":
+        write_image(tmp_path / f"masks/train/{name}.png", np.full_like(HALF, 255))
+    with pytest.raises(SceneError, match="black is what counts, so leave out invert_masks if"):
+        load_scene(tmp_path, invert_masks=True)
+
+
+def test_alpha_as_a_mask(tmp_path):
+    """Colours are the file's own, and what is transparent colours nothing when it shrinks."""
+    image = np.full((HEIGHT, WIDTH, 4), [200, 100, 50, 255], np.uint8)
+    image[:, 3:, :3], image[:, 3:, 3] = 7, 0
+    image[0, 0, 3] = 128
+    single_file(tmp_path, 1)
+    with pytest.raises(SceneError, match="no photograph is transparent anywhere: leave out alpha"):
+        load_scene(tmp_path, alpha_mode="mask")
+    write_image(tmp_path / "images/000.png", image)
+    scene = load_scene(tmp_path, alpha_mode="mask")
+    np.testing.assert_allclose(scene.train.weight[0], image[..., 3] / 255)
+    np.testing.assert_allclose(scene.train.rgb[0, :, :3], image[:, :3, :3], atol=1)
+    for options in ({"downscale": 2}, {"split": "zoom", "zoom": 2}):
+        scene = load_scene(tmp_path, alpha_mode="mask", **options)
+        weight = [[(3 + 128 / 255) / 4, 0.5, 0, 0], *[[1, 0.5, 0, 0]] * 2]
+        np.testing.assert_allclose(scene.train.weight[0], weight, atol=3e-3)
+        np.testing.assert_allclose(
+            np.asarray(scene.train.rgb[0, :, :2], int), np.full((3, 2, 3), [200, 100, 50]), atol=2
+        )
+    write_image(tmp_path / "masks/000.png", np.flip(HALF))  # keeps columns 5 to 7
+    with pytest.raises(SceneError, match="masks leave no pixel"):
+        load_scene(tmp_path, alpha_mode="mask")
+    scene = load_scene(tmp_path)
+    assert (
+        scene.train.rgb[0, 0].tolist() == [[227, 177, 152]] + [[200, 100, 50]] * 2 + [[255] * 3] * 5
+    )
+    with pytest.raises(SceneError, match="alpha_mode 'cut' is unknown: choose one of blend, mask"):
+        load_scene(tmp_path, alpha_mode="cut")

@@ -1,24 +1,34 @@
+import os
+import resource
 import tracemalloc
 
 import cv2
 import numpy as np
+import pytest
 from tiny_capture import POSE, frame, write_json
 
 from jaxcloseup.scenes import load_scene, photographs
 
 
+def write_photographs(folder, count, width, height):
+    """So many files that show one thing and that no cache takes for each other."""
+    row, column = np.mgrid[:height, :width]
+    channels = [250 * row // height, 250 * column // width, 250 * (row + column) // (3 * height)]
+    image = np.stack(channels, -1).astype(np.uint8)
+    data = cv2.imencode(".jpg", image)[1].tobytes()
+    names = [f"{i:03d}.jpg" for i in range(count)]
+    for i, name in enumerate(names):
+        (folder / name).write_bytes(data + b"%d" % i)  # after the end, and ignored there
+    pose = POSE.tolist()
+    frames = [{"file_path": name, "transform_matrix": pose} for name in names]
+    write_json(folder / "transforms.json", frames, fl_x=1500.0)
+    return image[..., ::-1]
+
+
 def test_photographs_are_never_all_in_memory_at_full_size(tmp_path, monkeypatch):
     """12 photographs of 3 megapixels are 108 MB; those being read and the small ones are not."""
     monkeypatch.setattr(photographs, "_MOST_AT_ONCE", 2)
-    row, column = np.mgrid[:1500, :2000]
-    image = np.stack([row // 6, column // 8, (row + column) // 14], -1).astype(np.uint8)
-    data = cv2.imencode(".jpg", image)[1].tobytes()
-    names = [f"{i:02d}.jpg" for i in range(12)]
-    for name in names:
-        (tmp_path / name).write_bytes(data)
-    pose = POSE.tolist()
-    frames = [{"file_path": name, "transform_matrix": pose} for name in names]
-    write_json(tmp_path / "transforms.json", frames, fl_x=1500.0)
+    image = write_photographs(tmp_path, 12, 2000, 1500)
     tracemalloc.start()
     try:
         scene = load_scene(tmp_path, downscale=8)
@@ -28,7 +38,18 @@ def test_photographs_are_never_all_in_memory_at_full_size(tmp_path, monkeypatch)
     assert len(scene.train) + len(scene.test_far) == 12
     assert scene.train.rgb.shape[1:] == (187, 250, 3)
     assert 9e6 < peak < 50e6
-    np.testing.assert_allclose(scene.train.rgb[0, 90, 120], image[724, 964][::-1], atol=3)
+    np.testing.assert_allclose(scene.train.rgb[0, 90, 120], image[724, 964], atol=3)
+
+
+@pytest.mark.skipif("JAXCLOSEUP_MANY" not in os.environ, reason="JAXCLOSEUP_MANY=500 takes minutes")
+@pytest.mark.parametrize("options", [{"downscale": 8}, {"split": "zoom", "zoom": 8}])
+def test_many_photographs_of_12_megapixels_stay_under_2_gib(tmp_path, options):
+    """All that the process ever held, JAX and OpenCV included; 500 of them decoded are 18 GB."""
+    count = int(os.environ["JAXCLOSEUP_MANY"])
+    write_photographs(tmp_path, count, 4000, 3000)
+    scene = load_scene(tmp_path, **options)
+    assert len(scene.train) + len(scene.test_far) == count
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < 2 * 2**20  # KiB
 
 
 def test_photographs_keep_the_order_of_their_frames(tmp_path):

@@ -243,6 +243,15 @@ def test_format_and_split_reach_the_capture(parsed_flags, capture_folder, capsys
     printed = capsys.readouterr().out
     assert "reading transforms_train.json" in printed and "every 8th of its" in printed
     assert set(command_line.names_from_flags()) == {"method", "preset"}
+    with flagsaver.flagsaver(split="zoom", zoom=3):
+        options = command_line.load_options_from_flags(TINY)
+        assert command_line.load(str(capture_folder), options).metadata["times_nearer"][0] == 3
+        assert command_line.names_from_flags()["zoom"] == 3
+    with (
+        flagsaver.flagsaver(invert_masks=True, alpha_mode="mask"),
+        pytest.raises(ValueError, match="no photograph has a mask to invert"),
+    ):
+        command_line.load(str(capture_folder), command_line.load_options_from_flags(TINY))
 
 
 def test_a_format_that_is_not_there_is_one_sentence(parsed_flags, capture_folder, tmp_path):

@@ -92,7 +92,10 @@ def test_closest_needs_photographs_and_points(capture):
         load_scene(capture, split="nearest")
 
 
-@pytest.mark.parametrize("options", [{"split": "every8"}, {"format": "colmap"}])
+@pytest.mark.parametrize(
+    "options",
+    [{"split": "every8"}, {"format": "colmap"}, {"invert_masks": True}, {"alpha_mode": "mask"}],
+)
 def test_built_in_scenes_have_their_own_split(options):
     with pytest.raises(SceneError, match=rf"built-in scene.*leave out {next(iter(options))}"):
         load_scene("table", **options)

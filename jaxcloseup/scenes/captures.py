@@ -11,17 +11,18 @@ import numpy as np
 from jaxcloseup.batch import Views
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.scenes.bounds import near_far_from_cameras, near_far_from_points
-from jaxcloseup.scenes.errors import ImageSizeWarning, NearFarWarning, SceneError
+from jaxcloseup.scenes.checks import check_weights, warn_sizes
+from jaxcloseup.scenes.errors import NearFarWarning, SceneError
 from jaxcloseup.scenes.fields import affine_transform, number
 from jaxcloseup.scenes.formats import FORMATS, Listing, read_listing
-from jaxcloseup.scenes.frames import Frame
 from jaxcloseup.scenes.images import pad_images
-from jaxcloseup.scenes.photographs import Photo, read_photos, resized_intrinsics
+from jaxcloseup.scenes.photographs import ALPHA_MODES, Photo, Reading, read_photos
 from jaxcloseup.scenes.scene import Scene
 from jaxcloseup.scenes.splits import SPLITS, unique_names
 from jaxcloseup.scenes.triangulation import triangulate
 
 
+_ZOOM = 4
 _LEAST_POINTS = 100  # triangulated; fewer tell too little of where a scene is
 
 _log = logging.getLogger(__name__)
@@ -35,6 +36,9 @@ def load_scene(
     background: float = 1.0,
     format: str | None = None,
     split: str = "given",
+    zoom: int | None = None,
+    invert_masks: bool = False,
+    alpha_mode: str = "blend",
 ) -> Scene:
     """A built-in scene by its name, or a capture from its folder.
 
@@ -56,30 +60,42 @@ def load_scene(
     size and focal lengths; pixels that they do not show have weight 0. Photographs of several
     sizes are padded at the right and the bottom with pixels of weight 0, and each camera keeps its
     own intrinsics. A mask weighs their pixels: white counts, black does not. It is a frame's
-    `mask_path`, or lies in `masks` beside the folder of the photographs under the same name
-    (`scenes/masks.py`). Initial points are the COLMAP model's, but for those that fewer than two
-    training photographs see, or come from `ply_file_path`, else from `points3d.ply`, else are
-    triangulated from features that neighbouring training photographs share. `near` and `far` are
-    the file's, or are estimated, with a warning unless a COLMAP model's points give them.
+    `mask_path`, or lies in `masks` beside the folder of the photographs under the same name, or
+    beside its photograph as `a.jpg.png` or `a.mask.png` (`scenes/masks.py`).
+
+    Initial points are the COLMAP model's, but for those that fewer than two training photographs
+    see, or come from `ply_file_path`, else from `points3d.ply`, else are triangulated from features
+    that neighbouring training photographs share. `near` and `far` are the file's, or are estimated,
+    with a warning unless a COLMAP model's points give them.
 
     Args:
       name_or_path: one of `PROCEDURAL_SCENES`, or a folder; `./table` is the folder of that name.
-      downscale: whole number by which photographs shrink, by averaging areas.
+      downscale: whole number by which photographs shrink, by averaging areas. For 2, 4 and 8 a
+        folder `images_2`, ... beside `images` is taken as it is, if all of them are in it. What is
+        reduced here is kept in `$XDG_CACHE_HOME/jaxcloseup/photographs`.
       half_pixel: the files count pixel centres at whole numbers, as the paper's do.
       background: grey level in [0, 1] behind transparent pixels.
       format: read `transforms`, `colmap` or `llff` and nothing else; None: the first that is there.
       split: `given`: as the capture says; `every8`: every 8th photograph by name is `test_far`;
         `closest`: the tenth of the photographs that are nearest to what they see, by the median
         depth of its points over the focal length in pixels, is `test`, and of the rest every 8th
-        is `test_far`.
+        is `test_far`; `zoom`: every 8th photograph is `test_far`, the rest is trained on reduced
+        `zoom` times more, and of every 8th of these one part of their own size, not reduced, is
+        `test`: exactly `zoom` times as fine, from the same place. It is that of `zoom` x `zoom`
+        with most detail: squared differences of neighbouring pixels that count.
+      zoom: whole number of at least 2, of split `zoom` alone; None: 4.
+      invert_masks: white is ignored and black counts.
+      alpha_mode: `blend`: transparent pixels show the background; `mask`: they weigh as much as
+        they are opaque, and their colours are those in the file.
 
     Returns:
       The scene. For a folder, `metadata` holds `path`, `downscale`, `files` and `sizes` (the path
       and, before padding, the (width, height) of each photograph, by split) and
       `applied_transform` (`[3, 4]`, from the capture's original world to this one, or None),
       `format`, `split`, `notes` (sentences on what was read and how it was divided) and, for
-      `closest`, `times_nearer` (how many times nearer each view of `test` is than the median
-      training photograph).
+      `closest` and `zoom`, `times_nearer` (how many times nearer, or finer, each view of `test` is
+      than the median training photograph); for `zoom` `corners` (of each view of `test` the first
+      pixel (x, y) in its photograph, reduced by `downscale`).
 
     Raises:
       SceneError: one sentence that names the file and the field and says what to do.
@@ -92,15 +108,31 @@ def load_scene(
         raise SceneError(f"split {split!r} is unknown: choose one of {', '.join(SPLITS)}.")
     if format is not None and format not in FORMATS:
         raise SceneError(f"format {format!r} is unknown: choose one of {', '.join(FORMATS)}.")
+    if zoom is not None and split != "zoom":
+        raise SceneError(f"zoom is of split zoom, and split is {split}: leave zoom out.")
+    if zoom is not None and (isinstance(zoom, bool) or not isinstance(zoom, int) or zoom < 2):
+        raise SceneError(f"zoom must be a whole number of at least 2, got {zoom!r}.")
+    zoom = (zoom or _ZOOM) if split == "zoom" else 1
+    if alpha_mode not in ALPHA_MODES:
+        raise SceneError(
+            f"alpha_mode {alpha_mode!r} is unknown: choose one of {', '.join(ALPHA_MODES)}."
+        )
+    reading = Reading(downscale, zoom, background, half_pixel, alpha_mode, invert_masks)
     path = pathlib.Path(name_or_path)
     if len(path.parts) == 1 and str(name_or_path) == path.name:
         from jaxcloseup.scenes.procedural import PROCEDURAL_SCENES, procedural_scene
 
         if path.name in PROCEDURAL_SCENES:
-            if split != "given" or format is not None:
+            of_captures = {
+                "split": split != "given",
+                "format": format is not None,
+                "invert_masks": invert_masks,
+                "alpha_mode": alpha_mode != "blend",
+            }
+            if given := [name for name, chosen in of_captures.items() if chosen]:
                 raise SceneError(
-                    f"{path} is a built-in scene with a split of its own: leave out "
-                    f"{'split' if split != 'given' else 'format'}."
+                    f"{path} is a built-in scene with a split of its own and no masks: leave out "
+                    f"{given[0]}."
                 )
             return procedural_scene(path.name, downscale=downscale)
         if not path.exists():
@@ -111,7 +143,7 @@ def load_scene(
     try:
         if not path.is_dir():
             raise SceneError(f"{path} is not a folder: give the one that holds the capture.")
-        listing = read_listing(path, format=format, split=split)
+        listing = read_listing(path, format=format, split=split, zoom=zoom, downscale=downscale)
     except OSError as error:  # of folders; what reads a file says more
         raise SceneError(
             f"{error.filename or path!s:.200} cannot be read ({error.strerror}): permit reading "
@@ -119,12 +151,12 @@ def load_scene(
         ) from error
     for note in listing.notes:
         _log.info(note)
-    scene = _load(listing, downscale, half_pixel, background)
+    scene = _load(listing, reading)
     scene.metadata.update(path=path, split=split)
     return scene
 
 
-def _load(listing: Listing, downscale: int, half_pixel: bool, background: float) -> Scene:
+def _load(listing: Listing, reading: Reading) -> Scene:
     transform = listing.fields.get("applied_transform")
     if transform is not None:
         transform = affine_transform(str(listing.file), "applied_transform", transform)
@@ -134,39 +166,48 @@ def _load(listing: Listing, downscale: int, half_pixel: bool, background: float)
                 "correct it."
             )
 
-    frames = [frame for members in listing.frames.values() for frame in members]
-    photos = read_photos(frames, downscale=downscale, background=background, half_pixel=half_pixel)
-    _check_masks(listing, photos)
-    _warn_sizes(listing, frames, photos)
-    intrinsics = np.stack(
-        [
-            resized_intrinsics(frame, photo.stored_size, photo.size, half_pixel)
-            for frame, photo in zip(frames, photos, strict=True)
-        ]
-    )
-    camtoworld = np.stack([frame.camtoworld for frame in frames])
+    parts = read_photos(listing.frames, reading)
+    photos = [photo for members in parts.values() for photo in members]
+    check_weights(listing.folder, listing.frames, photos, reading)
+    warn_sizes(listing.file.parent, photos)
+    intrinsics = np.stack([photo.intrinsics(reading.half_pixel) for photo in photos])
+    camtoworld = np.stack([photo.frame.camtoworld for photo in photos])
     sizes = np.array([photo.size for photo in photos])
     if not len(listing.points):
-        listing = _with_points(listing, photos, camtoworld, intrinsics)
+        listing = _with_points(listing, parts["train"], camtoworld, intrinsics)
     near, far = _near_far(listing, camtoworld, intrinsics, sizes)
 
     width, height = sizes.max(0).tolist()
-    ends = np.cumsum([len(members) for members in listing.frames.values()])[:-1]
-    parts = dict(zip(listing.frames, np.split(np.arange(len(frames)), ends), strict=True))
+    ends = np.cumsum([len(members) for members in parts.values()])[:-1]
+    rows = dict(zip(parts, np.split(np.arange(len(photos)), ends), strict=True))
     views = {
         split: Views(
             cameras=Camera(
-                camtoworld=jnp.asarray(camtoworld[part], jnp.float32),
-                intrinsics=jnp.asarray(intrinsics[part], jnp.float32),
+                camtoworld=jnp.asarray(camtoworld[rows[split]], jnp.float32),
+                intrinsics=jnp.asarray(intrinsics[rows[split]], jnp.float32),
                 height=height,
                 width=width,
             ),
-            rgb=jnp.asarray(pad_images([photos[i].rgb for i in part], height, width)),
-            weight=jnp.asarray(pad_images([photos[i].mask for i in part], height, width)) / 255,
+            rgb=jnp.asarray(pad_images([photo.rgb for photo in part], height, width)),
+            weight=jnp.asarray(pad_images([photo.mask for photo in part], height, width)) / 255,
         )
         for split, part in parts.items()
     }
-    files = {split: [frame.file for frame in part] for split, part in listing.frames.items()}
+    files = {split: [photo.frame.file for photo in part] for split, part in parts.items()}
+    names = {split: unique_names(paths) for split, paths in files.items()}
+    metadata = {
+        "downscale": reading.downscale,
+        "files": files,
+        "sizes": {split: [photo.size for photo in part] for split, part in parts.items()},
+        "applied_transform": transform,
+        "format": listing.format,
+        "notes": listing.notes,
+    }
+    if listing.times_nearer is not None:
+        metadata["times_nearer"] = listing.times_nearer
+    if reading.zoom > 1:
+        metadata["corners"] = [photo.corner for photo in parts["test"]]
+        names["test"] = [f"{name}_zoom{reading.zoom}" for name in names["test"]]
     return Scene(
         name=listing.folder.resolve().name,
         train=views["train"],
@@ -176,29 +217,24 @@ def _load(listing: Listing, downscale: int, half_pixel: bool, background: float)
         rgb=listing.rgb,
         near=near,
         far=far,
-        names={split: unique_names(paths) for split, paths in files.items()},
-        metadata={
-            "downscale": downscale,
-            "files": files,
-            "sizes": {split: [photos[i].size for i in part] for split, part in parts.items()},
-            "applied_transform": transform,
-            "format": listing.format,
-            "notes": listing.notes,
-            **({} if listing.times_nearer is None else {"times_nearer": listing.times_nearer}),
-        },
+        names=names,
+        metadata=metadata,
     )
 
 
 def _with_points(
     listing: Listing, photos: Sequence[Photo], camtoworld: np.ndarray, intrinsics: np.ndarray
 ) -> Listing:
-    """A listing without points, with those that its training photographs agree on."""
-    count = len(listing.frames["train"])  # held-out photographs tell nothing of what they show
+    """A listing without points, with those that its training photographs agree on.
+
+    `photos` are these, and the first of the poses and intrinsics are theirs.
+    """
+    count = len(photos)  # held-out photographs tell nothing of what they show
     if count < 2:
         return listing
     points, rgb = triangulate(
-        [photo.rgb for photo in photos[:count]],
-        [photo.mask for photo in photos[:count]],
+        [photo.rgb for photo in photos],
+        [photo.mask for photo in photos],
         camtoworld[:count],
         intrinsics[:count],
     )
@@ -210,41 +246,6 @@ def _with_points(
     )
     _log.info(note)
     return listing._replace(points=points, rgb=rgb, notes=(*listing.notes, note))
-
-
-def _check_masks(listing: Listing, photos: Sequence[Photo]) -> None:
-    """Complain of masks that leave nothing to train on; `train` comes first in `photos`."""
-    count = len(listing.frames["train"])
-    if not any(photo.mask.any() for photo in photos[:count]):
-        raise SceneError(
-            f"{listing.folder}: the masks leave no pixel of the {count} training photographs: "
-            "white is what counts, so invert them if it is black in these."
-        )
-
-
-def _warn_sizes(listing: Listing, frames: Sequence[Frame], photos: Sequence[Photo]) -> None:
-    """Accept images that were resized as a whole, and refuse other sizes than the file's."""
-    resized = []
-    for frame, photo in zip(frames, photos, strict=True):
-        (width, height), (w, h) = photo.stored_size, frame.size or photo.stored_size
-        if (width, height) == (w, h):
-            continue
-        # Resizing rounds each side to whole pixels: its aspect agrees to within one of them.
-        if abs(width * h / w - height) > 1 and abs(height * w / h - width) > 1:
-            swapped = (w, h) == (height, width)
-            turned = ", turned as by an EXIF orientation" if swapped else ""
-            raise SceneError(
-                f"{frame.label}: the image is {width} x {height} pixels, but w and h are {w} x {h}"
-                f"{turned}: restore the image that the camera was solved for, or correct w and h."
-            )
-        resized.append(f"{frame.listed} is {width} x {height} and not {w} x {h}")
-    if resized:
-        more = f" and {len(resized) - 1} more" if len(resized) > 1 else ""
-        warnings.warn(
-            f"{listing.file.parent}: {resized[0]}{more}; intrinsics were scaled to the images.",
-            ImageSizeWarning,
-            stacklevel=2,
-        )
 
 
 def _near_far(

@@ -11,6 +11,7 @@ from jaxcloseup.scenes.frames import Frame
 from jaxcloseup.scenes.llff import read_llff
 from jaxcloseup.scenes.masks import attach_masks
 from jaxcloseup.scenes.points import read_ply_points
+from jaxcloseup.scenes.reduced import attach_reduced
 from jaxcloseup.scenes.splits import divide, listed_split, split_of_file, warn_duplicates
 from jaxcloseup.scenes.transforms import read_transforms
 
@@ -61,8 +62,10 @@ class _Content(NamedTuple):
     points: tuple[np.ndarray, np.ndarray]
 
 
-def read_listing(path: pathlib.Path, *, format: str | None = None, split: str) -> Listing:
-    """The photographs of a folder by split; `load_scene` documents formats and splits.
+def read_listing(
+    path: pathlib.Path, *, format: str | None = None, split: str, zoom: int = 1, downscale: int = 1
+) -> Listing:
+    """The photographs of a folder by split; `load_scene` documents the arguments.
 
     Raises:
       SceneError: no known file in the folder, or something wrong in one.
@@ -86,11 +89,13 @@ def read_listing(path: pathlib.Path, *, format: str | None = None, split: str) -
     )
     given = content.given or (split_of_file(folder, content.frames) if split == "given" else None)
     points, rgb = content.points
-    division = divide(called, content.frames, given, split, points)
-    warn_duplicates(folder, division.frames)
+    division = divide(called, content.frames, given, split, points, zoom)
+    if split != "zoom":  # whose close-ups are what training photographs do not show
+        warn_duplicates(folder, division.frames)
     frames, masked = attach_masks(folder, division.frames)
+    frames, reduced = attach_reduced(called, frames, downscale)
     keep = _seen_in_training(frames, len(points))
-    notes = [note, *division.notes, *masked]
+    notes = [note, *division.notes, *masked, *reduced]
     if not keep.all():
         notes.append(
             f"{called}: {np.sum(~keep)} of {len(keep)} points, which fewer than two training "

@@ -25,6 +25,7 @@ class Frame(NamedTuple):
       lens: this frame's own fields about the lens, then those of the whole file.
       distortion: of the lens, or None for a pinhole.
       seen: indices of the capture's points that it shows, or None where the format does not say.
+      reduced: the same image, reduced before, which is read in its place; or None.
     """
 
     source: pathlib.Path
@@ -36,6 +37,7 @@ class Frame(NamedTuple):
     lens: tuple[dict[str, Any], dict[str, Any]]
     distortion: Distortion | None = None
     seen: np.ndarray | None = None
+    reduced: pathlib.Path | None = None
 
     @property
     def label(self) -> str:

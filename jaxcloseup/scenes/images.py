@@ -9,31 +9,58 @@ import numpy as np
 from jaxcloseup.scenes.errors import SceneError
 
 
-def read_image(path: pathlib.Path, *, background: float = 1.0) -> np.ndarray:
+def read_file(path: pathlib.Path) -> np.ndarray:
+    """The bytes of a picture's file, as uint8 `[N]`.
+
+    Raises:
+      SceneError: it is missing or may not be read.
+    """
+    try:
+        # `cv2.imread` fails on non-ASCII paths on some systems; decoding from memory never does.
+        return np.fromfile(path, np.uint8)
+    except OSError as error:
+        raise SceneError(f"{path} cannot be read ({error.strerror}): restore the file.") from error
+
+
+def read_image(
+    path: pathlib.Path,
+    *,
+    background: float = 1.0,
+    keep_alpha: bool = False,
+    data: np.ndarray | None = None,
+) -> np.ndarray:
     """A photograph as uint8 `[H, W, 3]`, red first.
 
     Grey becomes RGB, 16 bits become 8, and transparency is composited over the grey level
     `background` in [0, 1]. Pixels stay as they are stored: an EXIF orientation is not applied,
     because cameras are solved for, and transforms refer to, the stored pixels.
 
+    Args:
+      path: of the file.
+      background: behind transparent pixels.
+      keep_alpha: composite over black, and give alpha as a fourth channel if the file has one.
+      data: the file's bytes where they have been read already.
+
     Raises:
       SceneError: the file is missing, truncated, damaged or not a picture of 8 or 16 bits.
     """
-    image = _decode(path)
+    image, alpha = _decode(path, read_file(path) if data is None else data), None
     if image.ndim == 2:
         image = image[..., None]
     if image.shape[-1] in (2, 4):
-        alpha = image[..., -1:].astype(np.float32) / 255
-        image = np.rint(image[..., :-1] * alpha + 255 * background * (1 - alpha)).astype(np.uint8)
+        image, alpha = image[..., :-1], image[..., -1:]
+        share, behind = alpha.astype(np.float32) / 255, 0.0 if keep_alpha else 255 * background
+        image = np.rint(image * share + behind * (1 - share)).astype(np.uint8)
     # OpenCV stores blue first.
-    return (
-        np.repeat(image, 3, -1) if image.shape[-1] == 1 else np.ascontiguousarray(image[..., ::-1])
-    )
+    image = np.repeat(image, 3, -1) if image.shape[-1] == 1 else image[..., ::-1]
+    if keep_alpha and alpha is not None:
+        image = np.concatenate([image, alpha], -1)
+    return np.ascontiguousarray(image)
 
 
-def read_mask(path: pathlib.Path) -> np.ndarray:
+def read_mask(path: pathlib.Path, *, data: np.ndarray | None = None) -> np.ndarray:
     """A mask as uint8 `[H, W]`: white counts, black and transparent do not."""
-    return read_image(path, background=0.0)[..., 0]
+    return read_image(path, background=0.0, data=data)[..., 0]
 
 
 def downscale_image(image: np.ndarray, factor: int) -> np.ndarray:
@@ -52,12 +79,7 @@ def pad_images(images: Sequence[np.ndarray], height: int, width: int) -> np.ndar
     return stack
 
 
-def _decode(path: pathlib.Path) -> np.ndarray:
-    try:
-        # `cv2.imread` fails on non-ASCII paths on some systems; decoding from memory never does.
-        data = np.fromfile(path, np.uint8)
-    except OSError as error:
-        raise SceneError(f"{path} cannot be read ({error.strerror}): restore the file.") from error
+def _decode(path: pathlib.Path, data: np.ndarray) -> np.ndarray:
     image, large = None, False
     if data.size and not _is_truncated_jpeg(data.tobytes()):
         try:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxcloseup.scenes.errors import SceneError
 from jaxcloseup.scenes.fields import number, rigid_transform, side
 from jaxcloseup.scenes.frames import Frame
-from jaxcloseup.scenes.masks import is_picture
+from jaxcloseup.scenes.masks import list_photographs
 
 
 def read_llff(file: pathlib.Path, photographs: pathlib.Path) -> tuple[dict[str, Any], list[Frame]]:
@@ -38,8 +38,7 @@ def read_llff(file: pathlib.Path, photographs: pathlib.Path) -> tuple[dict[str, 
         )
     if rows.dtype.kind not in "fiu":
         raise SceneError(f"{file} holds {rows.dtype} values and not numbers: export it again.")
-    found = photographs.iterdir() if photographs.is_dir() else ()
-    files = sorted(path for path in found if is_picture(path))
+    files = list_photographs(photographs)
     if len(files) != len(rows):
         raise SceneError(
             f"{file} has {len(rows)} poses and {photographs} {len(files)} photographs: restore "

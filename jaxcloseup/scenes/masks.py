@@ -1,8 +1,9 @@
-"""Masks that lie in a folder `masks/` of their own, found by the names of their photographs.
+"""Masks that lie beside their photographs or in a folder `masks/`, found by their names.
 
 For a photograph `images/a.jpg` the mask is `masks/a.jpg.png`, as COLMAP names it, or
-`masks/a.mask.png`, or `masks/a` with any picture's ending; the first of them that is there. White
-pixels are kept and black ones are ignored. Folders inside `images` have their like inside `masks`.
+`masks/a.mask.png`, or `masks/a` with any picture's ending, or else `images/a.jpg.png` or
+`images/a.mask.png`; the first of them that is there. White pixels are kept and black ones are
+ignored. Folders inside `images` have their like inside `masks`.
 """
 
 import collections
@@ -15,12 +16,22 @@ from jaxcloseup.scenes.frames import Frame
 
 
 FOLDER = "masks"
+# The whole name first: it tells a.jpg's from a.png's.
+_BESIDE = ("{name}", "{stem}.mask")
+_IN_FOLDER = (*_BESIDE, "{stem}")
 _PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 
 
 def is_picture(path: pathlib.Path) -> bool:
     """Whether a file is a photograph or a mask by its name; macOS puts `._a.jpg` beside `a.jpg`."""
     return path.suffix.lower() in _PICTURES and not path.name.startswith(".")
+
+
+def list_photographs(folder: pathlib.Path) -> list[pathlib.Path]:
+    """The pictures in a folder, sorted, but for those that are masks of others there."""
+    pictures, by_stem = list_pictures(folder), _by_stem(folder)
+    masks = {_find(by_stem, picture, _BESIDE) for picture in pictures}
+    return [picture for picture in pictures if picture not in masks]
 
 
 def attach_masks(
@@ -39,22 +50,26 @@ def attach_masks(
     waiting = list({frame.file: frame for frame in every if frame.mask is None}.values())
     places = {frame.file: list(_places(folder, frame.file)) for frame in waiting}
     holders = sorted({holder for found in places.values() for holder, _ in found})
-    if not holders:
-        return splits, ()
-    pictures = functools.cache(_pictures)  # folders are listed once, however many photographs
+    pictures = functools.cache(_by_stem)  # folders are listed once, however many photographs
     found = {}
-    for frame in waiting:
-        masks = (_find(pictures(place), frame.file) for _, place in places[frame.file])
-        found[frame.file] = next((mask for mask in masks if mask), None)
-    masked = [file for file, mask in found.items() if mask]
-    total = len({frame.file for frame in every})
-    if not masked and len(waiting) == total:
+    for file, around in places.items():
+        masks = (_find(pictures(place), file, _IN_FOLDER) for _, place in around)
+        found[file] = next((mask for mask in masks if mask), None)
+    listed = {frame.file for frame in every}
+    total = len(listed)
+    if holders and not any(found.values()) and len(waiting) == total:
         stem, name = waiting[0].file.stem, waiting[0].file.name
         raise SceneError(
             f"{holders[0]} holds no mask of any of the {total} photographs: for {name} neither "
             f"{name}.png nor {stem}.mask.png nor {stem} with a picture's ending is there; name "
             "them so, or name the folder otherwise if it holds something else."
         )
+    for file in found:
+        beside = _find(pictures(file.parent), file, _BESIDE)
+        found[file] = found[file] or (None if beside in listed else beside)
+    masked = [file for file, mask in found.items() if mask]
+    if not holders and not masked:
+        return splits, ()
     _check_shared({file: found[file] for file in masked})
     count = len(masked) + total - len(waiting)
     note = f"{folder.resolve().name}: {count} of {total} photographs have a mask"
@@ -82,7 +97,8 @@ def _places(
                 yield root / FOLDER, root.joinpath(FOLDER, *inner[1:])
 
 
-def _pictures(folder: pathlib.Path) -> tuple[pathlib.Path, ...]:
+def list_pictures(folder: pathlib.Path) -> tuple[pathlib.Path, ...]:
+    """The pictures in a folder, sorted; of one that is not there, none."""
     try:
         return tuple(
             sorted(path for path in folder.iterdir() if is_picture(path)) if folder.is_dir() else ()
@@ -93,13 +109,17 @@ def _pictures(folder: pathlib.Path) -> tuple[pathlib.Path, ...]:
         ) from error
 
 
-def _find(pictures: Sequence[pathlib.Path], photograph: pathlib.Path) -> pathlib.Path | None:
-    # The whole name first: it tells a.jpg's from a.png's.
-    for stem in (photograph.name, f"{photograph.stem}.mask", photograph.stem):
-        for path in pictures:
-            if path.stem == stem:
-                return path
-    return None
+def _by_stem(folder: pathlib.Path) -> dict[str, pathlib.Path]:
+    """The pictures in a folder by their stems; of several with one, the first."""
+    return {path.stem: path for path in reversed(list_pictures(folder))}
+
+
+def _find(
+    pictures: dict[str, pathlib.Path], photograph: pathlib.Path, stems: Sequence[str]
+) -> pathlib.Path | None:
+    """The first picture with one of the stems, which are written for a photograph `{name}`."""
+    wanted = [stem.format(name=photograph.name, stem=photograph.stem) for stem in stems]
+    return next((pictures[stem] for stem in wanted if stem in pictures), None)
 
 
 def _check_shared(found: dict[pathlib.Path, pathlib.Path]) -> None:

@@ -17,7 +17,7 @@ from jaxcloseup.scenes.images import read_image
 
 TEST_EVERY = 8
 CLOSEST_SHARE = 0.1
-SPLITS = ("given", "every8", "closest")
+SPLITS = ("given", "every8", "closest", "zoom")
 _LISTS = {"train": "train_filenames", "test": "test_filenames", "test_far": "val_filenames"}
 _SPLIT_FILE_KEYS = {"train", "test", "test_far", "unused"}
 
@@ -29,7 +29,7 @@ class Division(NamedTuple):
       frames: for each split present the photographs, `train` first.
       notes: sentences on how they were divided.
       times_nearer: of `closest`, how many times nearer each photograph of `test` is than the median
-        one of `train`; else None.
+        one of `train`; of `zoom`, how many times finer each close-up is; else None.
     """
 
     frames: dict[str, list[Frame]]
@@ -86,6 +86,7 @@ def divide(
     given: dict[str, list[Frame]] | None,
     split: str,
     points: np.ndarray,
+    zoom: int = 1,
 ) -> Division:
     """The photographs as `split` says.
 
@@ -95,12 +96,15 @@ def divide(
       given: as the capture's files divide them, or None where none does.
       split: one of `SPLITS`. `given` takes every 8th where nothing is; `load_scene` has the rest.
       points: `[P, 3]` of the world; `closest` needs some.
+      zoom: of `zoom`, how many times finer its close-ups are.
     """
     if split == "given" and given:
         return Division(given)
     frames = sorted({frame.file: frame for frame in frames}.values(), key=lambda f: f.listed)
     if split == "closest":
         return _closest(name, frames, points)
+    if split == "zoom":
+        return _zoom(name, frames, zoom)
     parts = _every_eighth(frames)
     reason = " lists no splits" if split == "given" else ""
     return Division(
@@ -179,6 +183,18 @@ def _closest(name: str, frames: Sequence[Frame], points: np.ndarray) -> Division
         f"{len(parts.get('test_far', ()))} others are test_far"
     )
     return Division(parts, (note,), ratios)
+
+
+def _zoom(name: str, frames: Sequence[Frame], zoom: int) -> Division:
+    parts = _every_eighth(frames)
+    train, test = parts["train"], parts["train"][::TEST_EVERY]
+    note = (
+        f"{name}: its {len(train)} training photographs are reduced {zoom} times more, and the "
+        f"part with most detail of every {TEST_EVERY}th of them, not reduced, {len(test)} in all, "
+        f"is test: {zoom} times as fine, from the same places; "
+        f"{len(parts.get('test_far', ()))} others are test_far"
+    )
+    return Division({"train": train, "test": test, **parts}, (note,), (float(zoom),) * len(test))
 
 
 def _size_of_pixel(frame: Frame, points: np.ndarray) -> float:
