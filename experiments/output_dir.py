@@ -25,3 +25,18 @@ def check_unused(folder: str | pathlib.Path) -> pathlib.Path:
             f"--output_dir={folder} already holds something: name a new folder, or remove it first"
         )
     return path
+
+
+def make(folder: pathlib.Path) -> None:
+    """Make a folder for results, with those around it, if it is not there.
+
+    Raises:
+      OSError: it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OSError(
+            f"--output_dir={folder} cannot be made ({error.strerror}): name a folder where you may "
+            "write"
+        ) from error

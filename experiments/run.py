@@ -14,6 +14,7 @@ from absl import app, flags
 from experiments import command_line
 from experiments.evaluation import find_perceptual
 from experiments.loop import TrainingError
+from experiments.output_dir import make
 from experiments.pipeline import STAGES, run
 from experiments.report import print_table
 from experiments.set_up import set_up
@@ -45,7 +46,7 @@ def main(argv: list[str]) -> None:
         load_options = command_line.load_options_from_flags(preset)
         scene = command_line.load(FLAGS.scene, load_options)
         perceptual = find_perceptual(FLAGS.lpips_weights)
-        output_dir.mkdir(parents=True, exist_ok=True)
+        make(output_dir)
     except (SceneError, OSError, ValueError) as error:
         sys.exit(f"experiments.run: {error}")
     try:

@@ -26,11 +26,13 @@ flags.DEFINE_string(
 def set_up() -> None:
     """Compile into the cache of the flags, and say only what concerns the user."""
     set_up_compilation_cache(FLAGS.compilation_cache)
-    # Warnings are sentences for the user; notes on absent accelerators and on every file of a
-    # checkpoint are not.
+    # Warnings are sentences for the user; notes on absent accelerators, on every file of a
+    # checkpoint, or that are printed anyway are not.
     warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
     logging.getLogger("jax._src.xla_bridge").setLevel(logging.WARNING)
-    logging.getLogger("absl").setLevel(logging.WARNING)
+    logging.getLogger("jaxcloseup").setLevel(logging.WARNING)
+    # Errors of Orbax come with a traceback, and are raised too.
+    logging.getLogger("absl").setLevel(logging.CRITICAL)
 
 
 def set_up_compilation_cache(folder: str | None) -> None:

@@ -34,6 +34,7 @@ from experiments.fixed_labels import labels_of_less_error, true_close_ups
 from experiments.loop import HOSTS_WAIT, Programs, TrainingError, run_stage
 from experiments.manifest import NAME as MANIFEST
 from experiments.manifest import about_scene, hash_data, write_manifest
+from experiments.output_dir import make
 from experiments.pipeline import config, rendered_depths, timed, training_depths, versions
 from experiments.presets import Preset, initial_points, pseudo_settings
 from experiments.set_up import set_up
@@ -313,7 +314,7 @@ def main(argv: list[str]) -> None:
         load_options = command_line.load_options_from_flags(preset)
         captures = [command_line.load(name, load_options) for name in FLAGS.scenes]
         _check_scenes(captures, output_dir)
-        output_dir.mkdir(parents=True, exist_ok=True)
+        make(output_dir)
     except (SceneError, OSError, ValueError) as error:
         sys.exit(f"experiments.sweep: {error}")
     if hosts is not None:

@@ -1,5 +1,8 @@
 """Checkpoints: what was saved comes back, half of one never does, another run's is refused."""
 
+import contextlib
+import resource
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -49,6 +52,30 @@ def test_half_of_a_checkpoint_is_none(tmp_path):
     (half / "state" / "data").write_bytes(b"half")
     step, _, _ = Checkpoints(tmp_path, RUN).load("baseline", state(0))
     assert step == 3
+
+
+@contextlib.contextmanager
+def room_for(size):
+    """No file can become larger than so many bytes, whatever writes it."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_full_disk_costs_the_newest_checkpoint_alone(tmp_path):
+    checkpoints = Checkpoints(tmp_path, RUN)
+    checkpoints.save("baseline", 3, state(3), {})
+    noise = {"noise": jax.random.uniform(jax.random.key(0), (600_000,))}
+    with (
+        room_for(1_000_000),
+        pytest.raises(CheckpointError, match=r"baseline/5 cannot be written \(File too large\)"),
+    ):
+        checkpoints.save("baseline", 5, state(5) | noise, {})
+    step, found, _ = Checkpoints(tmp_path, RUN).load("baseline", state(0))
+    assert (step, int(found["step"])) == (3, 3)
 
 
 def test_another_run_is_refused_by_the_first_difference(tmp_path):

@@ -274,6 +274,16 @@ def test_a_folder_that_holds_something_is_refused_before_any_work(parsed_flags, 
     assert (tmp_path / "results.json").read_text() == "{}"
 
 
+def test_a_folder_that_cannot_be_made_is_one_sentence(parsed_flags, capture_folder, tmp_path):
+    (tmp_path / "file").write_text("")
+    folder = tmp_path / "file" / "out"
+    with (
+        flagsaver.flagsaver(scene=str(capture_folder), downscale=1, output_dir=str(folder)),
+        pytest.raises(SystemExit, match=f"--output_dir={folder} cannot be made .*: name a folder"),
+    ):
+        program.main(["run"])
+
+
 def test_flags_override_the_preset(parsed_flags):
     given = {"preset": "paper", "closeup_steps": 7, "compute_dtype": "bfloat16"}
     with flagsaver.flagsaver(method="nerf", **given):

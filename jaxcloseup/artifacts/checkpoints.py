@@ -59,13 +59,23 @@ class Checkpoints:
         """Keep a stage's state after `step` of its steps; `progress` is JSON. Two are kept.
 
         `state` is a pytree of arrays; random keys are kept too.
+
+        Raises:
+          CheckpointError: it cannot be written; those before it stay.
         """
         if jax.process_index() > 0:
             return
         items = ocp.args.Composite(
             state=ocp.args.StandardSave(_plain(state)), progress=ocp.args.JsonSave(dict(progress))
         )
-        self._manager(stage).save(step, args=items, force=True)
+        try:
+            self._manager(stage).save(step, args=items, force=True)
+        except (ValueError, OSError) as error:  # of a full disk, a ValueError
+            reason = str(error).splitlines()[0].rsplit(": ", 1)[-1].split(" [os_error")[0]
+            raise CheckpointError(
+                f"{self.folder / stage / str(step)} cannot be written ({reason}): make room for it "
+                "and resume the run from the checkpoint before."
+            ) from error
 
     def load(self, stage: str, like: Any) -> tuple[int, Any, dict[str, Any]] | None:
         """A stage's newest step, state and progress, or None; `like` gives the state's form."""
