@@ -1,4 +1,4 @@
-"""Rows of docs/bad_inputs.md that no other test has."""
+"""Rows of the table of bad inputs in BUILD.md that no other test has."""
 
 import json
 import pathlib
