@@ -23,6 +23,7 @@ from experiments.evaluation import (
     targets_by_split,
 )
 from experiments.gate import print_gate, weigh_labels
+from experiments.logs import TrainLog
 from experiments.loop import Programs, run_stage
 from experiments.manifest import about_scene, hash_data, write_manifest
 from experiments.pictures import comparisons, label_pictures, write_renders
@@ -55,6 +56,7 @@ def run(
     save_every: int = 1000,
     perceptual: Perceptual = NO_PERCEPTUAL,
     load_options: Mapping[str, Any] | None = None,
+    tensorboard: bool = False,
 ) -> dict[str, Any]:
     """The stages on one scene; writes everything under `output_dir` and returns the results.
 
@@ -68,6 +70,7 @@ def run(
       save_every: steps between checkpoints. Those in `output_dir` are gone on from.
       perceptual: networks of LPIPS.
       load_options: what `load_scene` was given, to load the scene again; for the manifest.
+      tensorboard: whether to write event files, beside `stats/train.jsonl`.
     """
     key_init, key_audit, key_pictures = jax.random.split(jax.random.key(seed), 3)
     key_points = jax.random.fold_in(key_init, 2)
@@ -82,6 +85,7 @@ def run(
     identity |= {"resolution": [size.width, size.height], "version": jaxcloseup.__version__}
     identity["data_sha256"] = hash_data(scene)
     checkpoints = Checkpoints(output_dir / "checkpoints", identity)
+    log = TrainLog(output_dir, tensorboard=tensorboard)
     settings = pseudo_settings(preset)
     seconds: dict[str, float] = {}
     history, stages, renderings = {}, {}, {}
@@ -101,19 +105,23 @@ def run(
                 steps=steps,
                 checkpoints=checkpoints,
                 save_every=save_every,
+                log=log,
             )
         return state
 
     def score(stage, state):
         with timed(seconds, f"{stage}_evaluation"):
-            stages[stage] = {}
+            stages[stage], shown = {}, {}
             for split, of_split in held_out.items():
                 rendered = functools.partial(programs.render, state)
                 stages[stage][split], seen = evaluate(rendered, of_split, perceptual)
                 write_renders(output_dir / "renders" / stage / split, seen, scene)
                 if split in targets:
                     renderings[stage, split] = seen
+                    name, first = next(iter(seen.items()))
+                    shown[f"{split}/{name}"] = first.rgb
                     print(f"{stage:>9} {split}: {in_short(stages[stage][split])}", flush=True)
+            log.evaluated(stage, stages[stage], shown)
             if len(held_out) > len(targets):
                 print(f"{stage:>9} {ladder_in_short(stages[stage])}", flush=True)
             if isinstance(state.params, Surfels):

@@ -31,6 +31,7 @@ from experiments.evaluation import (
     targets_by_split,
 )
 from experiments.fixed_labels import labels_of_less_error, true_close_ups
+from experiments.logs import TrainLog, check_tensorboard
 from experiments.loop import HOSTS_WAIT, Programs, TrainingError, run_stage
 from experiments.manifest import NAME as MANIFEST
 from experiments.manifest import about_scene, hash_data, write_manifest
@@ -91,6 +92,7 @@ def run_sweep(
     max_parallel: int = 8,
     perceptual: Perceptual = NO_PERCEPTUAL,
     seconds: dict[str, float] | None = None,
+    log: TrainLog | None = None,
 ) -> dict[str, Any]:
     """All arms of one scene; returns, for each arm, the metrics of each seed and split.
 
@@ -104,6 +106,7 @@ def run_sweep(
       max_parallel: arms and seeds trained at once.
       perceptual: networks of LPIPS.
       seconds: is filled with the wall time of each stage.
+      log: is told of what is printed.
     """
     chosen = [make_arm(name, pseudo_settings(preset)) for name in arms]
     for arm in chosen:
@@ -129,7 +132,8 @@ def run_sweep(
 
     def stage(name, *data, steps):
         with timed(seconds, name):
-            return run_stage(name, *data, steps=steps, checkpoints=checkpoints, save_every=1000)
+            kept = {"checkpoints": checkpoints, "save_every": 1000, "log": log}
+            return run_stage(name, *data, steps=steps, **kept)
 
     starts = []
 
@@ -302,6 +306,8 @@ def main(argv: list[str]) -> None:
     try:
         hosts = _hosts()
         first = hosts is None or hosts[-1] == 0
+        if FLAGS.tensorboard:
+            check_tensorboard()
         preset = command_line.preset_from_flags()
         _check_flags(preset)
         output_dir = pathlib.Path(FLAGS.output_dir or "")
@@ -329,6 +335,7 @@ def main(argv: list[str]) -> None:
         if first and not FLAGS.resume:
             write_manifest(output_dir, manifest)
         for scene in captures:
+            log = TrainLog(output_dir, scene.name, tensorboard=FLAGS.tensorboard)
             found[scene.name] = run_sweep(
                 scene,
                 preset,
@@ -339,6 +346,7 @@ def main(argv: list[str]) -> None:
                 max_parallel=FLAGS.max_parallel,
                 perceptual=perceptual,
                 seconds=seconds[scene.name],
+                log=log if first else None,
             )
             if first:
                 write_sweep(output_dir, found, about)
