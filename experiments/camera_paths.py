@@ -5,6 +5,7 @@ Poses are camera-to-world in the scene's own world: for a capture that of its `t
 
 import math
 import pathlib
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -92,18 +93,22 @@ def read_camera_path(path: pathlib.Path) -> Shots:
     return Shots(_stack(poses, intrinsics, height, width), _numbered(len(poses)), fps)
 
 
-def orbit(scene: Scene, frames: int) -> Shots:
+def orbit(scene: Scene, frames: int, *, up: Sequence[float] | None = None) -> Shots:
     """Cameras on a circle around what the training cameras look at, all looking there.
 
-    The circle has the training cameras' median height over that point, along their mean upward
-    direction, and their median distance from the vertical through it; lens and size are those of
-    the first training view.
+    The circle has the training cameras' median height over that point and their median distance
+    from the vertical through it; lens and size are those of the first training view.
+
+    Args:
+      scene: of the training cameras.
+      frames: how many.
+      up: direction `[3]` of the vertical, in the world; by default the cameras' mean one.
     """
     cameras = scene.train.cameras
     positions, rotations = (np.asarray(a, np.float64) for a in (cameras.position, cameras.rotation))
     forward = rotations[..., 2]
     centre = looked_at(positions, forward, near=scene.near, far=scene.far)
-    up = _unit(-rotations[..., 1].mean(axis=0))
+    up = _unit(-rotations[..., 1].mean(axis=0) if up is None else np.asarray(up, np.float64))
     offset = positions - centre
     height = np.median(offset @ up)
     flat = offset - (offset @ up)[:, None] * up

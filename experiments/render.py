@@ -13,6 +13,7 @@ sharply. `--fine_tune` first trains for exactly these cameras, with labels made 
 
 import datetime
 import functools
+import math
 import pathlib
 import sys
 from collections.abc import Iterator, Sequence
@@ -59,6 +60,7 @@ flags.DEFINE_string("views", None, "render the cameras of these photographs: tes
 flags.DEFINE_string("camera_path", None, "render the cameras of this file, a camera_path.json")
 flags.DEFINE_string("target", None, "as --camera_path, with --fine_tune")
 flags.DEFINE_bool("orbit", False, "render a circle around what the training cameras look at")
+flags.DEFINE_list("up", None, "x,y,z in the world: up of an orbit; default: mean of the cameras'")
 flags.DEFINE_string("from", None, "render a dolly from the training view of this name ...")
 flags.DEFINE_list("pixel", None, "... towards the surface at its pixel x,y, as it was trained ...")
 flags.DEFINE_float("magnification", 4.0, "... until it is so many times nearer")
@@ -77,6 +79,7 @@ flags.DEFINE_bool("support", True, "also render what photographs saw; needs thei
 _FOR = {
     **dict.fromkeys(("frames", "width", "height"), ("orbit", "from")),
     **dict.fromkeys(("pixel", "magnification"), ("from",)),
+    "up": ("orbit",),
 }
 
 
@@ -109,7 +112,7 @@ def _render() -> None:
     if way == "views":
         shots = camera_paths.view_shots(scene, FLAGS.views)
     elif way == "orbit":
-        shots = _resized(camera_paths.orbit(scene, FLAGS.frames))
+        shots = _resized(camera_paths.orbit(scene, FLAGS.frames, up=_up()))
     elif way == "from":
         index = camera_paths.find_view(scene, FLAGS["from"].value)
         view = camera_at(scene.train.cameras, index)
@@ -264,6 +267,7 @@ def _chosen_way() -> str:
                 f"--magnification={FLAGS.magnification:g} must be 1 or more: a dolly comes nearer"
             )
         _pixel()
+    _up()
     return given[0]
 
 
@@ -275,6 +279,21 @@ def _pixel() -> tuple[float, float]:
             "--from needs --pixel=x,y: two numbers, of a pixel of that view"
         ) from None
     return x, y
+
+
+def _up() -> tuple[float, ...] | None:
+    if FLAGS.up is None:
+        return None
+    try:
+        x, y, z = map(float, FLAGS.up)
+        length = math.hypot(x, y, z)
+        if not 0 < length < math.inf:
+            raise ValueError
+    except ValueError:
+        raise CameraError(
+            f"--up={','.join(FLAGS.up)} must be three finite numbers x,y,z, not all of them 0"
+        ) from None
+    return x / length, y / length, z / length
 
 
 def _resized(shots: Shots) -> Shots:

@@ -153,6 +153,32 @@ def test_an_orbit_is_the_circle_of_cameras_that_stand_on_one(capture_folder):
     np.testing.assert_allclose(depth, math.hypot(3, 2), rtol=1e-5)
 
 
+def test_an_orbit_stands_upright_in_the_direction_that_is_given(capture_folder):
+    scene = load_scene(str(capture_folder))
+    centre, radius, height = np.array([1.0, -2.0, 0.5]), 3.0, 2.0
+    cameras = ring(centre, radius, height)
+    scene = dataclasses.replace(scene, train=scene.train.replace(cameras=cameras))
+    # About -z the circle is the same, and every camera upside down.
+    shots = camera_paths.orbit(scene, 12, up=(0, 0, -3))
+    offset = np.asarray(shots.cameras.position) - centre
+    np.testing.assert_allclose(offset[:, 2], height, atol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(offset[:, :2], axis=1), radius, atol=1e-4)
+    down = np.asarray(shots.cameras.rotation)[..., 1]
+    np.testing.assert_allclose(down[:, 2], radius / math.hypot(radius, height), atol=1e-4)
+    # About x: as far from that axis as the cameras of the ring, who are evenly on both its sides.
+    shots = camera_paths.orbit(scene, 8, up=(0.1, 0, 0))
+    offset = np.asarray(shots.cameras.position) - centre
+    np.testing.assert_allclose(offset[:, 0], 0, atol=1e-4)
+    angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    expected = np.median(np.hypot(radius * np.sin(angles), height))
+    np.testing.assert_allclose(np.linalg.norm(offset, axis=1), expected, atol=1e-4)
+    steps = np.einsum("ni,ni->n", offset, np.roll(offset, 1, axis=0)) / expected**2
+    np.testing.assert_allclose(steps, math.cos(2 * np.pi / 8), atol=1e-4)
+    rotation = np.asarray(shots.cameras.rotation)
+    np.testing.assert_allclose(rotation[..., 1], np.tile([-1, 0, 0], (8, 1)), atol=1e-4)
+    np.testing.assert_allclose(rotation[..., 2], -offset / expected, atol=1e-4)
+
+
 def test_cameras_that_look_nowhere_in_common_look_ahead():
     positions, forward = np.eye(3), np.tile([0.0, 0, 1], (3, 1))
     point = looked_at(positions, forward, near=1.0, far=3.0)
