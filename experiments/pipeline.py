@@ -25,7 +25,12 @@ from experiments.evaluation import (
 from experiments.gate import print_gate, weigh_labels
 from experiments.logs import TrainLog
 from experiments.loop import Programs, run_stage
-from experiments.manifest import about_scene, hash_data, write_manifest
+from experiments.manifest import (
+    about_scene,
+    hash_data,
+    write_dataparser_transforms,
+    write_manifest,
+)
 from experiments.pictures import comparisons, label_pictures, write_renders
 from experiments.presets import Preset, initial_points, pseudo_settings
 from experiments.report import in_short, write_json, write_report
@@ -93,6 +98,7 @@ def run(
     manifest = {**names, "seed": seed, "config": config(preset), "versions": versions()}
     manifest |= about_scene(scene, load_options)
     write_manifest(output_dir, manifest)
+    write_dataparser_transforms(output_dir, scene)
 
     def train(stage, kind, state, *data, steps):
         with timed(seconds, stage):

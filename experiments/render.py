@@ -58,6 +58,12 @@ flags.DEFINE_string("stage", None, "which state to render; default: closeup, or 
 flags.DEFINE_string("data", None, "where the run's capture lies now, if it was moved")
 flags.DEFINE_string("views", None, "render the cameras of these photographs: test, test_far, train")
 flags.DEFINE_string("camera_path", None, "render the cameras of this file, a camera_path.json")
+flags.DEFINE_string(
+    "camera_transform",
+    None,
+    "dataparser_transforms.json of the nerfstudio run in which the camera path was made: brings it "
+    "back to the capture's coordinates; default: it is in these",
+)
 flags.DEFINE_string("target", None, "as --camera_path, with --fine_tune")
 flags.DEFINE_bool("orbit", False, "render a circle around what the training cameras look at")
 flags.DEFINE_list("up", None, "x,y,z in the world: up of an orbit; default: mean of the cameras'")
@@ -80,6 +86,7 @@ _FOR = {
     **dict.fromkeys(("frames", "width", "height"), ("orbit", "from")),
     **dict.fromkeys(("pixel", "magnification"), ("from",)),
     "up": ("orbit",),
+    "camera_transform": ("camera_path", "target"),
 }
 
 
@@ -108,7 +115,11 @@ def _render() -> None:
     output_dir = check_unused(FLAGS.output_dir or record.folder / "videos" / stamp)
     file = FLAGS.target or FLAGS.camera_path
     shots = camera_paths.read_camera_path(pathlib.Path(file)) if file else None
+    moved = FLAGS.camera_transform
+    moved = camera_paths.read_camera_transform(pathlib.Path(moved)) if moved else None
     scene = load_run_scene(record, FLAGS.data)
+    if moved is not None:
+        shots = camera_paths.to_capture(shots, *moved, scene)
     if way == "views":
         shots = camera_paths.view_shots(scene, FLAGS.views)
     elif way == "orbit":

@@ -10,9 +10,10 @@ import pytest
 
 from experiments import camera_paths
 from experiments.camera_paths import CameraError, check_pixel, dolly, looked_at, read_camera_path
+from experiments.manifest import write_dataparser_transforms
 from jaxcloseup.batch import camera_at
 from jaxcloseup.geometry.cameras import Camera, pixels_to_points, points_to_pixels
-from jaxcloseup.scenes import load_scene
+from jaxcloseup.scenes import SceneError, load_scene
 
 
 def path_file(folder, **changes):
@@ -53,6 +54,87 @@ def test_a_camera_path_is_read_as_nerfstudio_means_it(tmp_path):
 @pytest.mark.parametrize(("changes", "fps"), [({"fps": None}, 1.0), ({"seconds": None}, 24)])
 def test_frames_a_second_follow_from_seconds(tmp_path, changes, fps):
     assert read_camera_path(path_file(tmp_path, **changes)).fps == fps
+
+
+def random_similarity(rng):
+    """A rotation with a translation, `[3, 4]`, and a scale."""
+    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    q *= np.sign(np.diag(r))
+    q[:, 0] *= np.linalg.det(q)
+    return np.column_stack([q, rng.normal(size=3)]), rng.uniform(0.1, 3)
+
+
+# As nerfstudio's ns-process-data writes it.
+APPLIED = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
+
+
+@pytest.mark.parametrize("applied", [None, APPLIED])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_path_of_nerfstudio_comes_back_to_the_capture(tmp_path, capture_folder, applied, seed):
+    """What a camera shows of points is what the camera that comes back shows of the capture's."""
+    scene = load_scene(str(capture_folder))
+    scene.metadata["applied_transform"] = applied
+    rng = np.random.default_rng(seed)
+    transform, scale = random_similarity(rng)
+    original = rng.normal(size=(20, 3))
+    theirs = scale * (original @ transform[:, :3].T + transform[:, 3])
+    ours = original if applied is None else original @ applied[:, :3].T + applied[:, 3]
+    file = tmp_path / "dataparser_transforms.json"
+    file.write_text(json.dumps({"transform": transform.tolist(), "scale": scale}))
+    shots = read_camera_path(path_file(tmp_path))
+    back = camera_paths.to_capture(shots, *camera_paths.read_camera_transform(file), scene)
+    pose = np.asarray(shots.cameras.camtoworld[0], np.float64)
+    seen = (theirs - pose[:, 3]) @ pose[:, :3]  # in the camera's frame
+    pose = np.asarray(back.cameras.camtoworld[0], np.float64)
+    np.testing.assert_allclose((ours - pose[:, 3]) @ pose[:, :3], seen / scale, atol=1e-5)
+    np.testing.assert_allclose(pose[:, :3].T @ pose[:, :3], np.eye(3), atol=1e-5)
+    np.testing.assert_array_equal(back.cameras.intrinsics, shots.cameras.intrinsics)
+
+
+@pytest.mark.parametrize("applied", [None, APPLIED])
+def test_what_a_run_says_of_its_coordinates_leads_back_to_them(tmp_path, capture_folder, applied):
+    scene = load_scene(str(capture_folder))
+    scene.metadata["applied_transform"] = applied
+    write_dataparser_transforms(tmp_path, scene)
+    file = tmp_path / "dataparser_transforms.json"
+    said = json.loads(file.read_text())
+    assert said["scale"] == 1
+    np.testing.assert_array_equal(said["transform"], np.eye(3, 4) if applied is None else applied)
+    shots = read_camera_path(path_file(tmp_path))
+    back = camera_paths.to_capture(shots, *camera_paths.read_camera_transform(file), scene)
+    np.testing.assert_allclose(back.cameras.camtoworld, shots.cameras.camtoworld, atol=1e-6)
+
+
+def test_a_transform_of_another_capture_is_one_sentence(tmp_path, capture_folder):
+    scene = load_scene(str(capture_folder))
+    scene.metadata["applied_transform"] = 2 * APPLIED
+    shots = read_camera_path(path_file(tmp_path))
+    with pytest.raises(SceneError, match="applied_transform after --camera_transform is not rigid"):
+        camera_paths.to_capture(shots, APPLIED, 1.0, scene)
+
+
+RIGID = np.eye(3, 4).tolist()
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"scale": 1}, "transform must be a 4x4 matrix"),
+        ({"transform": RIGID[:2], "scale": 1}, "transform must be a 4x4 matrix"),
+        ({"transform": [[math.nan] * 4, *RIGID[1:]], "scale": 1}, "a value that is not finite"),
+        ({"transform": [[1.01, 0, 0, 0], *RIGID[1:]], "scale": 1}, "transform is not rigid"),
+        ({"transform": [[-1, 0, 0, 0], *RIGID[1:]], "scale": 1}, "transform mirrors space"),
+        ({"transform": RIGID}, "scale must be a finite number"),
+        ({"transform": RIGID, "scale": 0}, "scale must be greater than 0"),
+        ([], "not an object with a transform and a scale"),
+    ],
+)
+def test_a_broken_camera_transform_is_one_sentence(tmp_path, fields, message):
+    file = tmp_path / "t.json"
+    file.write_text(json.dumps(fields))
+    with pytest.raises(SceneError, match=message) as error:
+        camera_paths.read_camera_transform(file)
+    assert "t.json" in str(error.value) and "\n" not in str(error.value)
 
 
 FLAT = np.eye(4).ravel().tolist()

@@ -132,6 +132,10 @@ MISTAKES = {
     "frames of views": ({"frames": 9}, "--frames says nothing of --views"),
     "pixel of views": ({"pixel": ["3", "4"]}, "--pixel says nothing of --views"),
     "up of views": ({"up": ["0", "0", "1"]}, "--up says nothing of --views"),
+    "transform of views": (
+        {"camera_transform": "t.json"},
+        "--camera_transform says nothing of --views",
+    ),
     "no direction": ({"views": None, "orbit": True, "up": ["0"] * 3}, "--up=0,0,0 must be three"),
     "up and nan": ({"views": None, "orbit": True, "up": ["0", "nan", "1"]}, "--up=0,nan,1 must be"),
     "up in words": ({"views": None, "orbit": True, "up": ["z"]}, "--up=z must be three"),
