@@ -77,8 +77,7 @@ def run(
       load_options: what `load_scene` was given, to load the scene again; for the manifest.
       tensorboard: whether to write event files, beside `stats/train.jsonl`.
     """
-    key_init, key_audit, key_pictures = jax.random.split(jax.random.key(seed), 3)
-    key_points = jax.random.fold_in(key_init, 2)
+    _, key_audit, key_pictures = jax.random.split(jax.random.key(seed), 3)
     scene = dataclasses.replace(scene, train=jax.device_put(scene.train))
     views, size = scene.train, scene.train.cameras
     print(
@@ -134,8 +133,7 @@ def run(
                 path = output_dir / "splats" / f"{stage}.ply"
                 write_surfels(path, state.params, state.buffers.alive)
 
-    points = initial_points(key_points, scene)
-    state = init_state(key_init, *points, field=programs.field, optimizer=programs.optimizer)
+    state = state_to_begin(programs, seed)
     baseline = train("baseline", "photographs", state, views, steps=preset.baseline_steps)
     render = functools.partial(programs.render, baseline)
     with timed(seconds, "depths"):
@@ -212,6 +210,13 @@ def run(
     write_report(output_dir / "report.html", results, pictures)
     write_manifest(output_dir, manifest, seconds)
     return results
+
+
+def state_to_begin(programs: Programs, seed: int) -> TrainState:
+    """What a seed's baseline is trained from, in a run and in a sweep."""
+    key_init, _, _ = jax.random.split(jax.random.key(seed), 3)
+    points = initial_points(jax.random.fold_in(key_init, 2), programs.scene)
+    return init_state(key_init, *points, field=programs.field, optimizer=programs.optimizer)
 
 
 def training_depths(programs: Programs, state: TrainState, seed: int) -> jax.Array:

@@ -35,8 +35,15 @@ from experiments.logs import TrainLog, check_tensorboard
 from experiments.loop import HOSTS_WAIT, Programs, TrainingError, run_stage
 from experiments.manifest import NAME as MANIFEST
 from experiments.manifest import about_scene, hash_data, write_manifest
-from experiments.pipeline import config, rendered_depths, timed, training_depths, versions
-from experiments.presets import Preset, initial_points, pseudo_settings
+from experiments.pipeline import (
+    config,
+    rendered_depths,
+    state_to_begin,
+    timed,
+    training_depths,
+    versions,
+)
+from experiments.presets import Preset, pseudo_settings
 from experiments.set_up import set_up
 from experiments.sweep_report import print_sweep, write_sweep
 from experiments.zoom_ladder import ladder_targets
@@ -45,7 +52,7 @@ from jaxcloseup.geometry.union_warp import SourceBlocks, block_sources
 from jaxcloseup.pseudo import PseudoSettings, label_views
 from jaxcloseup.scenes import Scene, SceneError
 from jaxcloseup.splats.field import SurfelConfig
-from jaxcloseup.train import TrainState, init_state
+from jaxcloseup.train import TrainState
 
 
 class _Start(NamedTuple):
@@ -143,12 +150,8 @@ def run_sweep(
         return _Start(state, depths, sources, skipped)
 
     for seed in range(seeds):
-        key_init, _, _ = jax.random.split(jax.random.key(seed), 3)
-        points = initial_points(jax.random.fold_in(key_init, 2), scene)
-        state = init_state(key_init, *points, field=programs.field, optimizer=programs.optimizer)
-        steps = preset.baseline_steps
-        name = f"baseline_{seed}"
-        state, history = stage(name, programs, "photographs", state, views, steps=steps)
+        data = programs, "photographs", state_to_begin(programs, seed), views
+        state, history = stage(f"baseline_{seed}", *data, steps=preset.baseline_steps)
         starts.append(start_from(state, seed, _skipped(history)))
     exact = exact_depths(scene, views.cameras) if scene.surface else None
     render = functools.partial(programs.render, starts[0].state)
