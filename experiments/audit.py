@@ -18,7 +18,13 @@ from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points, points_to_pixels
 from jaxcloseup.geometry.masks import depth_consistent, in_bounds
 from jaxcloseup.geometry.warp import backward_warp
-from jaxcloseup.pseudo import PseudoSettings, best_source, make_label, sample_virtual_camera
+from jaxcloseup.pseudo import (
+    PseudoLabel,
+    PseudoSettings,
+    best_source,
+    make_label,
+    sample_virtual_camera,
+)
 from jaxcloseup.scenes import Scene
 
 
@@ -100,7 +106,7 @@ def audit_labels(
       coverage as a share of all pixels.
     """
     sample = jax.jit(sample_virtual_camera)
-    label_image = jax.jit(make_label)
+    label_image = jax.jit(_label_twice)
     of_curve: list[tuple[np.ndarray, ...]] = []
     pixels_total = 0
     error = kept = kept_visible = visible_total = 0.0
@@ -109,23 +115,21 @@ def audit_labels(
         pixels = pixel_grid(camera.height, camera.width)
         data = camera, pixels, render_depth(camera), index, scene.train, depths
         label = label_image(*data, settings)
+        weight, of_any_colour = np.asarray(label.weight)
         truth = scene.surface(camera)
         visible, footprint = _seen_by(
             camera, pixels, truth.depth, camera_at(scene.train.cameras, index), exact_depths[index]
         )
         visible = np.asarray(visible, np.float32)
         blurred = blur_to_footprint(np.asarray(truth.rgb), np.asarray(footprint))
-        weight = np.asarray(label.weight)
         difference = np.abs(label.rgb - blurred).mean(axis=-1)
         error += float((weight * difference).sum())
         kept += float(weight.sum())
         kept_visible += float((weight * visible).sum())
         visible_total += float(visible.sum())
-        scored = label_image(*data, _of_any_colour(settings))
-        inside = np.asarray(scored.weight) > 0
-        score = np.abs(scored.backward - scored.forward).max(axis=-1)
-        scored_error = np.abs(scored.rgb - blurred).mean(axis=-1)
-        columns = score, scored_error, 1 - visible
+        inside = of_any_colour > 0
+        score = np.abs(label.backward - label.forward).max(axis=-1)
+        columns = score, difference, 1 - visible
         of_curve.append(tuple(column[inside] for column in columns))
         pixels_total += inside.size
     shares = {
@@ -185,6 +189,20 @@ def error_curve(
     gap = np.subtract(curve["error"], curve["oracle"])
     largest = curve["error"][-1]
     return curve | {"ause": float(np.trapezoid(gap, shares) / largest) if largest else 0.0}
+
+
+def _label_twice(camera, pixels, depth, index, views, depths, settings):
+    """The label, of which `weight` `[2, H, W]` is as settings say and as it is of any colour."""
+    ways = settings, _of_any_colour(settings)
+
+    def label(use_mask, rgb_tolerance):
+        changed = settings.replace(use_mask=use_mask, rgb_tolerance=rgb_tolerance)
+        return make_label(camera, pixels, depth, index, views, depths, changed)
+
+    # What is not batched, the warps above all, is made once.
+    return jax.vmap(label, out_axes=PseudoLabel(None, 0, None, None))(
+        jnp.stack([way.use_mask for way in ways]), jnp.stack([way.rgb_tolerance for way in ways])
+    )
 
 
 def _of_any_colour(settings: PseudoSettings) -> PseudoSettings:

@@ -5,6 +5,7 @@ Poses are camera-to-world in the scene's own world: for a capture that of its `t
 
 import math
 import pathlib
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ from jaxcloseup.batch import Views, camera_at
 from jaxcloseup.geometry.cameras import Camera, pixels_to_points
 from jaxcloseup.geometry.poses import closeup_position
 from jaxcloseup.scenes import Scene, SceneError
-from jaxcloseup.scenes.fields import read_object
+from jaxcloseup.scenes.fields import number, read_object, rigid_transform
 
 
 FPS = 30.0
@@ -92,18 +93,59 @@ def read_camera_path(path: pathlib.Path) -> Shots:
     return Shots(_stack(poses, intrinsics, height, width), _numbered(len(poses)), fps)
 
 
-def orbit(scene: Scene, frames: int) -> Shots:
+def read_camera_transform(path: pathlib.Path) -> tuple[np.ndarray, float]:
+    """The `transform` `[3, 4]`, float64, and the `scale` of a `dataparser_transforms.json`.
+
+    Raises:
+      SceneError: names the file and the field.
+    """
+    fields = read_object(path, "a transform and a scale")
+    transform = rigid_transform(str(path), "transform", fields.get("transform"))
+    return transform, number(str(path), "scale", fields.get("scale"), above=0)
+
+
+def to_capture(shots: Shots, transform: np.ndarray, scale: float, scene: Scene) -> Shots:
+    """Cameras of nerfstudio's world in that of the scene.
+
+    nerfstudio moves a point x of the capture's original world, which is the scene's world before
+    the `applied_transform` of its `transforms.json`, to scale * transform (x, 1).
+
+    Args:
+      shots: cameras that nerfstudio shows.
+      transform: `[3, 4]`.
+      scale: of positions.
+      scene: that nerfstudio was given.
+
+    Raises:
+      SceneError: the `applied_transform` does not go with the transform.
+    """
+    last = [0.0, 0, 0, 1]
+    applied = scene.metadata.get("applied_transform")
+    back = np.linalg.inv(np.vstack([transform, last]))
+    back = (np.eye(3, 4) if applied is None else applied) @ back
+    back = rigid_transform(scene.name, "applied_transform after --camera_transform", back)
+    poses = np.asarray(shots.cameras.camtoworld, np.float64) / [1, 1, 1, scale]
+    poses = back[:, :3] @ poses + back[:, 3:] * [0, 0, 0, 1]
+    camtoworld = jnp.asarray(poses, jnp.float32)
+    return shots._replace(cameras=shots.cameras.replace(camtoworld=camtoworld))
+
+
+def orbit(scene: Scene, frames: int, *, up: Sequence[float] | None = None) -> Shots:
     """Cameras on a circle around what the training cameras look at, all looking there.
 
-    The circle has the training cameras' median height over that point, along their mean upward
-    direction, and their median distance from the vertical through it; lens and size are those of
-    the first training view.
+    The circle has the training cameras' median height over that point and their median distance
+    from the vertical through it; lens and size are those of the first training view.
+
+    Args:
+      scene: of the training cameras.
+      frames: how many.
+      up: direction `[3]` of the vertical, in the world; by default the cameras' mean one.
     """
     cameras = scene.train.cameras
     positions, rotations = (np.asarray(a, np.float64) for a in (cameras.position, cameras.rotation))
     forward = rotations[..., 2]
     centre = looked_at(positions, forward, near=scene.near, far=scene.far)
-    up = _unit(-rotations[..., 1].mean(axis=0))
+    up = _unit(-rotations[..., 1].mean(axis=0) if up is None else np.asarray(up, np.float64))
     offset = positions - centre
     height = np.median(offset @ up)
     flat = offset - (offset @ up)[:, None] * up

@@ -38,6 +38,9 @@ flags.DEFINE_integer(
     "closeup_steps", None, "steps of closeup and of control; default: the preset's", lower_bound=1
 )
 flags.DEFINE_bool("resume", False, "go on with the run in --output_dir where it was cut off")
+flags.DEFINE_bool(
+    "tensorboard", False, "also write event files for TensorBoard; needs the extra tensorboard"
+)
 flags.DEFINE_enum(
     "compute_dtype",
     "float32",

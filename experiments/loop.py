@@ -13,6 +13,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from orbax.checkpoint.multihost import sync_global_processes
 
+from experiments.logs import TrainLog
 from experiments.presets import Preset, make_field, make_optimizer, make_train_config
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.batch import Views
@@ -212,6 +213,7 @@ def run_stage(
     steps: int,
     checkpoints: Checkpoints,
     save_every: int,
+    log: TrainLog | None = None,
 ) -> tuple[TrainState, list[dict[str, Any]]]:
     """Take `steps` steps, reporting ten times or at least every 500 steps.
 
@@ -227,6 +229,7 @@ def run_stage(
       checkpoints: where states are kept.
       save_every: steps after which a state is kept, rounded up to when progress is reported; the
         last one always is.
+      log: is told of what is printed.
 
     Returns:
       The state, and for each chunk its metrics with `step`, counted within the stage.
@@ -241,6 +244,8 @@ def run_stage(
         programs.make_room(progress["growth"])
         print(f"{name:>9} {done}/{steps}  resumed")
     saved = done
+    if log is not None:
+        log.begin(name, history)
 
     def keep():
         progress = {"history": history, "growth": programs.growth}
@@ -269,6 +274,8 @@ def run_stage(
             f"{int(left // 60)}:{int(left % 60):02d} left  {shown}",
             flush=True,
         )
+        if log is not None:
+            log.write(history[-1])
         if done == steps or done - saved >= save_every:
             keep()
             saved = done

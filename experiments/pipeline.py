@@ -23,8 +23,14 @@ from experiments.evaluation import (
     targets_by_split,
 )
 from experiments.gate import print_gate, weigh_labels
+from experiments.logs import TrainLog
 from experiments.loop import Programs, run_stage
-from experiments.manifest import about_scene, hash_data, write_manifest
+from experiments.manifest import (
+    about_scene,
+    hash_data,
+    write_dataparser_transforms,
+    write_manifest,
+)
 from experiments.pictures import comparisons, label_pictures, write_renders
 from experiments.presets import Preset, initial_points, pseudo_settings
 from experiments.report import in_short, write_json, write_report
@@ -55,6 +61,7 @@ def run(
     save_every: int = 1000,
     perceptual: Perceptual = NO_PERCEPTUAL,
     load_options: Mapping[str, Any] | None = None,
+    tensorboard: bool = False,
 ) -> dict[str, Any]:
     """The stages on one scene; writes everything under `output_dir` and returns the results.
 
@@ -68,9 +75,9 @@ def run(
       save_every: steps between checkpoints. Those in `output_dir` are gone on from.
       perceptual: networks of LPIPS.
       load_options: what `load_scene` was given, to load the scene again; for the manifest.
+      tensorboard: whether to write event files, beside `stats/train.jsonl`.
     """
-    key_init, key_audit, key_pictures = jax.random.split(jax.random.key(seed), 3)
-    key_points = jax.random.fold_in(key_init, 2)
+    _, key_audit, key_pictures = jax.random.split(jax.random.key(seed), 3)
     scene = dataclasses.replace(scene, train=jax.device_put(scene.train))
     views, size = scene.train, scene.train.cameras
     print(
@@ -82,6 +89,7 @@ def run(
     identity |= {"resolution": [size.width, size.height], "version": jaxcloseup.__version__}
     identity["data_sha256"] = hash_data(scene)
     checkpoints = Checkpoints(output_dir / "checkpoints", identity)
+    log = TrainLog(output_dir, tensorboard=tensorboard)
     settings = pseudo_settings(preset)
     seconds: dict[str, float] = {}
     history, stages, renderings = {}, {}, {}
@@ -89,6 +97,7 @@ def run(
     manifest = {**names, "seed": seed, "config": config(preset), "versions": versions()}
     manifest |= about_scene(scene, load_options)
     write_manifest(output_dir, manifest)
+    write_dataparser_transforms(output_dir, scene)
 
     def train(stage, kind, state, *data, steps):
         with timed(seconds, stage):
@@ -101,27 +110,30 @@ def run(
                 steps=steps,
                 checkpoints=checkpoints,
                 save_every=save_every,
+                log=log,
             )
         return state
 
     def score(stage, state):
         with timed(seconds, f"{stage}_evaluation"):
-            stages[stage] = {}
+            stages[stage], shown = {}, {}
             for split, of_split in held_out.items():
                 rendered = functools.partial(programs.render, state)
                 stages[stage][split], seen = evaluate(rendered, of_split, perceptual)
                 write_renders(output_dir / "renders" / stage / split, seen, scene)
                 if split in targets:
                     renderings[stage, split] = seen
+                    name, first = next(iter(seen.items()))
+                    shown[f"{split}/{name}"] = first.rgb
                     print(f"{stage:>9} {split}: {in_short(stages[stage][split])}", flush=True)
+            log.evaluated(stage, stages[stage], shown)
             if len(held_out) > len(targets):
                 print(f"{stage:>9} {ladder_in_short(stages[stage])}", flush=True)
             if isinstance(state.params, Surfels):
                 path = output_dir / "splats" / f"{stage}.ply"
                 write_surfels(path, state.params, state.buffers.alive)
 
-    points = initial_points(key_points, scene)
-    state = init_state(key_init, *points, field=programs.field, optimizer=programs.optimizer)
+    state = state_to_begin(programs, seed)
     baseline = train("baseline", "photographs", state, views, steps=preset.baseline_steps)
     render = functools.partial(programs.render, baseline)
     with timed(seconds, "depths"):
@@ -198,6 +210,13 @@ def run(
     write_report(output_dir / "report.html", results, pictures)
     write_manifest(output_dir, manifest, seconds)
     return results
+
+
+def state_to_begin(programs: Programs, seed: int) -> TrainState:
+    """What a seed's baseline is trained from, in a run and in a sweep."""
+    key_init, _, _ = jax.random.split(jax.random.key(seed), 3)
+    points = initial_points(jax.random.fold_in(key_init, 2), programs.scene)
+    return init_state(key_init, *points, field=programs.field, optimizer=programs.optimizer)
 
 
 def training_depths(programs: Programs, state: TrainState, seed: int) -> jax.Array:

@@ -13,6 +13,7 @@ sharply. `--fine_tune` first trains for exactly these cameras, with labels made 
 
 import datetime
 import functools
+import math
 import pathlib
 import sys
 from collections.abc import Iterator, Sequence
@@ -57,8 +58,15 @@ flags.DEFINE_string("stage", None, "which state to render; default: closeup, or 
 flags.DEFINE_string("data", None, "where the run's capture lies now, if it was moved")
 flags.DEFINE_string("views", None, "render the cameras of these photographs: test, test_far, train")
 flags.DEFINE_string("camera_path", None, "render the cameras of this file, a camera_path.json")
+flags.DEFINE_string(
+    "camera_transform",
+    None,
+    "dataparser_transforms.json of the nerfstudio run in which the camera path was made: brings it "
+    "back to the capture's coordinates; default: it is in these",
+)
 flags.DEFINE_string("target", None, "as --camera_path, with --fine_tune")
 flags.DEFINE_bool("orbit", False, "render a circle around what the training cameras look at")
+flags.DEFINE_list("up", None, "x,y,z in the world: up of an orbit; default: mean of the cameras'")
 flags.DEFINE_string("from", None, "render a dolly from the training view of this name ...")
 flags.DEFINE_list("pixel", None, "... towards the surface at its pixel x,y, as it was trained ...")
 flags.DEFINE_float("magnification", 4.0, "... until it is so many times nearer")
@@ -77,6 +85,8 @@ flags.DEFINE_bool("support", True, "also render what photographs saw; needs thei
 _FOR = {
     **dict.fromkeys(("frames", "width", "height"), ("orbit", "from")),
     **dict.fromkeys(("pixel", "magnification"), ("from",)),
+    "up": ("orbit",),
+    "camera_transform": ("camera_path", "target"),
 }
 
 
@@ -105,11 +115,15 @@ def _render() -> None:
     output_dir = check_unused(FLAGS.output_dir or record.folder / "videos" / stamp)
     file = FLAGS.target or FLAGS.camera_path
     shots = camera_paths.read_camera_path(pathlib.Path(file)) if file else None
+    moved = FLAGS.camera_transform
+    moved = camera_paths.read_camera_transform(pathlib.Path(moved)) if moved else None
     scene = load_run_scene(record, FLAGS.data)
+    if moved is not None:
+        shots = camera_paths.to_capture(shots, *moved, scene)
     if way == "views":
         shots = camera_paths.view_shots(scene, FLAGS.views)
     elif way == "orbit":
-        shots = _resized(camera_paths.orbit(scene, FLAGS.frames))
+        shots = _resized(camera_paths.orbit(scene, FLAGS.frames, up=_up()))
     elif way == "from":
         index = camera_paths.find_view(scene, FLAGS["from"].value)
         view = camera_at(scene.train.cameras, index)
@@ -264,6 +278,7 @@ def _chosen_way() -> str:
                 f"--magnification={FLAGS.magnification:g} must be 1 or more: a dolly comes nearer"
             )
         _pixel()
+    _up()
     return given[0]
 
 
@@ -275,6 +290,21 @@ def _pixel() -> tuple[float, float]:
             "--from needs --pixel=x,y: two numbers, of a pixel of that view"
         ) from None
     return x, y
+
+
+def _up() -> tuple[float, ...] | None:
+    if FLAGS.up is None:
+        return None
+    try:
+        x, y, z = map(float, FLAGS.up)
+        length = math.hypot(x, y, z)
+        if not 0 < length < math.inf:
+            raise ValueError
+    except ValueError:
+        raise CameraError(
+            f"--up={','.join(FLAGS.up)} must be three finite numbers x,y,z, not all of them 0"
+        ) from None
+    return x / length, y / length, z / length
 
 
 def _resized(shots: Shots) -> Shots:

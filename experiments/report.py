@@ -77,15 +77,16 @@ def print_table(results: Mapping[str, Any]) -> None:
 
 def write_json(path: pathlib.Path, results: Mapping[str, Any]) -> None:
     """Write strict JSON, whole or not at all; numbers that are not finite become null."""
-
-    def strict(value):
-        if isinstance(value, Mapping):
-            return {key: strict(inner) for key, inner in value.items()}
-        if isinstance(value, list | tuple):
-            return [strict(inner) for inner in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
     write_file(path, json.dumps(strict(results), indent=1, allow_nan=False).encode())
+
+
+def strict(value: Any) -> Any:
+    """What JSON is to hold, with None in place of numbers that are not finite."""
+    if isinstance(value, Mapping):
+        return {key: strict(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [strict(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def write_report(

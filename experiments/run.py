@@ -13,6 +13,7 @@ from absl import app, flags
 
 from experiments import command_line
 from experiments.evaluation import find_perceptual
+from experiments.logs import check_tensorboard
 from experiments.loop import TrainingError
 from experiments.output_dir import make
 from experiments.pipeline import STAGES, run
@@ -39,6 +40,8 @@ def main(argv: list[str]) -> None:
         raise app.UsageError(f"unexpected argument: {argv[1]}")
     set_up()
     try:
+        if FLAGS.tensorboard:
+            check_tensorboard()
         preset = command_line.preset_from_flags()
         output_dir = command_line.choose_output_dir(
             FLAGS.output_dir, FLAGS.scene, FLAGS.method, resume=FLAGS.resume
@@ -60,6 +63,7 @@ def main(argv: list[str]) -> None:
             save_every=FLAGS.save_every,
             perceptual=perceptual,
             load_options=load_options,
+            tensorboard=FLAGS.tensorboard,
         )
     except (TrainingError, CheckpointError, OSError) as error:
         sys.exit(f"experiments.run: {error}")

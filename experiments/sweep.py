@@ -31,12 +31,20 @@ from experiments.evaluation import (
     targets_by_split,
 )
 from experiments.fixed_labels import labels_of_less_error, true_close_ups
+from experiments.logs import TrainLog, check_tensorboard
 from experiments.loop import HOSTS_WAIT, Programs, TrainingError, run_stage
 from experiments.manifest import NAME as MANIFEST
 from experiments.manifest import about_scene, hash_data, write_manifest
 from experiments.output_dir import make
-from experiments.pipeline import config, rendered_depths, timed, training_depths, versions
-from experiments.presets import Preset, initial_points, pseudo_settings
+from experiments.pipeline import (
+    config,
+    rendered_depths,
+    state_to_begin,
+    timed,
+    training_depths,
+    versions,
+)
+from experiments.presets import Preset, pseudo_settings
 from experiments.set_up import set_up
 from experiments.sweep_report import print_sweep, write_sweep
 from experiments.zoom_ladder import ladder_targets
@@ -45,7 +53,7 @@ from jaxcloseup.geometry.union_warp import SourceBlocks, block_sources
 from jaxcloseup.pseudo import PseudoSettings, label_views
 from jaxcloseup.scenes import Scene, SceneError
 from jaxcloseup.splats.field import SurfelConfig
-from jaxcloseup.train import TrainState, init_state
+from jaxcloseup.train import TrainState
 
 
 class _Start(NamedTuple):
@@ -92,6 +100,7 @@ def run_sweep(
     max_parallel: int = 8,
     perceptual: Perceptual = NO_PERCEPTUAL,
     seconds: dict[str, float] | None = None,
+    log: TrainLog | None = None,
 ) -> dict[str, Any]:
     """All arms of one scene; returns, for each arm, the metrics of each seed and split.
 
@@ -105,6 +114,7 @@ def run_sweep(
       max_parallel: arms and seeds trained at once.
       perceptual: networks of LPIPS.
       seconds: is filled with the wall time of each stage.
+      log: is told of what is printed.
     """
     chosen = [make_arm(name, pseudo_settings(preset)) for name in arms]
     for arm in chosen:
@@ -130,7 +140,8 @@ def run_sweep(
 
     def stage(name, *data, steps):
         with timed(seconds, name):
-            return run_stage(name, *data, steps=steps, checkpoints=checkpoints, save_every=1000)
+            kept = {"checkpoints": checkpoints, "save_every": 1000, "log": log}
+            return run_stage(name, *data, steps=steps, **kept)
 
     starts = []
 
@@ -140,12 +151,8 @@ def run_sweep(
         return _Start(state, depths, sources, skipped)
 
     for seed in range(seeds):
-        key_init, _, _ = jax.random.split(jax.random.key(seed), 3)
-        points = initial_points(jax.random.fold_in(key_init, 2), scene)
-        state = init_state(key_init, *points, field=programs.field, optimizer=programs.optimizer)
-        steps = preset.baseline_steps
-        name = f"baseline_{seed}"
-        state, history = stage(name, programs, "photographs", state, views, steps=steps)
+        data = programs, "photographs", state_to_begin(programs, seed), views
+        state, history = stage(f"baseline_{seed}", *data, steps=preset.baseline_steps)
         starts.append(start_from(state, seed, _skipped(history)))
     exact = exact_depths(scene, views.cameras) if scene.surface else None
     render = functools.partial(programs.render, starts[0].state)
@@ -303,6 +310,8 @@ def main(argv: list[str]) -> None:
     try:
         hosts = _hosts()
         first = hosts is None or hosts[-1] == 0
+        if FLAGS.tensorboard:
+            check_tensorboard()
         preset = command_line.preset_from_flags()
         _check_flags(preset)
         output_dir = pathlib.Path(FLAGS.output_dir or "")
@@ -330,6 +339,7 @@ def main(argv: list[str]) -> None:
         if first and not FLAGS.resume:
             write_manifest(output_dir, manifest)
         for scene in captures:
+            log = TrainLog(output_dir, scene.name, tensorboard=FLAGS.tensorboard)
             found[scene.name] = run_sweep(
                 scene,
                 preset,
@@ -340,6 +350,7 @@ def main(argv: list[str]) -> None:
                 max_parallel=FLAGS.max_parallel,
                 perceptual=perceptual,
                 seconds=seconds[scene.name],
+                log=log if first else None,
             )
             if first:
                 write_sweep(output_dir, found, about)

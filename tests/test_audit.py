@@ -89,15 +89,20 @@ def test_curves_of_a_mask_that_knows_and_of_one_that_does_not():
 def test_labels_from_exact_depth_are_sorted_and_never_leak():
     cameras = [plane.camera_above(x, 0.1 * x, 4.0, tilt=0.1 * x) for x in (-1.0, 0.0, 1.0)]
     scene, depths = scene_of(cameras)
-    curve = audit_labels(
-        jax.random.key(0),
-        depths,
-        scene=scene,
-        settings=settings(),
-        depths=depths,
-        render_depth=lambda camera: striped(camera).depth,
-        count=3,
-    )["curve"]
+    of_labels = {
+        "scene": scene,
+        "depths": depths,
+        "render_depth": lambda camera: striped(camera).depth,
+        "count": 3,
+    }
+    strict = settings().replace(rgb_tolerance=jnp.float32(0.02))
+    masked = audit_labels(jax.random.key(0), depths, settings=strict, **of_labels)
+    no_mask = strict.replace(use_mask=jnp.float32(0))
+    whole = audit_labels(jax.random.key(0), depths, settings=no_mask, **of_labels)
+    # Without a mask everything is kept that the source sees; the curve is of any mask.
+    assert masked["kept"] < 0.5 < whole["kept"] == 1
+    curve = masked["curve"]
+    assert curve == whole["curve"]
     assert curve["leaked"] == [0.0] * 20
     assert 0.05 < curve["coverage"][-1] < 1
     assert all(np.less_equal(curve["oracle"], np.add(curve["error"], 1e-9)))

@@ -10,9 +10,10 @@ import pytest
 
 from experiments import camera_paths
 from experiments.camera_paths import CameraError, check_pixel, dolly, looked_at, read_camera_path
+from experiments.manifest import write_dataparser_transforms
 from jaxcloseup.batch import camera_at
 from jaxcloseup.geometry.cameras import Camera, pixels_to_points, points_to_pixels
-from jaxcloseup.scenes import load_scene
+from jaxcloseup.scenes import SceneError, load_scene
 
 
 def path_file(folder, **changes):
@@ -53,6 +54,87 @@ def test_a_camera_path_is_read_as_nerfstudio_means_it(tmp_path):
 @pytest.mark.parametrize(("changes", "fps"), [({"fps": None}, 1.0), ({"seconds": None}, 24)])
 def test_frames_a_second_follow_from_seconds(tmp_path, changes, fps):
     assert read_camera_path(path_file(tmp_path, **changes)).fps == fps
+
+
+def random_similarity(rng):
+    """A rotation with a translation, `[3, 4]`, and a scale."""
+    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    q *= np.sign(np.diag(r))
+    q[:, 0] *= np.linalg.det(q)
+    return np.column_stack([q, rng.normal(size=3)]), rng.uniform(0.1, 3)
+
+
+# As nerfstudio's ns-process-data writes it.
+APPLIED = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
+
+
+@pytest.mark.parametrize("applied", [None, APPLIED])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_path_of_nerfstudio_comes_back_to_the_capture(tmp_path, capture_folder, applied, seed):
+    """What a camera shows of points is what the camera that comes back shows of the capture's."""
+    scene = load_scene(str(capture_folder))
+    scene.metadata["applied_transform"] = applied
+    rng = np.random.default_rng(seed)
+    transform, scale = random_similarity(rng)
+    original = rng.normal(size=(20, 3))
+    theirs = scale * (original @ transform[:, :3].T + transform[:, 3])
+    ours = original if applied is None else original @ applied[:, :3].T + applied[:, 3]
+    file = tmp_path / "dataparser_transforms.json"
+    file.write_text(json.dumps({"transform": transform.tolist(), "scale": scale}))
+    shots = read_camera_path(path_file(tmp_path))
+    back = camera_paths.to_capture(shots, *camera_paths.read_camera_transform(file), scene)
+    pose = np.asarray(shots.cameras.camtoworld[0], np.float64)
+    seen = (theirs - pose[:, 3]) @ pose[:, :3]  # in the camera's frame
+    pose = np.asarray(back.cameras.camtoworld[0], np.float64)
+    np.testing.assert_allclose((ours - pose[:, 3]) @ pose[:, :3], seen / scale, atol=1e-5)
+    np.testing.assert_allclose(pose[:, :3].T @ pose[:, :3], np.eye(3), atol=1e-5)
+    np.testing.assert_array_equal(back.cameras.intrinsics, shots.cameras.intrinsics)
+
+
+@pytest.mark.parametrize("applied", [None, APPLIED])
+def test_what_a_run_says_of_its_coordinates_leads_back_to_them(tmp_path, capture_folder, applied):
+    scene = load_scene(str(capture_folder))
+    scene.metadata["applied_transform"] = applied
+    write_dataparser_transforms(tmp_path, scene)
+    file = tmp_path / "dataparser_transforms.json"
+    said = json.loads(file.read_text())
+    assert said["scale"] == 1
+    np.testing.assert_array_equal(said["transform"], np.eye(3, 4) if applied is None else applied)
+    shots = read_camera_path(path_file(tmp_path))
+    back = camera_paths.to_capture(shots, *camera_paths.read_camera_transform(file), scene)
+    np.testing.assert_allclose(back.cameras.camtoworld, shots.cameras.camtoworld, atol=1e-6)
+
+
+def test_a_transform_of_another_capture_is_one_sentence(tmp_path, capture_folder):
+    scene = load_scene(str(capture_folder))
+    scene.metadata["applied_transform"] = 2 * APPLIED
+    shots = read_camera_path(path_file(tmp_path))
+    with pytest.raises(SceneError, match="applied_transform after --camera_transform is not rigid"):
+        camera_paths.to_capture(shots, APPLIED, 1.0, scene)
+
+
+RIGID = np.eye(3, 4).tolist()
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"scale": 1}, "transform must be a 4x4 matrix"),
+        ({"transform": RIGID[:2], "scale": 1}, "transform must be a 4x4 matrix"),
+        ({"transform": [[math.nan] * 4, *RIGID[1:]], "scale": 1}, "a value that is not finite"),
+        ({"transform": [[1.01, 0, 0, 0], *RIGID[1:]], "scale": 1}, "transform is not rigid"),
+        ({"transform": [[-1, 0, 0, 0], *RIGID[1:]], "scale": 1}, "transform mirrors space"),
+        ({"transform": RIGID}, "scale must be a finite number"),
+        ({"transform": RIGID, "scale": 0}, "scale must be greater than 0"),
+        ([], "not an object with a transform and a scale"),
+    ],
+)
+def test_a_broken_camera_transform_is_one_sentence(tmp_path, fields, message):
+    file = tmp_path / "t.json"
+    file.write_text(json.dumps(fields))
+    with pytest.raises(SceneError, match=message) as error:
+        camera_paths.read_camera_transform(file)
+    assert "t.json" in str(error.value) and "\n" not in str(error.value)
 
 
 FLAT = np.eye(4).ravel().tolist()
@@ -151,6 +233,32 @@ def test_an_orbit_is_the_circle_of_cameras_that_stand_on_one(capture_folder):
     pixel, depth = jax.vmap(points_to_pixels, (0, None))(shots.cameras, jnp.asarray(centre, "f"))
     np.testing.assert_allclose(pixel, np.tile([16, 12], (12, 1)), atol=1e-2)
     np.testing.assert_allclose(depth, math.hypot(3, 2), rtol=1e-5)
+
+
+def test_an_orbit_stands_upright_in_the_direction_that_is_given(capture_folder):
+    scene = load_scene(str(capture_folder))
+    centre, radius, height = np.array([1.0, -2.0, 0.5]), 3.0, 2.0
+    cameras = ring(centre, radius, height)
+    scene = dataclasses.replace(scene, train=scene.train.replace(cameras=cameras))
+    # About -z the circle is the same, and every camera upside down.
+    shots = camera_paths.orbit(scene, 12, up=(0, 0, -3))
+    offset = np.asarray(shots.cameras.position) - centre
+    np.testing.assert_allclose(offset[:, 2], height, atol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(offset[:, :2], axis=1), radius, atol=1e-4)
+    down = np.asarray(shots.cameras.rotation)[..., 1]
+    np.testing.assert_allclose(down[:, 2], radius / math.hypot(radius, height), atol=1e-4)
+    # About x: as far from that axis as the cameras of the ring, who are evenly on both its sides.
+    shots = camera_paths.orbit(scene, 8, up=(0.1, 0, 0))
+    offset = np.asarray(shots.cameras.position) - centre
+    np.testing.assert_allclose(offset[:, 0], 0, atol=1e-4)
+    angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    expected = np.median(np.hypot(radius * np.sin(angles), height))
+    np.testing.assert_allclose(np.linalg.norm(offset, axis=1), expected, atol=1e-4)
+    steps = np.einsum("ni,ni->n", offset, np.roll(offset, 1, axis=0)) / expected**2
+    np.testing.assert_allclose(steps, math.cos(2 * np.pi / 8), atol=1e-4)
+    rotation = np.asarray(shots.cameras.rotation)
+    np.testing.assert_allclose(rotation[..., 1], np.tile([-1, 0, 0], (8, 1)), atol=1e-4)
+    np.testing.assert_allclose(rotation[..., 2], -offset / expected, atol=1e-4)
 
 
 def test_cameras_that_look_nowhere_in_common_look_ahead():

@@ -52,6 +52,17 @@ def run_tiny(capture_folder, output_dir):
         return run(scene, TINY, 0, output_dir, names=names, save_every=3)
 
 
+def assert_log_is_history(output_dir, history):
+    lines = list(map(json.loads, (output_dir / "stats" / "train.jsonl").read_text().splitlines()))
+    assert [line["stage"] for line in lines] == [s for s in history for _ in history[s]]
+    said = [
+        {key: value for key, value in line.items() if key not in ("steps_per_second", "seconds")}
+        for line in lines
+    ]
+    assert said == [{"stage": stage, **entry} for stage in history for entry in history[stage]]
+    assert all(line["steps_per_second"] > 0 and line["seconds"] > 0 for line in lines)
+
+
 def test_a_run_scores_every_stage_on_every_split(finished):
     results, output_dir = finished
     assert json.loads((output_dir / "results.json").read_text()) == results
@@ -65,6 +76,7 @@ def test_a_run_scores_every_stage_on_every_split(finished):
             assert scores["lpips_vgg_reason"]
         assert results["seconds"][stage] > 0
     assert results["stages"]["control"] != results["stages"]["closeup"]
+    assert_log_is_history(output_dir, results["history"])
 
 
 def test_a_run_leaves_what_it_takes_to_render_it(finished, capture_folder):
@@ -207,6 +219,7 @@ def test_a_run_cut_off_and_resumed_ends_the_same(
     assert "resumed" in capsys.readouterr().out
     assert again["stages"] == results["stages"]
     assert again["history"] == results["history"]
+    assert_log_is_history(tmp_path, results["history"])
 
 
 def test_nothing_to_resume_is_one_sentence(parsed_flags, tmp_path):
