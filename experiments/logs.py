@@ -6,8 +6,8 @@ history: what was said after its last checkpoint is said again when it is done a
 
 import json
 import pathlib
-import struct
 import time
+import weakref
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -112,15 +112,17 @@ class _EventFile:
     """A new event file of a folder, which takes the place of older ones.
 
     These stay, for a TensorBoard that is reading them would stop; the new one's second event tells
-    it to forget all steps from 0 on. Nothing waits in a queue, as it does in tensorboardX's own
-    writer: a run may end at any time.
+    it to forget all steps from 0 on. tensorboardX's `SummaryWriter` keeps events in a queue, which
+    a run that is killed loses; what it writes with does not.
     """
 
     def __init__(self, folder):
+        from tensorboardX.event_file_writer import EventsWriter
+
         folder.mkdir(parents=True, exist_ok=True)
-        # The files of a folder are read in the order of their names.
-        self._file = folder / f"events.out.tfevents.{time.time_ns()}"
-        self._add(file_version="brain.Event:2")
+        # The files of a folder are read in the order of their names, which tell seconds.
+        self._writer = EventsWriter(str(folder / "events"), f".{time.time_ns()}")
+        weakref.finalize(self, self._writer.close)
         self._add(step=0, session_log={"status": "START"})
 
     def write(self, step, numbers, images=None, *, ago=0.0):
@@ -139,13 +141,9 @@ class _EventFile:
 
     def _add(self, ago=0.0, **fields):
         from tensorboardX.proto.event_pb2 import Event
-        from tensorboardX.record_writer import masked_crc32c
 
-        event = Event(wall_time=time.time() - ago, **fields).SerializeToString()
-        size = struct.pack("<Q", len(event))
-        checks = (struct.pack("<I", masked_crc32c(part)) for part in (size, event))
-        with self._file.open("ab") as file:
-            file.write(size + next(checks) + event + next(checks))
+        self._writer.write_event(Event(wall_time=time.time() - ago, **fields))
+        self._writer.flush()
 
 
 def _parse(text):
