@@ -10,15 +10,13 @@ import warnings
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import jax
-
 from experiments import manifest
 from experiments.loop import Programs
-from experiments.pipeline import config
-from experiments.presets import Preset, initial_points
+from experiments.pipeline import config, state_to_begin
+from experiments.presets import Preset
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.scenes import Scene, load_scene
-from jaxcloseup.train import TrainState, init_state
+from jaxcloseup.train import TrainState
 
 
 # What is rendered where nobody says: the first of these that a run has.
@@ -127,9 +125,7 @@ def restore(record: Record, scene: Scene, stage: str) -> tuple[Programs, TrainSt
     """
     preset = record.preset
     programs = Programs(preset, scene)
-    points = initial_points(jax.random.key(0), scene)
-    bound = {"field": programs.field, "optimizer": programs.optimizer}
-    like = init_state(jax.random.key(0), *points, **bound)
+    like = state_to_begin(programs, seed=0)
     found = Checkpoints(record.folder / "checkpoints", record.identity).load(stage, like)
     if found is None:
         raise RunError(f"--stage={stage}: {record.folder} has no state of it")
