@@ -32,19 +32,19 @@ def main(argv: list[str]) -> None:
         raise app.UsageError(f"unexpected argument: {argv[1]}")
     set_up()
     try:
-        from experiments import viewer
+        from experiments import serving, viewer
     except ModuleNotFoundError as error:
         if error.name != "viser":
             raise
         sys.exit('experiments.view: needs viser: install jaxcloseup with the extra "viewer"')
     try:
         record, stage = named_run()
-        viewer.check_address(FLAGS.host, FLAGS.port)
+        serving.check_address(FLAGS.host, FLAGS.port)
         scene = load_run_scene(record, FLAGS.data)
         programs, state = restore(record, scene, stage)
-        server = viewer.serve(FLAGS.host, FLAGS.port)
+        server = serving.serve(FLAGS.host, FLAGS.port)
         page = viewer.Viewer(server, programs, state, stage=stage, seed=record.identity["seed"])
-    except (RunError, viewer.ViewError, SceneError, CheckpointError, OSError) as error:
+    except (RunError, serving.ServeError, SceneError, CheckpointError, OSError) as error:
         sys.exit(f"experiments.view: {error}")
     print(f"open http://{FLAGS.host}:{FLAGS.port} in a browser; Ctrl-C ends this", flush=True)
     with contextlib.suppress(KeyboardInterrupt):

@@ -1,12 +1,7 @@
 """The page of `experiments.view`: a run's scene, its photographs, and buttons. Needs Viser."""
 
-import contextlib
 import functools
-import io
-import logging
-import os
 import queue
-import socket
 import time
 import traceback
 
@@ -14,7 +9,6 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
-import viser
 from viser.transforms import SO3
 
 from experiments.camera_paths import Shots, looked_at
@@ -27,6 +21,7 @@ from experiments.picking import (
     vertical_fov,
 )
 from experiments.pipeline import training_depths
+from experiments.serving import Server
 from experiments.shots import fine_tune, pictures
 from jaxcloseup.artifacts.gaussians import as_gaussians
 from jaxcloseup.artifacts.images import encode_png, to_uint8
@@ -44,33 +39,7 @@ _SHOWN = 360  # what is narrower is drawn larger
 
 
 class ViewError(Exception):
-    """Something cannot be shown or done. The message is one sentence that says what to do."""
-
-
-class Server(viser.ViserServer):
-    """Viser's, without its tunnel to a public server, which any page could ask for."""
-
-    def request_share_url(self, verbose: bool = True) -> None:
-        """Not done."""
-
-
-def serve(host: str, port: int) -> Server:
-    """A server that can be reached at this address only.
-
-    Raises:
-      ViewError: the address cannot be had.
-    """
-    check_address(host, port)
-
-    logging.getLogger("websockets").setLevel(logging.WARNING)
-    # Viser has a banner of its own, and takes the next port where one is in use.
-    with contextlib.redirect_stdout(io.StringIO()):
-        server = Server(host=host, port=port, verbose=False)
-    if server.get_port() != port:
-        server.stop()
-        raise ViewError(f"--port={port} was taken just now: choose another")
-    server.gui.configure_theme(show_share_button=False, control_width="large")
-    return server
+    """Something cannot be done here. The message is one sentence that says what to do."""
 
 
 class Viewer:
@@ -147,6 +116,9 @@ class Viewer:
                 found.opacities[:, None],
                 scale=unit,
             )
+            # As the run's own renderer has it.
+            background = self._programs.preset.field.background or 0.0
+            scene.set_background_image(to_uint8(np.full((1, 1), background)))
         elif len(self._scene.points):
             size = 0.003 * self._distance
             points, rgb = self._scene.points, to_uint8(self._scene.rgb[None])[0]
@@ -170,7 +142,7 @@ class Viewer:
             scale=self._size,
             thickness=1.5,
             thickness_units="screen",
-            color=(90, 90, 90) if image is not None else (220, 0, 0),
+            color=(150, 150, 150) if image is not None else (220, 0, 0),
             image=image,
             wxyz=_quaternion(camera),
             position=np.asarray(camera.position),
@@ -253,8 +225,8 @@ class Viewer:
         best = int(ranks.argmax())
         self._aim = camera_at(views.cameras, best), point
         self._place(client)
-        name = self._scene.names["train"][best]
-        return f"{np.count_nonzero(ranks)} photographs show that; nearer to it than {name}"
+        shown = f"{np.count_nonzero(ranks)} of {len(ranks)} photographs show that"
+        return f"{shown}; the camera came nearer from {self._scene.names['train'][best]}"
 
     def _place(self, client):
         """The close-up's camera as far from the point as the slider says."""
@@ -308,16 +280,3 @@ def _bring(client, camera, distance):
 
 def _quaternion(camera):
     return SO3.from_matrix(np.asarray(camera.rotation, np.float64)).wxyz
-
-
-def check_address(host: str, port: int) -> None:
-    """Whether a server can be there; where it cannot, Viser would look for another port."""
-    try:
-        with socket.create_server((host, port)):
-            pass
-    except OSError as error:
-        reason = os.strerror(error.errno) if error.errno and error.errno > 0 else error.strerror
-        raise ViewError(
-            f"--host={host} --port={port} cannot be served at ({reason}): choose another port, or "
-            "an address of this computer"
-        ) from None

@@ -14,7 +14,7 @@ from tiny_runs import TINY
 
 from experiments import view as program
 from experiments.finished import load_run_scene, read_run, restore
-from experiments.loop import Programs
+from experiments.loop import Programs, TrainingError
 
 
 HAS = "return document.body.innerText.includes(arguments[0])"
@@ -32,21 +32,20 @@ return pixels.length == 2 && pixels[0] != arguments[0] ? pixels : null;
 
 
 @pytest.fixture
-def viewer():
-    pytest.importorskip("viser", reason='needs viser (the extra "viewer")')
-    from experiments import viewer
-
-    return viewer
+def viser():
+    return pytest.importorskip("viser", reason='needs viser (the extra "viewer")')
 
 
 @pytest.fixture
-def serve(viewer):
+def serve(viser):
     """Serve a state at a free port; returns the page and its address."""
+    from experiments import serving, viewer
+
     servers = []
 
     def call(programs, state):
         port = free_port()
-        servers.append(viewer.serve("127.0.0.1", port))
+        servers.append(serving.serve("127.0.0.1", port))
         page = viewer.Viewer(servers[0], programs, state, stage="closeup", seed=0)
         return page, f"http://127.0.0.1:{port}"
 
@@ -56,12 +55,12 @@ def serve(viewer):
         server.stop()
 
 
-def test_a_closeup_is_chosen_and_rendered_in_a_browser(serve, viewer, kept, monkeypatch):
+def test_a_closeup_is_chosen_and_rendered_in_a_browser(serve, kept, monkeypatch):
     def darker(programs, state, depths, shots, *, most):
         assert depths.shape == programs.scene.train.weight.shape and shots.names == ["closeup"]
         return state.replace(params=state.params.replace(sh=state.params.sh - 1))
 
-    monkeypatch.setattr(viewer, "fine_tune", darker)
+    monkeypatch.setattr("experiments.viewer.fine_tune", darker)
     with open_browser() as browser:
         record = read_run(kept)
         programs, state = restore(record, load_run_scene(record), "closeup")
@@ -92,8 +91,29 @@ def test_a_nerf_is_shown_by_its_points(serve, kept):
         page.work(timeout=0)
 
 
-def test_nothing_is_ever_shared(viewer):
-    server = viewer.serve("127.0.0.1", free_port())
+def test_failures_are_said_on_the_page_which_goes_on(serve, kept, capsys):
+    page, _ = serve(
+        Programs(TINY, load_run_scene(read_run(kept))), types.SimpleNamespace(params={})
+    )
+
+    def fail(error):
+        raise error
+
+    page._later("trying", lambda: fail(TrainingError("the loss was not finite")))
+    page._later("trying more", lambda: "done")
+    assert "still work to do" in page._status.content
+    page.work()
+    assert page._status.content == "the loss was not finite"
+    page._later("trying", lambda: fail(ValueError("a bug")))
+    page.work()
+    assert page._status.content == "trying failed (ValueError): the terminal says more."
+    assert "ValueError: a bug" in capsys.readouterr().err
+
+
+def test_nothing_is_ever_shared(viser):
+    from experiments import serving
+
+    server = serving.serve("127.0.0.1", free_port())
     assert server.request_share_url() is None
     assert server._share_tunnel is None
     server.stop()
@@ -110,7 +130,7 @@ def run(kept):
     return call
 
 
-def test_mistakes_are_one_sentence(run, viewer):
+def test_mistakes_are_one_sentence(run, viser):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(SystemExit, match=rf"--port={port} cannot be served at \(Address al"):
@@ -123,7 +143,8 @@ def test_mistakes_are_one_sentence(run, viewer):
 
 def test_without_viser_the_extra_is_named(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    monkeypatch.delitem(sys.modules, "experiments.viewer", raising=False)
-    monkeypatch.delattr("experiments.viewer", raising=False)
+    for name in ("experiments.serving", "experiments.viewer"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+        monkeypatch.delattr(name, raising=False)
     with pytest.raises(SystemExit, match='install jaxcloseup with the extra "viewer"'):
         run()
