@@ -107,7 +107,8 @@ class Viewer:
         if isinstance(params, Surfels):
             found = as_gaussians(params, self._state.buffers.alive)
             # Viser keeps covariances in 16 bits: the largest radius is 100 in the units it gets.
-            unit = max(np.sqrt(np.trace(found.covariances, axis1=1, axis2=2)).max(), 1e-9) / 100
+            variances = np.trace(found.covariances, axis1=1, axis2=2)
+            unit = np.sqrt(variances.max(initial=1e-18)) / 100
             scene.add_gaussian_splats(
                 "/surfels",
                 found.means / unit,
@@ -276,6 +277,7 @@ def _bring(client, camera, distance):
         client.camera.look_at = position + distance * forward
         client.camera.wxyz = _quaternion(camera)
         client.camera.fov = vertical_fov(camera)
+        client.camera.near, client.camera.far = distance / 100, 1000 * distance
 
 
 def _quaternion(camera):
