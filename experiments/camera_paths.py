@@ -157,7 +157,7 @@ def orbit(scene: Scene, frames: int, *, up: Sequence[float] | None = None) -> Sh
     poses = []
     for angle in np.arange(frames) * (2 * np.pi / frames):
         position = radius * (np.cos(angle) * east + np.sin(angle) * north) + height * up
-        poses.append(_look(centre + position, centre, up))
+        poses.append(look(centre + position, centre, up))
     intrinsics = np.tile(np.asarray(cameras.intrinsics[0]), (frames, 1))
     return Shots(_stack(poses, intrinsics, cameras.height, cameras.width), _numbered(frames))
 
@@ -265,8 +265,8 @@ def _stack(poses: Any, intrinsics: Any, height: int, width: int) -> Camera:
     )
 
 
-def _look(position, target, up):
-    """Pose `[3, 4]` at a position, looking at a target, in OpenCV's frame."""
+def look(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Pose `[3, 4]` at a position `[3]`, looking at a target, in OpenCV's frame."""
     forward = _unit(target - position)
     right = np.cross(forward, up)
     if np.linalg.norm(right) < 1e-6:  # straight up or down: any right will do

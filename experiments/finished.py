@@ -10,6 +10,8 @@ import warnings
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from absl import flags
+
 from experiments import manifest
 from experiments.loop import Programs
 from experiments.pipeline import config, state_to_begin
@@ -18,6 +20,11 @@ from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.scenes import Scene, load_scene
 from jaxcloseup.train import TrainState
 
+
+FLAGS = flags.FLAGS
+flags.DEFINE_string("run", None, "folder of the run")
+flags.DEFINE_string("stage", None, "which state to render; default: closeup, or the last there is")
+flags.DEFINE_string("data", None, "where the run's capture lies now, if it was moved")
 
 # What is rendered where nobody says: the first of these that a run has.
 _BY_DEFAULT = ("closeup", "control", "baseline")
@@ -43,6 +50,18 @@ class Record(NamedTuple):
     identity: Mapping[str, Any]
     preset: Preset
     stages: list[str]
+
+
+def named_run() -> tuple[Record, str]:
+    """The run that `--run` names, and its stage that `--stage` does.
+
+    Raises:
+      RunError: there is none.
+    """
+    if FLAGS.run is None:
+        raise RunError("--run is missing: name the folder of a run of experiments.run")
+    record = read_run(pathlib.Path(FLAGS.run))
+    return record, choose_stage(record, FLAGS.stage)
 
 
 def read_run(folder: pathlib.Path) -> Record:

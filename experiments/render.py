@@ -12,50 +12,33 @@ sharply. `--fine_tune` first trains for exactly these cameras, with labels made 
 """
 
 import datetime
-import functools
 import math
 import pathlib
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import cv2
-import jax
-import jax.numpy as jnp
 import numpy as np
 from absl import app, flags
 
 from experiments import camera_paths
 from experiments.camera_paths import CameraError, Shots
-from experiments.finished import RunError, choose_stage, load_run_scene, read_run, restore
-from experiments.gate import print_gate, weigh_labels
-from experiments.loop import Programs, TrainingError
+from experiments.finished import RunError, load_run_scene, named_run, restore
+from experiments.loop import TrainingError
 from experiments.output_dir import check_unused
 from experiments.pipeline import training_depths
-from experiments.presets import pseudo_settings
 from experiments.set_up import set_up
+from experiments.shots import fine_tune, render_shots
 from jaxcloseup.artifacts.checkpoints import CheckpointError
-from jaxcloseup.artifacts.images import (
-    colorize_depth,
-    colorize_normals,
-    colorize_support,
-    write_png,
-)
 from jaxcloseup.artifacts.video import write_video
 from jaxcloseup.batch import camera_at
-from jaxcloseup.geometry.cameras import pixel_grid
-from jaxcloseup.geometry.union_warp import block_sources
-from jaxcloseup.pseudo import label_views
-from jaxcloseup.scenes import Scene, SceneError
-from jaxcloseup.splats.field import SurfelConfig
-from jaxcloseup.support import find_support
-from jaxcloseup.train import TrainState, labelled_depth
+from jaxcloseup.scenes import SceneError
+from jaxcloseup.train import labelled_depth
 
 
 FLAGS = flags.FLAGS
-flags.declare_key_flag("output_dir")
-flags.DEFINE_string("run", None, "folder of the run")
-flags.DEFINE_string("stage", None, "which state to render; default: closeup, or the last there is")
-flags.DEFINE_string("data", None, "where the run's capture lies now, if it was moved")
+for _name in ("output_dir", "run", "stage", "data"):
+    flags.declare_key_flag(_name)
 flags.DEFINE_string("views", None, "render the cameras of these photographs: test, test_far, train")
 flags.DEFINE_string("camera_path", None, "render the cameras of this file, a camera_path.json")
 flags.DEFINE_string(
@@ -107,10 +90,7 @@ def main(argv: list[str]) -> None:
 def _render() -> None:
     # What costs nothing is checked first.
     way = _chosen_way()
-    if FLAGS.run is None:
-        raise RunError("--run is missing: name the folder of a run of experiments.run")
-    record = read_run(pathlib.Path(FLAGS.run))
-    stage = choose_stage(record, FLAGS.stage)
+    record, stage = named_run()
     stamp = datetime.datetime.now().strftime("%Y-%m-%d_%H%M%S")
     output_dir = check_unused(FLAGS.output_dir or record.folder / "videos" / stamp)
     file = FLAGS.target or FLAGS.camera_path
@@ -156,103 +136,6 @@ def _render() -> None:
             print(f"video: {path}")
         if path.suffix != ".mp4":
             print('MP4 needs imageio-ffmpeg: install jaxcloseup with the extra "video"')
-
-
-def fine_tune(
-    programs: Programs, state: TrainState, depths: jax.Array, shots: Shots, *, most: int | None
-) -> TrainState:
-    """Train a state for the cameras that are to be rendered, with labels made once for them.
-
-    Where the preset has a gate, it weighs the labels again.
-
-    Args:
-      programs: of the run.
-      state: of which depth is rendered for the labels.
-      depths: `[V, H, W]` of the training views, of this state.
-      shots: the cameras.
-      most: steps in all; by default the preset's, for each camera of surfels.
-    """
-    preset, scene = programs.preset, programs.scene
-    render = functools.partial(programs.render, state)
-    settings, views = pseudo_settings(preset), scene.train
-    if preset.gated:
-        settings, found = weigh_labels(views, depths, render, settings)
-        print_gate(found)
-        if not found["weight"]:
-            print("nothing is fine-tuned")
-            return state
-    # Targets may be nearer to the surface than any photograph was.
-    seen = (render(camera) for _, camera in camera_paths.one_by_one(shots))
-    targets = jnp.stack([labelled_depth(one, near=0, far=scene.far) for one in seen])
-    sources = jax.jit(block_sources)(views.cameras, depths, views.weight)
-    data = shots.cameras, targets, views, depths, settings
-    labels = jax.jit(label_views)(*data, sources=sources)
-    steps = preset.test_time_steps
-    if isinstance(preset.field, SurfelConfig):
-        steps *= len(shots.names)
-    steps = min(steps, most or steps)
-    coverage = float(jnp.mean(labels.weight))
-    print(f"labels on {coverage:.0%} of the pixels to be rendered; {steps} steps", flush=True)
-    if coverage == 0:
-        print("nothing is fine-tuned")
-        return state
-    state, values = programs.run("targets", state, views, labels, settings, count=steps)
-    numbers = {key: value for key, value in values.items() if isinstance(value, float)}
-    print("  ".join(f"{key} {value:.4g}" for key, value in numbers.items()))
-    return state
-
-
-def render_shots(
-    output_dir: pathlib.Path,
-    programs: Programs,
-    state: TrainState,
-    shots: Shots,
-    *,
-    depths: jax.Array | None,
-) -> list[pathlib.Path]:
-    """Write `<kind>/<name>.png` for every camera; returns the folders.
-
-    Args:
-      output_dir: for `rgb`, `depth`, `normals` of surfels, and `support`.
-      programs: of the run.
-      state: what is rendered.
-      shots: cameras.
-      depths: `[V, H, W]` of the training views, or None for no support.
-    """
-    scene = programs.scene
-    support = jax.jit(find_support)
-    kinds: list[str] = []
-    cameras = camera_paths.one_by_one(shots)
-    # Depth has the colours of three frames in all of them, so that videos do not flicker.
-    some = [programs.render(state, cameras[i][1]) for i in {0, len(cameras) // 2, len(cameras) - 1}]
-    limits = depth_range([labelled_depth(one, near=0, far=scene.far) for one in some], scene)
-    for name, camera in cameras:
-        seen = programs.render(state, camera)
-        solid = np.asarray(seen.alpha) >= 0.5
-        depth_colours = colorize_depth(seen.depth, near=limits[0], far=limits[1], valid=solid)
-        images = {"rgb": seen.rgb, "depth": depth_colours}
-        surfels = getattr(seen.aux, "surfels", None)
-        if surfels is not None:
-            images["normals"] = colorize_normals(np.where(solid[..., None], surfels.normal, 0))
-        if depths is not None:
-            depth = labelled_depth(seen, near=0, far=scene.far)
-            pixels = pixel_grid(camera.height, camera.width)
-            found = support(camera, pixels, depth, scene.train, depths)
-            images["support"] = colorize_support(*found)
-        for kind, image in images.items():
-            write_png(output_dir / kind / f"{name}.png", image)
-        kinds = list(images)
-    return [output_dir / kind for kind in kinds]
-
-
-def depth_range(depths: Sequence[jax.Array], scene: Scene) -> tuple[float, float]:
-    """Near and far of most of these depths, 0 being undefined, or else the scene's."""
-    known = np.concatenate([np.asarray(depth).ravel() for depth in depths])
-    known = known[known > 0]
-    if not len(known):
-        return scene.near, scene.far
-    low, high = np.percentile(known, [1, 99])
-    return float(low), float(high)
 
 
 def _chosen_way() -> str:

@@ -7,7 +7,7 @@ import tempfile
 
 import jax
 import pytest
-from tiny_runs import write_plane
+from tiny_runs import keep_run, write_plane
 
 
 # Arms of sweeps are spread over all devices; read when the first array is made.
@@ -57,3 +57,9 @@ def key(request):
 def capture_folder(tmp_path_factory):
     """The plane as photographs in the paper's layout."""
     return write_plane(tmp_path_factory.mktemp("plane"))
+
+
+@pytest.fixture(scope="session")
+def kept(capture_folder, tmp_path_factory):
+    """A run of surfels on it, as it is left on disk."""
+    return keep_run(tmp_path_factory.mktemp("kept"), capture_folder)

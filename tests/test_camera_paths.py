@@ -217,7 +217,7 @@ def ring(centre, radius, height, count=12):
     poses = []
     for angle in np.linspace(0, 2 * np.pi, count, endpoint=False):
         position = centre + np.array([radius * np.cos(angle), radius * np.sin(angle), height])
-        poses.append(camera_paths._look(position, centre, np.array([0.0, 0, 1])))
+        poses.append(camera_paths.look(position, centre, np.array([0.0, 0, 1])))
     intrinsics = jnp.tile(jnp.array([40.0, 40, 16, 12]), (count, 1))
     return Camera(jnp.asarray(np.array(poses), jnp.float32), intrinsics, 24, 32)
 

@@ -18,8 +18,8 @@ DISCS = 500
 def project(surfels, camera):
     discs, normals = to_camera(surfels, camera)
     opacity = jax.nn.sigmoid(surfels.opacity_logits)
-    footprints = project_discs(discs, opacity, normals, camera, near=NEAR)
-    return footprints.box, footprints.opacity, footprints.anchor, footprints.rows
+    found = project_discs(discs, opacity, normals, camera, near=NEAR)
+    return found.box, found.opacity, found.anchor, found.rows, found.low_pass
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ def test_rays_see_what_the_rows_say():
     """u, v and 1/z of the homography against the intersection, wherever the anchor lies."""
     scene = random_scene(3, depth=(-1.0, 2.0), log_scale=(-1.0, 1.0), count=DISCS)
     camera = make_camera(intrinsics=INTRINSICS, size=SIZE)
-    _, opacity, anchor, rows = map(np.asarray, project(to_surfels(scene), camera))
+    _, opacity, anchor, rows, _ = map(np.asarray, project(to_surfels(scene), camera))
     pixel = np.array([40.3, 11.7])
     d = np.concatenate([np.ones((DISCS, 1)), pixel - anchor.astype(np.float64)], axis=1)
     u, v, inverse = np.einsum("nij,nj->in", rows.astype(np.float64), d)
@@ -89,6 +89,18 @@ def test_rays_see_what_the_rows_say():
             np.testing.assert_allclose(actual, expected, rtol=2e-4, atol=2e-4)
             checked += 1
     assert checked > 100
+
+
+def test_the_low_pass_of_discs_behind_the_camera_is_out_of_sight():
+    """It once showed them in the middle pixel of images with odd sides."""
+    height, width = size = (47, 63)
+    scene = random_scene(5, depth=(-1.0, -0.5), log_scale=(0.0, 1.0), count=DISCS)
+    camera = make_camera(intrinsics=INTRINSICS, size=size)
+    _, opacity, anchor, _, low_pass = map(np.asarray, project(to_surfels(scene), camera))
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
+    rho = low_pass * np.sum((pixels[:, None] - anchor) ** 2, axis=-1).min(axis=0)
+    assert np.sum(opacity > 0) > DISCS // 10 and np.all(rho > 100)
 
 
 def test_near_must_be_positive():

@@ -5,54 +5,21 @@ import json
 
 import cv2
 import jax
-import jax.numpy as jnp
 import numpy as np
 import plane
 import pytest
 from absl import flags
 from absl.testing import flagsaver
 from test_camera_paths import path_file
-from tiny_runs import TINY_SURFELS
+from tiny_runs import KEPT
 
 from experiments import render as program
+from experiments import shots
 from experiments.finished import load_run_scene, preset_from_config, read_run
 from experiments.loop import Programs
-from experiments.manifest import about_scene, write_manifest
 from experiments.pipeline import config
 from experiments.presets import PRESETS, with_classic_density
-from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.scenes import load_scene
-from jaxcloseup.train import init_state
-
-
-PRESET = dataclasses.replace(TINY_SURFELS, gated=False)
-HALF = 1.4  # the surfels reach so far from the middle of the plane
-
-
-@pytest.fixture(scope="session")
-def kept(capture_folder, tmp_path_factory):
-    """A folder as a run leaves it, cut off after its closeup."""
-    folder = tmp_path_factory.mktemp("kept")
-    with jax.numpy_dtype_promotion("standard"):
-        scene = load_scene(str(capture_folder))
-        side = np.linspace(-HALF, HALF, 24)
-        points = np.stack([*np.meshgrid(side, side), np.zeros((24, 24))], -1).reshape(-1, 3)
-        programs = Programs(PRESET, scene)
-        bound = {"field": programs.field, "optimizer": programs.optimizer}
-        data = (jnp.asarray(x, jnp.float32) for x in (points, plane.texture(points)))
-        state = init_state(jax.random.key(0), *data, **bound)
-        flat = {
-            "opacity_logits": jnp.full_like(state.params.opacity_logits, 3.0),
-            "quaternions": jnp.zeros_like(state.params.quaternions).at[:, 0].set(1),
-        }
-        state = state.replace(params=state.params.replace(**flat))
-    write_manifest(folder, about_scene(scene, {"downscale": 1}) | {"seed": 0})
-    size = [plane.WIDTH, plane.HEIGHT]
-    identity = {"scene": scene.name, "config": config(PRESET), "resolution": size, "seed": 0}
-    checkpoints = Checkpoints(folder / "checkpoints", identity | {"version": "1"})
-    for stage in ("baseline", "closeup"):
-        checkpoints.save(stage, 3, state, {"history": [], "growth": 1})
-    return folder
 
 
 @pytest.fixture
@@ -115,10 +82,10 @@ def test_a_camera_path_may_be_fine_tuned_for(render, tmp_path, capsys):
 
 
 def test_nothing_is_fine_tuned_where_the_gate_lets_no_labels_in(capture_folder, monkeypatch):
-    monkeypatch.setattr(program, "weigh_labels", lambda *data: (data[-1], {"weight": 0.0}))
-    monkeypatch.setattr(program, "print_gate", lambda _: None)
-    programs = Programs(dataclasses.replace(PRESET, gated=True), load_scene(str(capture_folder)))
-    assert program.fine_tune(programs, "state", None, None, most=None) == "state"
+    monkeypatch.setattr(shots, "weigh_labels", lambda *data: (data[-1], {"weight": 0.0}))
+    monkeypatch.setattr(shots, "print_gate", lambda _: None)
+    programs = Programs(dataclasses.replace(KEPT, gated=True), load_scene(str(capture_folder)))
+    assert shots.fine_tune(programs, "state", None, None, most=None) == "state"
 
 
 MISTAKES = {
@@ -222,13 +189,13 @@ def test_presets_come_back_from_their_json(method):
         presets = [preset]
         if method == "surfels":
             field = with_classic_density(preset.field, name)
-            presets += [dataclasses.replace(preset, field=field), PRESET]
+            presets += [dataclasses.replace(preset, field=field), KEPT]
         for one in presets:
             assert preset_from_config(json.loads(json.dumps(config(one)))) == one
 
 
 def test_a_preset_of_another_form_names_the_field():
-    stored = config(PRESET)
+    stored = config(KEPT)
     field = stored["field"] | {"glow": 1}
     with pytest.raises(ValueError, match=r"config\.field differs in glow"):
         preset_from_config(stored | {"field": field})

@@ -4,12 +4,19 @@ import dataclasses
 import json
 
 import cv2
+import jax
+import jax.numpy as jnp
 import numpy as np
 import plane
 
+from experiments.loop import Programs
+from experiments.manifest import about_scene, write_manifest
+from experiments.pipeline import config
 from experiments.presets import QUICK, QUICK_SURFELS
+from jaxcloseup.artifacts.checkpoints import Checkpoints
+from jaxcloseup.scenes import load_scene
 from jaxcloseup.splats import RasterizeConfig
-from jaxcloseup.train import TrainConfig
+from jaxcloseup.train import TrainConfig, init_state
 from jaxcloseup.volume.nerf import NerfConfig
 
 
@@ -37,6 +44,8 @@ TINY_SURFELS = dataclasses.replace(
     test_time_steps=2,
     downscale=1,
 )
+KEPT = dataclasses.replace(TINY_SURFELS, gated=False)
+HALF = 1.4  # the surfels of a kept run reach so far from the middle of the plane
 OPENGL = np.diag([1.0, -1, -1])
 
 
@@ -62,4 +71,28 @@ def write_plane(folder):
             frames.append({"file_path": name, "transform_matrix": pose.tolist()} | intrinsics)
         text = json.dumps({"near": 1.0, "far": 8.0, "frames": frames})
         (folder / f"transforms_{split}.json").write_text(text)
+    return folder
+
+
+def keep_run(folder, capture_folder):
+    """A folder as a run leaves it, cut off after its closeup; its state is the plane as surfels."""
+    with jax.numpy_dtype_promotion("standard"):
+        scene = load_scene(str(capture_folder))
+        side = np.linspace(-HALF, HALF, 24)
+        points = np.stack([*np.meshgrid(side, side), np.zeros((24, 24))], -1).reshape(-1, 3)
+        programs = Programs(KEPT, scene)
+        bound = {"field": programs.field, "optimizer": programs.optimizer}
+        data = (jnp.asarray(x, jnp.float32) for x in (points, plane.texture(points)))
+        state = init_state(jax.random.key(0), *data, **bound)
+        flat = {
+            "opacity_logits": jnp.full_like(state.params.opacity_logits, 3.0),
+            "quaternions": jnp.zeros_like(state.params.quaternions).at[:, 0].set(1),
+        }
+        state = state.replace(params=state.params.replace(**flat))
+    write_manifest(folder, about_scene(scene, {"downscale": 1}) | {"seed": 0})
+    size = [plane.WIDTH, plane.HEIGHT]
+    identity = {"scene": scene.name, "config": config(KEPT), "resolution": size, "seed": 0}
+    checkpoints = Checkpoints(folder / "checkpoints", identity | {"version": "1"})
+    for stage in ("baseline", "closeup"):
+        checkpoints.save(stage, 3, state, {"history": [], "growth": 1})
     return folder

@@ -33,18 +33,23 @@ def to_uint8(image: Image) -> np.ndarray:
     )
 
 
+def encode_png(image: Image) -> bytes:
+    """The image as the bytes of an 8-bit PNG."""
+    return cv2.imencode(".png", to_uint8(image)[..., ::-1])[1].tobytes()
+
+
 def write_png(path: str | pathlib.Path, image: Image) -> None:
     """Write an image as an 8-bit PNG, whole or not at all, making its folders.
 
     Raises:
       OSError: the path cannot be written.
     """
-    write_file(path, _png(image))
+    write_file(path, encode_png(image))
 
 
 def png_data_uri(image: Image) -> str:
     """The image as a `data:` address, for a page that needs no files beside it."""
-    return "data:image/png;base64," + base64.b64encode(_png(image)).decode()
+    return "data:image/png;base64," + base64.b64encode(encode_png(image)).decode()
 
 
 def colorize_depth(
@@ -149,10 +154,6 @@ def side_by_side(
         row[: panel.shape[0], left : left + panel.shape[1]] = panel
         left += panel.shape[1] + gap
     return row
-
-
-def _png(image: Image) -> bytes:
-    return cv2.imencode(".png", to_uint8(image)[..., ::-1])[1].tobytes()
 
 
 def _map(unit: np.ndarray, colours: int) -> np.ndarray:

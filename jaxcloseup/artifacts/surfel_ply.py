@@ -11,12 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcloseup.artifacts.gaussians import thickened
 from jaxcloseup.geometry.rotations import quaternion_to_matrix
 from jaxcloseup.ply import PlyError, read_vertices, write_vertices
 from jaxcloseup.splats.surfels import Surfels
-
-
-_LEAST_LOG_SCALE = -20.0  # what compressed PLY can hold
 
 
 def write_surfels(
@@ -44,8 +42,7 @@ def write_surfels(
     sh = np.asarray(surfels.sh, np.float32)
     scales = np.asarray(surfels.log_scales, np.float32)
     if num_scales == 3:
-        thin = scales.min(axis=1, keepdims=True) + np.float32(np.log(1e-3))
-        scales = np.concatenate([scales, np.maximum(thin, _LEAST_LOG_SCALE)], axis=1)
+        scales = thickened(scales)
     normals = np.asarray(quaternion_to_matrix(jnp.asarray(surfels.quaternions)))[..., 2]
     columns = {
         **dict(zip("xyz", np.asarray(surfels.means).T, strict=True)),

@@ -82,7 +82,9 @@ def project_discs(
     margin = jnp.maximum(size, 16)
     within = jnp.all((centre > -margin) & (centre < size + margin), axis=-1, keepdims=True)
     centred = ahead[:, None] & within
-    elsewhere = jnp.where(ahead[:, None], jnp.clip(centre, -margin, size + margin), size / 2)
+    # In the image, for those behind the camera, it is a corner of pixels, never a pixel's centre.
+    corner = jnp.floor(size / 2)
+    elsewhere = jnp.where(ahead[:, None], jnp.clip(centre, -margin, size + margin), corner)
     anchor = jnp.where(centred, centre, lax.stop_gradient(elsewhere))
 
     tangent_u, tangent_v, normal = (discs.axes[..., i] for i in range(3))

@@ -1,0 +1,35 @@
+"""Surfels as 3-D Gaussians, against the definition of a covariance."""
+
+import jax.numpy as jnp
+import numpy as np
+from reference_splats import rotation_of
+from splat_scenes import random_scene, to_surfels
+
+from jaxcloseup.artifacts.gaussians import as_gaussians
+
+
+def test_covariances_are_those_of_thin_ellipsoids():
+    scene = random_scene(2)
+    found = as_gaussians(to_surfels(scene), jnp.ones(16, bool))
+    for i in range(16):
+        u, v = np.exp(scene["log_scales"][i])
+        rotation = rotation_of(scene["quaternions"][i])
+        expected = rotation @ np.diag(np.square([u, v, min(u, v) / 1000])) @ rotation.T
+        largest = max(u, v) ** 2
+        np.testing.assert_allclose(found.covariances[i], expected, rtol=0, atol=1e-5 * largest)
+    np.testing.assert_allclose(found.opacities, 1 / (1 + np.exp(-scene["opacity_logits"])), 1e-5)
+
+
+def test_colours_are_the_constant_ones_in_range():
+    surfels = to_surfels(random_scene(3))
+    sh = jnp.zeros((16, 4, 3)).at[:, 1:].set(9.0).at[:, 0].set(jnp.array([-9.0, 0.0, 9.0]))
+    found = as_gaussians(surfels.replace(sh=sh), jnp.ones(16, bool))
+    np.testing.assert_allclose(found.rgb, [[0, 0.5, 1]] * 16, atol=1e-6)
+
+
+def test_only_living_and_finite_ones_are_kept():
+    surfels = to_surfels(random_scene(4))
+    broken = surfels.replace(log_scales=surfels.log_scales.at[1, 0].set(jnp.nan))
+    found = as_gaussians(broken, jnp.arange(16) != 0)
+    np.testing.assert_array_equal(found.means, surfels.means[2:])
+    assert all(len(array) == 14 for array in found)

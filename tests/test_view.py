@@ -1,0 +1,150 @@
+"""The viewer: its page in a browser, where one is here, and what is said where it cannot be."""
+
+import queue
+import socket
+import sys
+import types
+
+import jax
+import pytest
+from absl import flags
+from absl.testing import flagsaver
+from browser import free_port, open_browser
+from tiny_runs import TINY
+
+from experiments import view as program
+from experiments.finished import load_run_scene, read_run, restore
+from experiments.loop import Programs, TrainingError
+
+
+HAS = "return document.body.innerText.includes(arguments[0])"
+# The pixels of the picture and of its support, once the picture is not the one given.
+PICTURES = """
+const shown = [...document.images].filter(image => image.complete && image.naturalWidth > 300);
+const pixels = shown.map(image => {
+    const canvas = document.createElement('canvas');
+    [canvas.width, canvas.height] = [image.naturalWidth, image.naturalHeight];
+    canvas.getContext('2d').drawImage(image, 0, 0);
+    return canvas.toDataURL();
+});
+return pixels.length == 2 && pixels[0] != arguments[0] ? pixels : null;
+"""
+
+
+@pytest.fixture
+def viser():
+    return pytest.importorskip("viser", reason='needs viser (the extra "viewer")')
+
+
+@pytest.fixture
+def serve(viser):
+    """Serve a state at a free port; returns the page and its address."""
+    from experiments import serving, viewer
+
+    servers = []
+
+    def call(programs, state):
+        port = free_port()
+        servers.append(serving.serve("127.0.0.1", port))
+        page = viewer.Viewer(servers[0], programs, state, stage="closeup", seed=0)
+        return page, f"http://127.0.0.1:{port}"
+
+    with jax.numpy_dtype_promotion("standard"):
+        yield call
+    for server in servers:
+        server.stop()
+
+
+def test_a_closeup_is_chosen_and_rendered_in_a_browser(serve, kept, monkeypatch):
+    def darker(programs, state, depths, shots, *, most):
+        assert depths.shape == programs.scene.train.weight.shape and shots.names == ["closeup"]
+        return state.replace(params=state.params.replace(sh=state.params.sh - 1))
+
+    monkeypatch.setattr("experiments.viewer.fine_tune", darker)
+    with open_browser() as browser:
+        record = read_run(kept)
+        programs, state = restore(record, load_run_scene(record), "closeup")
+        page, address = serve(programs, state)
+        browser.open(address)
+        browser.wait(HAS, "Render")
+        browser.press("Download PNG")
+        browser.wait(HAS, "There is no picture yet")
+        browser.click_in_the_middle()
+        page.work(timeout=30)
+        browser.wait(HAS, "photographs show that")
+        pictures = [[None]]
+        for button in ("Render", "Fine-tune for it, and render", "Render"):
+            browser.press(button)
+            page.work(timeout=30)
+            said = "Fine-tuned and rendered (" if "tune" in button else "Rendered ("
+            browser.wait(HAS, said)
+            pictures.append(browser.wait(PICTURES, pictures[-1][0]))
+    _, rendered, tuned, again = pictures
+    assert tuned[1] == rendered[1]  # darker, but of the same support
+    assert again == rendered  # every fine-tuning starts from the same state, which is left alone
+
+
+def test_a_nerf_is_shown_by_its_points(serve, kept):
+    programs = Programs(TINY, load_run_scene(read_run(kept)))
+    page, _ = serve(programs, types.SimpleNamespace(params={}))
+    with pytest.raises(queue.Empty):
+        page.work(timeout=0)
+
+
+def test_failures_are_said_on_the_page_which_goes_on(serve, kept, capsys):
+    page, _ = serve(
+        Programs(TINY, load_run_scene(read_run(kept))), types.SimpleNamespace(params={})
+    )
+
+    def fail(error):
+        raise error
+
+    page._later("trying", lambda: fail(TrainingError("the loss was not finite")))
+    page._later("trying more", lambda: "done")
+    assert "still work to do" in page._status.content
+    page.work()
+    assert page._status.content == "the loss was not finite"
+    page._later("trying", lambda: fail(ValueError("a bug")))
+    page.work()
+    assert page._status.content == "trying failed (ValueError): the terminal says more."
+    assert "ValueError: a bug" in capsys.readouterr().err
+
+
+def test_nothing_is_ever_shared(viser):
+    from experiments import serving
+
+    server = serving.serve("127.0.0.1", free_port())
+    assert server.request_share_url() is None
+    assert server._share_tunnel is None
+    server.stop()
+
+
+@pytest.fixture
+def run(kept):
+    flags.FLAGS(["view"])
+
+    def call(**given):
+        with flagsaver.flagsaver(compilation_cache="", **{"run": str(kept), **given}):
+            program.main(["view"])
+
+    return call
+
+
+def test_mistakes_are_one_sentence(run, viser):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(SystemExit, match=rf"--port={port} cannot be served at \(Address al"):
+            run(port=port)
+    with pytest.raises(SystemExit, match=r"--host=10\.255\.255\.1 .*an address of this computer"):
+        run(host="10.255.255.1", port=free_port())
+    with pytest.raises(SystemExit, match=r"experiments\.view: --run=nowhere is not a folder"):
+        run(run="nowhere")
+
+
+def test_without_viser_the_extra_is_named(run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    for name in ("experiments.serving", "experiments.viewer"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+        monkeypatch.delattr(name, raising=False)
+    with pytest.raises(SystemExit, match='install jaxcloseup with the extra "viewer"'):
+        run()
