@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from tiny_capture import POSE, frame, write_json
 
-from jaxcloseup.scenes import load_scene, photographs
+from jaxcloseup.scenes import SceneError, load_scene, photographs
 
 
 def write_photographs(folder, count, width, height):
@@ -39,6 +39,16 @@ def test_photographs_are_never_all_in_memory_at_full_size(tmp_path, monkeypatch)
     assert scene.train.rgb.shape[1:] == (187, 250, 3)
     assert 9e6 < peak < 50e6
     np.testing.assert_allclose(scene.train.rgb[0, 90, 120], image[724, 964], atol=3)
+
+
+def test_more_photographs_than_memory_holds_are_refused_before_they_are_read(tmp_path, monkeypatch):
+    write_photographs(tmp_path, 9, 400, 300)
+    (tmp_path / "008.jpg").write_bytes(b"never read")
+    monkeypatch.setattr(photographs, "_memory", lambda: 2 * 2**20)
+    with pytest.raises(SceneError, match=r"9 photographs of 400 x 300 pixels take .* at least 3"):
+        load_scene(tmp_path)
+    (tmp_path / "008.jpg").write_bytes((tmp_path / "007.jpg").read_bytes())
+    assert len(load_scene(tmp_path, downscale=3).train) == 7
 
 
 @pytest.mark.skipif("JAXCLOSEUP_MANY" not in os.environ, reason="JAXCLOSEUP_MANY=500 takes minutes")

@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import functools
+import math
 import os
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -19,6 +20,7 @@ from jaxcloseup.scenes.photo_cache import content_hash, kept
 
 ALPHA_MODES = ("blend", "mask")
 _MOST_AT_ONCE = 4  # each holds a few times its own size: 12 megapixels take some 100 MB
+_BYTES_PER_PIXEL = 12  # of what stays: as read, padded, and weights in float32, at the worst moment
 
 
 class Reading(NamedTuple):
@@ -77,7 +79,8 @@ def read_photos(splits: Mapping[str, Sequence[Frame]], reading: Reading) -> dict
     """The photographs of each split; at full size no more than `_MOST_AT_ONCE` are in memory.
 
     Raises:
-      SceneError: a photograph or its mask that cannot be read, or sizes that do not fit.
+      SceneError: a photograph or its mask that cannot be read, sizes that do not fit, or more
+        photographs than fit into memory.
     """
     # A close-up is cut while the photograph that it is a part of is there anyway.
     parts = splits.get("test", ()) if reading.zoom > 1 else ()
@@ -89,14 +92,35 @@ def read_photos(splits: Mapping[str, Sequence[Frame]], reading: Reading) -> dict
         reading=reading,
         find_remap=_one_at_a_time(functools.lru_cache(maxsize=2)(undistortion)),  # mostly one lens
     )
+    first = read(frames[0], frames[0].file in closeups)
+    _check_memory(first[0], len(frames), reading)
     workers = min(_MOST_AT_ONCE, os.cpu_count() or 1)
     # OpenCV decodes without Python's lock.
     with concurrent.futures.ThreadPoolExecutor(workers) as pool:
-        made = list(pool.map(read, frames, [frame.file in closeups for frame in frames]))
-    first = iter(photos[0] for photos in made)
-    found = {split: [next(first) for _ in members] for split, members in whole.items()}
+        each = pool.map(read, frames[1:], [frame.file in closeups for frame in frames[1:]])
+        made = [first, *each]
+    wholes = iter(photos[0] for photos in made)
+    found = {split: [next(wholes) for _ in members] for split, members in whole.items()}
     found["test" if closeups else ""] = [photo for photos in made for photo in photos[1:]]
     return {split: found[split] for split in splits}
+
+
+def _check_memory(photo: Photo, count: int, reading: Reading) -> None:
+    """Refuse what would not fit, were all photographs like this one, before it is read."""
+    needed = _BYTES_PER_PIXEL * count * photo.mask.size
+    if needed > (held := _memory()):
+        width, height = photo.size
+        least = math.ceil(reading.downscale * math.sqrt(needed / held))
+        raise SceneError(
+            f"{photo.frame.file.parent}: {count} photographs of {width} x {height} pixels take "
+            f"{needed / 2**30:.1f} GiB, and this computer has {held / 2**30:.1f}: choose a "
+            f"downscale of at least {least}."
+        )
+
+
+def _memory() -> int:
+    """Bytes of this computer."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
 def _resized_intrinsics(
