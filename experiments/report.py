@@ -115,7 +115,15 @@ def write_report(
     parts += _label_plots(results["labels"], results["left_out"])
     if results["gate"]:
         parts.append(_gate_table(results["gate"]))
-    section = None
+    parts += figures(pictures)
+    config = html.escape(json.dumps({k: results[k] for k in ("config", "versions")}, indent=1))
+    parts.append(f"<details><summary>Configuration</summary><pre>{config}</pre></details></html>")
+    write_file(path, "\n".join(parts).encode())
+
+
+def figures(pictures: Sequence[Picture]) -> list[str]:
+    """Lines of a page with pictures in it, under a heading for each section."""
+    parts, section = [], None
     for picture in pictures:
         if picture.section != section:
             section = picture.section
@@ -125,9 +133,7 @@ def write_report(
             f"<figure><img alt='{caption}' src='{png_data_uri(picture.image)}'>"
             f"<figcaption>{caption}</figcaption></figure>"
         )
-    config = html.escape(json.dumps({k: results[k] for k in ("config", "versions")}, indent=1))
-    parts.append(f"<details><summary>Configuration</summary><pre>{config}</pre></details></html>")
-    write_file(path, "\n".join(parts).encode())
+    return parts
 
 
 def _zoom_plots(stages):

@@ -36,6 +36,7 @@ from experiments.loop import HOSTS_WAIT, Programs, TrainingError, run_stage
 from experiments.manifest import NAME as MANIFEST
 from experiments.manifest import about_scene, hash_data, write_manifest
 from experiments.output_dir import make
+from experiments.pictures import comparisons
 from experiments.pipeline import (
     config,
     rendered_depths,
@@ -45,6 +46,7 @@ from experiments.pipeline import (
     versions,
 )
 from experiments.presets import Preset, pseudo_settings
+from experiments.report import SPLIT_TITLES, Picture
 from experiments.set_up import set_up
 from experiments.sweep_report import print_sweep, write_sweep
 from experiments.zoom_ladder import ladder_targets
@@ -54,6 +56,9 @@ from jaxcloseup.pseudo import PseudoSettings, label_views
 from jaxcloseup.scenes import Scene, SceneError
 from jaxcloseup.splats.field import SurfelConfig
 from jaxcloseup.train import TrainState
+
+
+SHOWN = 2  # views of a split
 
 
 class _Start(NamedTuple):
@@ -101,8 +106,9 @@ def run_sweep(
     perceptual: Perceptual = NO_PERCEPTUAL,
     seconds: dict[str, float] | None = None,
     log: TrainLog | None = None,
-) -> dict[str, Any]:
-    """All arms of one scene; returns, for each arm, the metrics of each seed and split.
+    compare: pathlib.Path | None = None,
+) -> tuple[dict[str, Any], list[Picture]]:
+    """All arms of one scene.
 
     Args:
       scene: what is photographed.
@@ -115,6 +121,11 @@ def run_sweep(
       perceptual: networks of LPIPS.
       seconds: is filled with the wall time of each stage.
       log: is told of what is printed.
+      compare: folder for pictures.
+
+    Returns:
+      For each arm the metrics of each seed and split, and of the first views of each split a
+      picture of the truth and of all arms of the first seed; none without `compare`.
     """
     chosen = [make_arm(name, pseudo_settings(preset)) for name in arms]
     for arm in chosen:
@@ -162,11 +173,16 @@ def run_sweep(
 
     results: dict[str, Any] = {arm.name: {} for arm in chosen}
 
+    shown = {split: targets[split][:SHOWN] for split in SPLIT_TITLES if split in targets}
+    renderings: dict[str, dict[str, Any]] = {arm.name: {} for arm in chosen}
+
     def score(arm, seed, state, skipped):
-        splits = {
-            split: evaluate(functools.partial(programs.render, state), of_split, perceptual)[0]
-            for split, of_split in targets.items()
-        }
+        splits = {}
+        for split, of_split in targets.items():
+            render = functools.partial(programs.render, state)
+            splits[split], seen = evaluate(render, of_split, perceptual)
+            if seed == 0 and split in shown:
+                renderings[arm][split] = {view.name: seen[view.name] for view in shown[split]}
         results[arm][str(seed)] = {"skipped": skipped, "splits": splits}
 
     @functools.cache
@@ -220,7 +236,11 @@ def run_sweep(
             print(f"{name} is left out: {error}")
             continue
         score(arm.name, seed, state, _skipped(history))
-    return results
+    if compare is None:
+        return results, []
+    # Arms in the order in which they were named, whatever was trained first.
+    by_arm = {(arm, split): seen for arm, of in renderings.items() for split, seen in of.items()}
+    return results, comparisons(compare, shown, by_arm)
 
 
 def _skipped(history: Sequence[Mapping[str, Any]]) -> int:
@@ -333,6 +353,7 @@ def main(argv: list[str]) -> None:
     manifest = about | {"seeds": list(range(FLAGS.seeds)), "arms": FLAGS.arms}
     manifest["scenes"] = {scene.name: about_scene(scene, load_options) for scene in captures}
     found: dict[str, Any] = {}
+    pictures: list[Picture] = []
     seconds: dict[str, dict[str, float]] = {scene.name: {} for scene in captures}
     try:
         # One that is resumed may yet turn out to be another sweep.
@@ -340,7 +361,7 @@ def main(argv: list[str]) -> None:
             write_manifest(output_dir, manifest)
         for scene in captures:
             log = TrainLog(output_dir, scene.name, tensorboard=FLAGS.tensorboard)
-            found[scene.name] = run_sweep(
+            found[scene.name], drawn = run_sweep(
                 scene,
                 preset,
                 FLAGS.arms,
@@ -351,9 +372,11 @@ def main(argv: list[str]) -> None:
                 perceptual=perceptual,
                 seconds=seconds[scene.name],
                 log=log if first else None,
+                compare=output_dir / "compare" / scene.name if first else None,
             )
+            pictures += [one._replace(section=f"{scene.name}: {one.section}") for one in drawn]
             if first:
-                write_sweep(output_dir, found, about)
+                write_sweep(output_dir, found, about, pictures)
         if first:
             write_manifest(output_dir, manifest, seconds)
     except (TrainingError, CheckpointError, OSError) as error:

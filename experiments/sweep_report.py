@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.plots import Curve, line_plot
-from experiments.report import SPLIT_TITLES, STYLE, write_json
+from experiments.report import SPLIT_TITLES, STYLE, Picture, figures, write_json
 from experiments.zoom_ladder import MAGNIFICATIONS, PREFIX
 from jaxcloseup.files import write_file
 
@@ -78,7 +78,7 @@ def rows(scenes: Mapping[str, Mapping[str, Any]]) -> list[Row]:
     """A row for each split and arm.
 
     Args:
-      scenes: for each scene what `run_sweep` returns.
+      scenes: for each scene the metrics that `run_sweep` returns.
     """
     table = []
     arms = _arms(scenes)
@@ -155,8 +155,20 @@ def print_sweep(scenes: Mapping[str, Mapping[str, Any]]) -> None:
         Console().print(table)
 
 
-def write_sweep(folder: pathlib.Path, scenes: Mapping[str, Any], about: Mapping[str, Any]) -> None:
-    """Write sweep.json, table.md, table.csv and report.html; `about` is how it was made."""
+def write_sweep(
+    folder: pathlib.Path,
+    scenes: Mapping[str, Any],
+    about: Mapping[str, Any],
+    pictures: Sequence[Picture] = (),
+) -> None:
+    """Write sweep.json, table.md, table.csv and report.html.
+
+    Args:
+      folder: where.
+      scenes: for each scene the metrics that `run_sweep` returns.
+      about: how they were made.
+      pictures: for the report.
+    """
     found = rows(scenes)
     write_json(folder / "sweep.json", {"scenes": scenes, **about})
     header, *body = _cells(found)
@@ -198,7 +210,7 @@ def write_sweep(folder: pathlib.Path, scenes: Mapping[str, Any], about: Mapping[
             ),
             "</div>",
         ]
-    parts.append("</html>")
+    parts += [*figures(pictures), "</html>"]
     write_file(folder / "report.html", "\n".join(parts).encode())
 
 

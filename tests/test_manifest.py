@@ -72,7 +72,7 @@ def test_a_sweep_leaves_a_manifest(capture_folder, tmp_path, monkeypatch):
     def stub(scene, preset, arms, seeds, folder, *, seconds, **options):
         begun.update(json.loads((tmp_path / "out" / "manifest.json").read_text()))
         seconds["baseline_0"] = 1.5
-        return {}
+        return {}, []
 
     monkeypatch.setattr(sweep, "run_sweep", stub)
     monkeypatch.setattr(sweep, "write_sweep", lambda *_: None)

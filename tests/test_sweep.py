@@ -118,10 +118,11 @@ def test_an_arm_that_diverges_takes_no_other_down(capture_folder, capsys):
     jax.tree.map(np.testing.assert_array_equal, first, arms[1][1].params)
 
 
-def sweep_tiny(scene, folder, arms=("baseline", "control", "diverse", "test_time"), seeds=2):
-    names = {"method": "nerf", "preset": "tiny"}
+def sweep_tiny(scene, folder, arms=("baseline", "control", "diverse", "test_time"), seeds=2, **kw):
+    kw |= {"names": {"method": "nerf", "preset": "tiny"}, "max_parallel": 3}
     with jax.numpy_dtype_promotion("standard"):
-        return run_sweep(scene, TINY_STEPS, arms, seeds, folder, names=names, max_parallel=3)
+        found, pictures = run_sweep(scene, TINY_STEPS, arms, seeds, folder, **kw)
+    return (found, pictures) if "compare" in kw else found
 
 
 def test_a_sweep_cut_off_and_resumed_ends_the_same(capture_folder, tmp_path, monkeypatch, capsys):
@@ -139,17 +140,31 @@ def test_a_sweep_cut_off_and_resumed_ends_the_same(capture_folder, tmp_path, mon
     for stage in ("arms_1", "test_time_0", "test_time_1"):  # as if stopped after the first arms
         shutil.rmtree(tmp_path / "sweep" / stage)
     capsys.readouterr()
-    assert sweep_tiny(scene, tmp_path / "sweep") == whole
+    compare = tmp_path / "compare"
+    again, pictures = sweep_tiny(scene, tmp_path / "sweep", compare=compare)
+    assert again == whole
     assert capsys.readouterr().out.count("resumed") == 3  # both baselines and the first arms
 
-    write_sweep(tmp_path, {scene.name: whole}, {"method": "nerf", "preset": "tiny"})
+    # Truth, four arms and the error of the last, of the one close-up and the one ordinary view.
+    assert [picture.section for picture in pictures] == ["Close-ups", "Ordinary views"]
+    assert len(list(compare.iterdir())) == 2
+    truth = np.asarray(scene.test.rgb[0]).repeat(8, axis=0).repeat(8, axis=1)  # at least 240 wide
+    height, width = truth.shape[:2]
+    starts = [(width + 8) * i for i in range(6)]
+    panels = [pictures[0].image[-height:, x : x + width].astype(int) for x in starts]
+    np.testing.assert_array_equal(panels[0], truth)
+    assert np.abs(panels[1] - panels[3]).max() > 0  # baseline and diverse
+
+    about = {"method": "nerf", "preset": "tiny"}
+    write_sweep(tmp_path, {scene.name: whole}, about, pictures)
     table = list(csv.DictReader((tmp_path / "table.csv").read_text().splitlines()))
     assert [row["arm"] for row in table[:4]] == list(whole)
     expected = np.mean([psnr["control"], other])
     assert float(table[1]["psnr"]) == pytest.approx(expected)
     assert json.loads((tmp_path / "sweep.json").read_text())["scenes"][scene.name] == whole
     assert "test_time" in (tmp_path / "table.md").read_text()
-    assert "95 %" in (tmp_path / "report.html").read_text()
+    page = (tmp_path / "report.html").read_text()
+    assert "95 %" in page and page.count("<img") == 2
 
 
 def result(values):
@@ -267,7 +282,7 @@ def test_an_arm_may_have_labels_from_the_other_depth(capture_folder, tmp_path):
     names = {"method": "surfels", "preset": "tiny"}
     preset = dataclasses.replace(TINY_SMOOTH, label_share=0.5)
     with jax.numpy_dtype_promotion("standard"):
-        found = run_sweep(scene, preset, arms, 1, tmp_path, names=names)
+        found, _ = run_sweep(scene, preset, arms, 1, tmp_path, names=names)
     as_ever, median, expected = (found[arm]["0"]["splits"]["test"]["psnr"] for arm in arms)
     assert as_ever == median
     assert as_ever != expected
