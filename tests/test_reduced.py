@@ -152,7 +152,7 @@ def test_damage_is_never_trusted(capture, cache, decoded):
             np.testing.assert_array_equal(found[1], expected[1])
 
 
-def test_everything_that_matters_is_in_the_key(capture, decoded):
+def test_everything_that_matters_is_in_the_key(capture, decoded, monkeypatch):
     """Each change makes what has never been made; the half pixel matters to bent lenses alone."""
     write_image(capture / "images/a.png", np.dstack([picture(0), picture(1)[..., :1]]))
     frames = [
@@ -175,12 +175,23 @@ def test_everything_that_matters_is_in_the_key(capture, decoded):
         (lambda: bend(k1=-0.2), {"downscale": 2}, 2),
         (lambda: bend(k1=-0.2, fl_x=8.0), {"downscale": 2}, 2),
         (lambda: None, {"downscale": 2, "half_pixel": True}, 2),
+        (lambda: monkeypatch.setattr(photographs, "_code", list), {"downscale": 2}, 2),
     ]
     for change, options, count in changes:
         change()
         decoded.clear()
         load_scene(capture, **options)
         assert len(decoded) == count, options
+
+
+def test_a_principal_point_near_the_corner_is_not_the_middle(capture, decoded):
+    """The half that is given is not half of a size that is not known before decoding."""
+    frames = [{"file_path": "images/a.png", "transform_matrix": POSE.tolist()}]
+    for centre in ({"cx": 0.5, "cy": 0.5}, {}):
+        write_json(capture / "transforms_train.json", frames, fl_x=7.0, k1=-0.1, **centre)
+        decoded.clear()
+        load_scene(capture, downscale=2)
+        assert decoded == ["a.png"]
 
 
 def test_a_cache_that_cannot_be_written_is_none(capture, monkeypatch, tmp_path):

@@ -29,9 +29,10 @@ def kept(key: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.nd
 
     What is damaged there is made again, and what cannot be written is not kept.
     """
-    root = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
+    # Unlike `Path.home`, this does not fail where nobody has a home.
+    root = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     name = hashlib.sha256(key.encode()).hexdigest()
-    path = root / "jaxcloseup" / "photographs" / f"{name}.photo"
+    path = pathlib.Path(root) / "jaxcloseup" / "photographs" / f"{name}.photo"
     with contextlib.suppress(OSError):
         data = path.read_bytes()
         if hashlib.sha256(data[_DIGEST:]).digest() == data[:_DIGEST]:

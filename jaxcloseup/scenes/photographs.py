@@ -4,6 +4,7 @@ import concurrent.futures
 import functools
 import math
 import os
+import pathlib
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
@@ -20,6 +21,7 @@ from jaxcloseup.scenes.photo_cache import content_hash, kept
 
 ALPHA_MODES = ("blend", "mask")
 _MOST_AT_ONCE = 4  # each holds a few times its own size: 12 megapixels take some 100 MB
+_CODE = ("photographs.py", "images.py", "distortion.py")
 _BYTES_PER_PIXEL = 12  # of what stays: as read, padded, and weights in float32, at the worst moment
 
 
@@ -154,13 +156,21 @@ def _read_photo(
     if frame.reduced or reading.downscale * reading.zoom == 1:
         return make()
     # All that the result depends on.
-    key = ["area", cv2.__version__, closeup, reading._replace(half_pixel=False)]
+    key = ["area", cv2.__version__, _code(), closeup, reading._replace(half_pixel=False)]
     key += [content_hash(picture), content_hash(mask), frame.size, frame.distortion]
     if frame.distortion:
-        size = frame.size or (1, 1)
+        # A size that is not known yet is one of which no half can be a cx that is given.
+        size = frame.size or (2**30, 2**30)
         key += frame_intrinsics(frame, *size, half_pixel=reading.half_pixel).tolist()
     arrays = kept(repr(key), lambda: _pack(make()))
     return _unpack(frame, arrays)
+
+
+@functools.cache
+def _code() -> list[str]:
+    """Hashes of the modules that decide what becomes of a photograph."""
+    folder = pathlib.Path(__file__).parent
+    return [content_hash((folder / name).read_bytes()) for name in _CODE]
 
 
 def _pack(photos: Sequence[Photo]) -> dict[str, np.ndarray]:
