@@ -34,12 +34,13 @@ def comparisons(
 ) -> list[Picture]:
     """Write `<name>.png`: truth, every stage, error of the last; returns them for the report.
 
-    A name that an earlier split has taken is prefixed with its split.
+    A name that an earlier split has taken is prefixed with its split; a split that no stage has
+    rendered, as where every arm of a sweep failed, has no pictures.
     """
     pictures, written = [], set()
     for split, views in targets.items():
         stages = [stage for stage, of_split in renderings if of_split == split]
-        for target in views:
+        for target in views if stages else ():
             images = [renderings[stage, split][target.name].rgb for stage in stages]
             truth = np.asarray(target.rgb)
             error = colorize_error(np.abs(images[-1] - truth).mean(axis=-1))

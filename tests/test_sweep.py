@@ -22,6 +22,7 @@ from tiny_runs import TINY, TINY_SURFELS
 from experiments import sweep
 from experiments.arms import make_arm
 from experiments.loop import Programs
+from experiments.pictures import comparisons
 from experiments.pipeline import rendered_depths
 from experiments.presets import initial_points, pseudo_settings
 from experiments.sweep import run_sweep, stack_arms
@@ -196,6 +197,10 @@ def test_rows_are_means_over_everything_and_gains_are_paired():
     # A seed that lacks a view is no other seed's equal.
     del scenes["a"]["better"]["1"]["splits"]["test"]["views"]["1"]
     assert rows(scenes)[1].spread is None
+
+
+def test_a_sweep_whose_arms_all_failed_has_no_pictures(tmp_path):
+    assert comparisons(tmp_path, {"test": [None]}, {}) == []
 
 
 def test_a_single_view_has_no_interval():
