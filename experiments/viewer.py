@@ -231,9 +231,10 @@ class Viewer:
 
     def _place(self, client):
         """The close-up's camera as far from the point as the slider says."""
-        if self._aim is None:
+        aim = self._aim  # once: another thread may forget it meanwhile
+        if aim is None:
             return
-        source, point = self._aim
+        source, point = aim
         self._camera = closeup_camera(source, point, self._nearer.value)
         self._show_camera()
         if client is not None:
