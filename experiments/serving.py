@@ -40,7 +40,11 @@ def serve(host: str, port: int) -> Server:
 
 
 def check_address(host: str, port: int) -> None:
-    """Whether a server can be there; where it cannot, Viser would look for another port."""
+    """Complain where no server can be: Viser would take another port without a word.
+
+    Raises:
+      ServeError: the address cannot be had.
+    """
     try:
         with socket.create_server((host, port)):
             pass
