@@ -11,11 +11,9 @@ import weakref
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import cv2
-
 from experiments.report import strict
-from jaxcloseup.artifacts.images import Image, to_uint8
-from jaxcloseup.files import write_file
+from jaxcloseup.artifacts.images import Image, encode_png
+from jaxcloseup.files import append_file, write_file
 
 
 def check_tensorboard() -> None:
@@ -78,9 +76,7 @@ class TrainLog:
         rate = (entry["step"] - self._step) / (seconds - self._seconds)
         self._step, self._seconds = entry["step"], seconds
         line = {"stage": self._stage, **entry, "steps_per_second": rate, "seconds": seconds}
-        self._file.parent.mkdir(parents=True, exist_ok=True)
-        with self._file.open("ab") as file:
-            file.write(_format(line))
+        append_file(self._file, _format(line))
         self._send(line)
 
     def evaluated(
@@ -133,9 +129,8 @@ class _EventFile:
             if isinstance(number, int | float)
         ]
         for tag, image in (images or {}).items():
-            pixels = to_uint8(image)
-            png = cv2.imencode(".png", pixels[..., ::-1])[1].tobytes()
-            size = {"height": pixels.shape[0], "width": pixels.shape[1], "colorspace": 3}
+            size = {"height": image.shape[0], "width": image.shape[1], "colorspace": 3}
+            png = encode_png(image)
             values.append({"tag": tag, "image": {**size, "encoded_image_string": png}})
         self._add(ago, step=step, summary={"value": values})
 

@@ -1,4 +1,4 @@
-"""Files that are either whole or not there."""
+"""Files that are either whole or not there, and lines added to others."""
 
 import os
 import pathlib
@@ -20,7 +20,26 @@ def write_file(path: str | pathlib.Path, data: bytes) -> None:
         finally:
             part.unlink(missing_ok=True)
     except OSError as error:
-        raise OSError(
-            f"{path} cannot be written ({error.strerror}): choose another output folder or make "
-            "room in this one."
-        ) from error
+        raise _unwritable(path, error) from error
+
+
+def append_file(path: str | pathlib.Path, data: bytes) -> None:
+    """Add `data` to the end of `path`, making it and its folders if they are not there.
+
+    Raises:
+      OSError: one sentence that names the path and the reason.
+    """
+    path = pathlib.Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("ab") as file:
+            file.write(data)
+    except OSError as error:
+        raise _unwritable(path, error) from error
+
+
+def _unwritable(path, error):
+    return OSError(
+        f"{path} cannot be written ({error.strerror}): choose another output folder or make room "
+        "in this one."
+    )

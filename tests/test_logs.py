@@ -98,6 +98,17 @@ def test_a_line_that_was_lost_comes_back_from_the_checkpoint(tmp_path, clock):
     assert [line["seconds"] for line in lines] == [None] * 3 + [5]
 
 
+@pytest.mark.skipif("not os.path.exists('/dev/full')", reason="needs /dev/full, of Linux")
+def test_a_full_disk_is_one_sentence(tmp_path, clock):
+    log = TrainLog(tmp_path)
+    log.begin("baseline", [])
+    (tmp_path / "stats").mkdir()
+    (tmp_path / "stats/train.jsonl").symlink_to("/dev/full")
+    clock.now += 1
+    with pytest.raises(OSError, match=r"train\.jsonl cannot be written \(No space left .* make"):
+        log.write(HISTORY[0])
+
+
 def test_lines_are_strict(tmp_path, clock):
     train(clock, tmp_path, "baseline", history=[{"step": 1, "loss": math.nan, "psnr": math.inf}])
     (line,) = read_lines(tmp_path)
