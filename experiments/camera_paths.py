@@ -18,7 +18,6 @@ from jaxcloseup.scenes import Scene, SceneError
 from jaxcloseup.scenes.fields import number, read_object, rigid_transform
 
 
-FPS = 30.0
 OPENGL = np.diag([1.0, -1, -1])  # y and z change sign between OpenGL's frame and OpenCV's
 _RIGID = 1e-3
 
