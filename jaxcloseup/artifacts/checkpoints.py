@@ -71,7 +71,7 @@ class Checkpoints:
         try:
             self._manager(stage).save(step, args=items, force=True)
         except (ValueError, OSError) as error:  # of a full disk, a ValueError
-            reason = str(error).splitlines()[0].rsplit(": ", 1)[-1].split(" [os_error")[0]
+            reason = str(error).partition("\n")[0].rsplit(": ", 1)[-1].split(" [os_error")[0]
             raise CheckpointError(
                 f"{self.folder / stage / str(step)} cannot be written ({reason}): make room for it "
                 "and resume the run from the checkpoint before."

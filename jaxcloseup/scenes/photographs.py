@@ -1,6 +1,7 @@
 """Photographs made ready, a few at a time: decoded, masked, straightened and downscaled."""
 
 import concurrent.futures
+import contextlib
 import functools
 import math
 import os
@@ -121,8 +122,11 @@ def _check_memory(photo: Photo, count: int, reading: Reading) -> None:
 
 
 def _memory() -> int:
-    """Bytes of this computer."""
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    """Bytes of this computer, or of the container."""
+    held = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    with contextlib.suppress(OSError, ValueError):  # "max" is no limit
+        held = min(held, int(pathlib.Path("/sys/fs/cgroup/memory.max").read_text()))
+    return held
 
 
 def _resized_intrinsics(
