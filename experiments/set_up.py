@@ -1,12 +1,13 @@
 """What every program of experiments begins with, and the flags for it."""
 
 import logging
-import os
 import sys
 import warnings
 
 import jax
 from absl import flags
+
+from jaxcloseup.files import cache_folder
 
 
 FLAGS = flags.FLAGS
@@ -38,8 +39,7 @@ def set_up() -> None:
 def set_up_compilation_cache(folder: str | None) -> None:
     """Keep compiled programs on disk, so that the next run starts at once."""
     if folder is None:
-        cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-        folder = os.path.join(cache, "jaxcloseup", "xla")
+        folder = str(cache_folder() / "jaxcloseup" / "xla")
     if folder:
         jax.config.update("jax_compilation_cache_dir", folder)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

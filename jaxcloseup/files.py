@@ -1,7 +1,13 @@
-"""Files that are either whole or not there, and lines added to others."""
+"""Files that are either whole or not there, lines added to others, and where caches are."""
 
 import os
 import pathlib
+
+
+def cache_folder() -> pathlib.Path:
+    """Where programs of this user keep what can be made again."""
+    # Unlike `Path.home`, this does not fail where nobody has a home.
+    return pathlib.Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
 
 
 def write_file(path: str | pathlib.Path, data: bytes) -> None:

@@ -7,13 +7,11 @@ nothing there is ever out of date, and anything may be deleted.
 import contextlib
 import hashlib
 import io
-import os
-import pathlib
 from collections.abc import Callable
 
 import numpy as np
 
-from jaxcloseup.files import write_file
+from jaxcloseup.files import cache_folder, write_file
 
 
 _DIGEST = 32  # bytes of SHA-256, before the content that they are of
@@ -29,10 +27,8 @@ def kept(key: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.nd
 
     What is damaged there is made again, and what cannot be written is not kept.
     """
-    # Unlike `Path.home`, this does not fail where nobody has a home.
-    root = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     name = hashlib.sha256(key.encode()).hexdigest()
-    path = pathlib.Path(root) / "jaxcloseup" / "photographs" / f"{name}.photo"
+    path = cache_folder() / "jaxcloseup" / "photographs" / f"{name}.photo"
     with contextlib.suppress(OSError):
         data = path.read_bytes()
         if hashlib.sha256(data[_DIGEST:]).digest() == data[:_DIGEST]:

@@ -1,0 +1,139 @@
+"""Flags of `experiments.run`: what they set, and one sentence for each that makes no sense."""
+
+import json
+
+import pytest
+from absl import flags
+from absl.testing import flagsaver
+from tiny_runs import TINY
+
+from experiments import command_line
+from experiments import run as program
+from experiments.pipeline import config
+from experiments.presets import PRESETS
+from jaxcloseup.splats.adaptive_density import AdaptiveDensityConfig
+
+
+@pytest.fixture
+def parsed_flags():
+    flags.FLAGS(["run"])
+    with flagsaver.flagsaver(compilation_cache=""):
+        yield
+
+
+def test_nothing_to_resume_is_one_sentence(parsed_flags, tmp_path):
+    with (
+        flagsaver.flagsaver(scene="table", output_dir=str(tmp_path), resume=True),
+        pytest.raises(SystemExit, match="--resume finds no run in --output_dir="),
+    ):
+        program.main(["run"])
+
+
+def test_an_unknown_scene_is_one_sentence(parsed_flags, tmp_path):
+    with (
+        flagsaver.flagsaver(scene="tabel", output_dir=str(tmp_path / "out")),
+        pytest.raises(SystemExit, match="tabel"),
+    ):
+        program.main(["run"])
+    assert not (tmp_path / "out").exists()
+
+
+def test_format_and_split_reach_the_capture(parsed_flags, capture_folder, capsys):
+    with flagsaver.flagsaver(format="transforms", split="every8"):
+        options = command_line.load_options_from_flags(TINY)
+        scene = command_line.load(str(capture_folder), options)
+        names = command_line.names_from_flags()
+    assert (names["format"], names["split"]) == ("transforms", "every8")
+    assert scene.metadata["split"] == "every8" and scene.test is None
+    printed = capsys.readouterr().out
+    assert "reading transforms_train.json" in printed and "every 8th of its" in printed
+    assert set(command_line.names_from_flags()) == {"method", "preset"}
+    with flagsaver.flagsaver(split="zoom", zoom=3):
+        options = command_line.load_options_from_flags(TINY)
+        assert command_line.load(str(capture_folder), options).metadata["times_nearer"][0] == 3
+        assert command_line.names_from_flags()["zoom"] == 3
+    with (
+        flagsaver.flagsaver(invert_masks=True, alpha_mode="mask"),
+        pytest.raises(ValueError, match="no photograph has a mask to invert"),
+    ):
+        command_line.load(str(capture_folder), command_line.load_options_from_flags(TINY))
+
+
+def test_a_format_that_is_not_there_is_one_sentence(parsed_flags, capture_folder, tmp_path):
+    given = {"scene": str(capture_folder), "output_dir": str(tmp_path / "out"), "format": "llff"}
+    with (
+        flagsaver.flagsaver(**given),
+        pytest.raises(SystemExit, match="holds no capture in the format llff"),
+    ):
+        program.main(["run"])
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_holds_something_is_refused_before_any_work(parsed_flags, tmp_path):
+    (tmp_path / "results.json").write_text("{}")
+    with (
+        flagsaver.flagsaver(scene="table", output_dir=str(tmp_path)),
+        pytest.raises(SystemExit, match="already holds something"),
+    ):
+        program.main(["run"])
+    assert (tmp_path / "results.json").read_text() == "{}"
+
+
+def test_a_folder_that_cannot_be_made_is_one_sentence(parsed_flags, capture_folder, tmp_path):
+    (tmp_path / "file").write_text("")
+    folder = tmp_path / "file" / "out"
+    with (
+        flagsaver.flagsaver(scene=str(capture_folder), downscale=1, output_dir=str(folder)),
+        pytest.raises(SystemExit, match=f"--output_dir={folder} cannot be made .*: name a folder"),
+    ):
+        program.main(["run"])
+
+
+def test_flags_override_the_preset(parsed_flags):
+    given = {"preset": "paper", "closeup_steps": 7, "compute_dtype": "bfloat16"}
+    with flagsaver.flagsaver(method="nerf", **given):
+        preset = command_line.preset_from_flags()
+    assert preset.closeup_steps == 7
+    assert preset.field.compute_dtype == "bfloat16"
+    assert preset.baseline_steps == PRESETS["nerf"]["paper"].baseline_steps == 200_000
+    assert config(preset)["depth_tolerance"] == "inf"
+    json.dumps(config(preset), allow_nan=False)
+
+
+def test_an_unknown_stage_is_refused(parsed_flags):
+    with pytest.raises(flags.IllegalFlagValueError, match="--stages takes names of baseline"):
+        flags.FLAGS.stages = ["baseline", "polish"]
+
+
+def test_a_preset_of_the_other_method_is_one_sentence(parsed_flags, tmp_path):
+    with (
+        flagsaver.flagsaver(method="surfels", preset="released", output_dir=str(tmp_path / "out")),
+        pytest.raises(SystemExit, match="--preset=released is not for --method=surfels"),
+    ):
+        program.main(["run"])
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("method", "flag", "value"),
+    [
+        ("nerf", "density", "classic"),
+        ("nerf", "colour_ridge", 0.1),
+        ("surfels", "compute_dtype", "bfloat16"),
+    ],
+)
+def test_a_flag_of_the_other_method_is_one_sentence(parsed_flags, tmp_path, method, flag, value):
+    out = str(tmp_path / "out")
+    with (
+        flagsaver.flagsaver(method=method, output_dir=out, **{flag: value}),
+        pytest.raises(SystemExit, match=f"--{flag} is for --method=(?!{method})"),
+    ):
+        program.main(["run"])
+
+
+def test_surfels_can_be_cloned_and_split(parsed_flags):
+    with flagsaver.flagsaver(method="surfels", density="classic", colour_ridge=0.01):
+        field = command_line.preset_from_flags().field
+    assert isinstance(field.density, AdaptiveDensityConfig)
+    assert field.colour_ridge == 0.01
+    assert field.opacity_weight == 0
