@@ -81,7 +81,7 @@ def label_pictures(
         shots.append((f"virtual_{i}", camera, index, truth))
     nearest = jax.jit(best_source)
     for target in targets[:SHOWN_LABELS]:
-        index = nearest(target.camera, scene.train, depths)
+        index = nearest(target.camera, scene.train, depths, depth=render_depth(target.camera))
         shots.append((f"closeup_{target.name}", target.camera, index, target.rgb))
     pictures = []
     for name, camera, index, truth in shots:

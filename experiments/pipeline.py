@@ -149,29 +149,36 @@ def run(
             settings, gate = weigh_labels(views, depths, render, settings)
             print_gate(gate)
     use_labels = gate is None or gate["weight"] > 0
-    steps = preset.closeup_steps
-    if "control" in to_run or ("closeup" in to_run and not use_labels):
-        control = train("control", "photographs", baseline, views, steps=steps)
-        score("control", control)
+    controls: dict[int, TrainState] = {}
+
+    def control_of(steps, name):
+        if steps not in controls:
+            controls[steps] = train(name, "photographs", baseline, views, steps=steps)
+            score(name, controls[steps])
+        return controls[steps]
+
+    def fine_tune(stage, control, kind, *data, steps):
+        without = None
+        if "control" in to_run or not use_labels:
+            without = control_of(steps, control)
+        # Without labels a stage is its control: the same steps on the same photographs.
+        state = train(stage, kind, baseline, *data, steps=steps) if use_labels else without
+        score(stage, state)
+
+    if "control" in to_run:
+        control_of(preset.closeup_steps, "control")
     if "closeup" in to_run:
-        if use_labels:
-            data = views, depths, settings, sources
-            closeup = train("closeup", "virtual", baseline, *data, steps=steps)
-        else:
-            closeup = control  # the same steps on the same photographs
-        score("closeup", closeup)
+        data = views, depths, settings, sources
+        fine_tune("closeup", "control", "virtual", *data, steps=preset.closeup_steps)
     if "test_time" in to_run and scene.test is not None:
         with timed(seconds, "test_time_labels"):
             cameras = scene.test.cameras
             seen = rendered_depths(render, cameras, scene, near=0.0)
             data = cameras, seen, views, depths, settings
             labels = jax.jit(label_views)(*data, sources=sources)
-        per_view = len(scene.test) if names["method"] == "surfels" else 1
-        kind, data = (
-            ("targets", (views, labels, settings)) if use_labels else ("photographs", (views,))
-        )
-        steps = preset.test_time_steps * per_view
-        score("test_time", train("test_time", kind, baseline, *data, steps=steps))
+        steps = preset.test_time_steps * (len(scene.test) if names["method"] == "surfels" else 1)
+        data = views, labels, settings
+        fine_tune("test_time", "test_time_control", "targets", *data, steps=steps)
 
     with timed(seconds, "report"):
         of_labels = {

@@ -103,7 +103,8 @@ def write_report(
         f"<h1>{html.escape(title)}</h1>",
         f"<p>{width} x {height} pixels, seed {results['seed']}. Metrics are means over views, on "
         "8-bit images. <i>control</i> is the baseline after as many further steps as "
-        "<i>closeup</i>, without pseudo-labels: a gain counts against it.</p>",
+        "<i>closeup</i>, without pseudo-labels: a gain counts against it. <i>test_time_control</i> "
+        "is the same for <i>test_time</i>, where that takes another number of steps.</p>",
         "<div class=wide><table><tr>",
         *(f"<th>{html.escape(cell)}" for cell in header),
         *("<tr>" + "".join(f"<td>{html.escape(cell)}" for cell in row) for row in body),

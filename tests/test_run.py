@@ -61,7 +61,7 @@ def test_a_run_scores_every_stage_on_every_split(finished):
     results, output_dir = finished
     assert json.loads((output_dir / "results.json").read_text()) == results
     assert results["resolution"] == [plane.WIDTH, plane.HEIGHT]
-    for stage in ("baseline", "control", "closeup", "test_time"):
+    for stage in ("baseline", "control", "closeup", "test_time_control", "test_time"):
         for split in ("test", "test_far"):
             scores = results["stages"][stage][split]
             assert scores["psnr"] == pytest.approx(scores["views"]["0"]["psnr"])
@@ -81,7 +81,7 @@ def test_a_run_leaves_what_it_takes_to_render_it(finished, capture_folder):
     assert manifest["scene"] == str(capture_folder.resolve())
     record = read_run(output_dir)
     assert record.preset == TINY
-    assert record.stages == ["baseline", "closeup", "control", "test_time"]
+    assert record.stages == ["baseline", "closeup", "control", "test_time", "test_time_control"]
     assert choose_stage(record, None) == "closeup"
     with jax.numpy_dtype_promotion("standard"):
         scene = load_run_scene(record)
@@ -112,7 +112,8 @@ def test_surfels_run_through_all_stages_from_random_points(capture_folder, tmp_p
     assert len(results["gate"]["left_out"]) == 6
     if not use_labels:
         assert stages["closeup"] == stages["control"]
-    assert [entry["step"] for entry in results["history"]["test_time"]] == [1, 2]
+    trained = "test_time" if use_labels else "control"  # of as many steps
+    assert [entry["step"] for entry in results["history"][trained]] == [1, 2]
     assert "left-out photographs" in (tmp_path / "report.html").read_text()
     for stage in stages:
         splats = read_surfels(tmp_path / "splats" / f"{stage}.ply")
