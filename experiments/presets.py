@@ -48,6 +48,7 @@ class Preset:
       forward_label: colours from the forward warps.
       leave_out_source: labels are held against the other views alone.
       label_share: of the labels' loss in a step's, unless both are pooled.
+      test_time_share: the same of labels of wanted views.
       test_time_steps: in total for a NeRF, for each target view for surfels.
       gated: labels weigh what left-out photographs show that they deserve, which may be nothing.
     """
@@ -69,6 +70,7 @@ class Preset:
     forward_label: bool = False
     leave_out_source: bool = False
     label_share: float = 0.5
+    test_time_share: float = 0.5
     test_time_steps: int = 200
     gated: bool = False
 
@@ -139,7 +141,8 @@ QUICK_SURFELS = dataclasses.replace(
     closeup_steps=200,
     downscale=8,
     leave_out_source=True,
-    label_share=0.1,
+    label_share=0.05,
+    test_time_share=0.2,
     gated=True,
 )
 
@@ -234,4 +237,11 @@ def pseudo_settings(preset: Preset) -> PseudoSettings:
         forward_label=jnp.float32(preset.forward_label),
         leave_out_source=jnp.float32(preset.leave_out_source),
         label_share=jnp.float32(preset.label_share),
+    )
+
+
+def for_wanted_views(settings: PseudoSettings, preset: Preset) -> PseudoSettings:
+    """Settings of labels, weighed or not, with the share that labels of wanted views have."""
+    return settings.replace(
+        label_share=settings.label_share * preset.test_time_share / preset.label_share
     )
