@@ -107,7 +107,8 @@ def to_capture(shots: Shots, transform: np.ndarray, scale: float, scene: Scene) 
     """Cameras of nerfstudio's world in that of the scene.
 
     nerfstudio moves a point x of the capture's original world, which is the scene's world before
-    the `applied_transform` of its `transforms.json`, to scale * transform (x, 1).
+    the `applied_transform` of its `transforms.json`, to scale * transform (x, 1). Of the scale that
+    it records the `applied_scale` is a part; its cameras do not have it.
 
     Args:
       shots: cameras that nerfstudio shows.
@@ -123,6 +124,7 @@ def to_capture(shots: Shots, transform: np.ndarray, scale: float, scene: Scene) 
     back = np.linalg.inv(np.vstack([transform, last]))
     back = (np.eye(3, 4) if applied is None else applied) @ back
     back = rigid_transform(scene.name, "applied_transform after --camera_transform", back)
+    scale /= scene.metadata.get("applied_scale", 1.0)
     poses = np.asarray(shots.cameras.camtoworld, np.float64) / [1, 1, 1, scale]
     poses = back[:, :3] @ poses + back[:, 3:] * [0, 0, 0, 1]
     camtoworld = jnp.asarray(poses, jnp.float32)

@@ -54,12 +54,13 @@ def about_scene(scene: Scene, load_options: Mapping[str, Any]) -> dict[str, Any]
 def write_dataparser_transforms(folder: pathlib.Path, scene: Scene) -> None:
     """Write `dataparser_transforms.json`, nerfstudio's record of how a run changed coordinates.
 
-    Exports are in the scene's world, in which training is too: `scale` is 1, and `transform` is the
-    `applied_transform` of the capture's `transforms.json`, from its original world to this one.
+    Exports are in the scene's world, in which training is too: `transform` and `scale` are the
+    `applied_transform` and `applied_scale` of the capture's `transforms.json`, from its original
+    world to this one.
     """
     applied = scene.metadata.get("applied_transform")
     transform = np.eye(3, 4) if applied is None else applied
-    fields = {"transform": transform.tolist(), "scale": 1.0}
+    fields = {"transform": transform.tolist(), "scale": scene.metadata.get("applied_scale", 1.0)}
     write_json(folder / "dataparser_transforms.json", fields)
 
 

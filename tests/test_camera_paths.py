@@ -68,19 +68,23 @@ def random_similarity(rng):
 APPLIED = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
 
 
-@pytest.mark.parametrize("applied", [None, APPLIED])
+@pytest.mark.parametrize(("applied", "applied_scale"), [(None, 1.0), (APPLIED, 1.0), (None, 2.5)])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_a_path_of_nerfstudio_comes_back_to_the_capture(tmp_path, capture_folder, applied, seed):
+def test_a_path_of_nerfstudio_comes_back_to_the_capture(
+    tmp_path, capture_folder, applied, applied_scale, seed
+):
     """What a camera shows of points is what the camera that comes back shows of the capture's."""
     scene = load_scene(str(capture_folder))
-    scene.metadata["applied_transform"] = applied
+    scene.metadata.update(applied_transform=applied, applied_scale=applied_scale)
     rng = np.random.default_rng(seed)
     transform, scale = random_similarity(rng)
     original = rng.normal(size=(20, 3))
     theirs = scale * (original @ transform[:, :3].T + transform[:, 3])
     ours = original if applied is None else original @ applied[:, :3].T + applied[:, 3]
     file = tmp_path / "dataparser_transforms.json"
-    file.write_text(json.dumps({"transform": transform.tolist(), "scale": scale}))
+    # What is recorded leads from before the capture was scaled; the cameras were moved after.
+    recorded = {"transform": transform.tolist(), "scale": scale * applied_scale}
+    file.write_text(json.dumps(recorded))
     shots = read_camera_path(path_file(tmp_path))
     back = camera_paths.to_capture(shots, *camera_paths.read_camera_transform(file), scene)
     pose = np.asarray(shots.cameras.camtoworld[0], np.float64)
@@ -94,11 +98,11 @@ def test_a_path_of_nerfstudio_comes_back_to_the_capture(tmp_path, capture_folder
 @pytest.mark.parametrize("applied", [None, APPLIED])
 def test_what_a_run_says_of_its_coordinates_leads_back_to_them(tmp_path, capture_folder, applied):
     scene = load_scene(str(capture_folder))
-    scene.metadata["applied_transform"] = applied
+    scene.metadata.update(applied_transform=applied, applied_scale=2.0)
     write_dataparser_transforms(tmp_path, scene)
     file = tmp_path / "dataparser_transforms.json"
     said = json.loads(file.read_text())
-    assert said["scale"] == 1
+    assert said["scale"] == 2
     np.testing.assert_array_equal(said["transform"], np.eye(3, 4) if applied is None else applied)
     shots = read_camera_path(path_file(tmp_path))
     back = camera_paths.to_capture(shots, *camera_paths.read_camera_transform(file), scene)

@@ -119,6 +119,7 @@ def test_wrong_frames(capture, frames, message):
         ({"far": "9"}, "far must be a finite number"),
         ({"applied_transform": [[1]]}, "applied_transform must be a 4x4"),
         ({"applied_transform": [[0.0] * 4] * 3}, "applied_transform flattens space"),
+        ({"applied_scale": 0}, "applied_scale must be greater than 0"),
     ],
 )
 def test_wrong_fields(capture, fields, message):

@@ -105,10 +105,11 @@ def test_single_file_holds_out_every_eighth(tmp_path, caplog):
 def test_single_file_with_lists(tmp_path):
     transform = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 2]]
     lists = {"test_filenames": ["./images/003.png"], "val_filenames": ["images/001.png"]}
-    single_file(tmp_path, 4, applied_transform=transform, **lists)
+    single_file(tmp_path, 4, applied_transform=transform, applied_scale=0.5, **lists)
     scene = load_scene(tmp_path)
     assert scene.names == {"train": ["002", "000"], "test": ["003"], "test_far": ["001"]}
     np.testing.assert_array_equal(scene.metadata["applied_transform"], transform)
+    assert scene.metadata["applied_scale"] == 0.5
     single_file(tmp_path, 4, train_filenames=["images/000.png"], **lists)
     assert load_scene(tmp_path).names["train"] == ["000"]
 

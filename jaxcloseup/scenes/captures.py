@@ -91,11 +91,11 @@ def load_scene(
     Returns:
       The scene. For a folder, `metadata` holds `path`, `downscale`, `files` and `sizes` (the path
       and, before padding, the (width, height) of each photograph, by split) and
-      `applied_transform` (`[3, 4]`, from the capture's original world to this one, or None),
-      `format`, `split`, `notes` (sentences on what was read and how it was divided) and, for
-      `closest` and `zoom`, `times_nearer` (how many times nearer, or finer, each view of `test` is
-      than the median training photograph); for `zoom` `corners` (of each view of `test` the first
-      pixel (x, y) in its photograph, reduced by `downscale`).
+      `applied_transform` and `applied_scale` (`[3, 4]` or None and a number, from the capture's
+      original world to this one), `format`, `split`, `notes` (sentences on what was read and how it
+      was divided) and, for `closest` and `zoom`, `times_nearer` (how many times nearer, or finer,
+      each view of `test` is than the median training photograph); for `zoom` `corners` (of each
+      view of `test` the first pixel (x, y) in its photograph, reduced by `downscale`).
 
     Raises:
       SceneError: one sentence that names the file and the field and says what to do.
@@ -165,6 +165,8 @@ def _load(listing: Listing, reading: Reading) -> Scene:
                 f"{listing.file}: applied_transform flattens space, so that nothing leads back: "
                 "correct it."
             )
+    scale = listing.fields.get("applied_scale", 1.0)
+    scale = number(str(listing.file), "applied_scale", scale, above=0)
 
     parts = read_photos(listing.frames, reading)
     photos = [photo for members in parts.values() for photo in members]
@@ -200,6 +202,7 @@ def _load(listing: Listing, reading: Reading) -> Scene:
         "files": files,
         "sizes": {split: [photo.size for photo in part] for split, part in parts.items()},
         "applied_transform": transform,
+        "applied_scale": scale,
         "format": listing.format,
         "notes": listing.notes,
     }

@@ -21,14 +21,14 @@ _LENS_KEYS = {
     *("camera_model", "is_fisheye", *COEFFICIENTS),
 }
 _FILE_KEYS = _LENS_KEYS | {
-    *("frames", "near", "far", "ply_file_path", "applied_transform"),
+    *("frames", "near", "far", "ply_file_path", "applied_transform", "applied_scale"),
     *("train_filenames", "test_filenames", "val_filenames"),
 }
 _FRAME_KEYS = _LENS_KEYS | {"file_path", "transform_matrix", "mask_path"}
 # Well known, of no bearing on what is loaded, and passed over in silence.
 _UNUSED_KEYS = {
     *("aabb_scale", "scale", "offset", "render_aabb", "sharpness", "rotation", "colmap_im_id"),
-    *("applied_scale", "orientation_override", "auto_scale_poses_override"),
+    *("orientation_override", "auto_scale_poses_override"),
     *("depth_file_path", "depth_unit_scale_factor", "integer_depth_scale"),
 }
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
