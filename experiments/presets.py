@@ -142,7 +142,7 @@ QUICK_SURFELS = dataclasses.replace(
     downscale=8,
     leave_out_source=True,
     label_share=0.05,
-    test_time_share=0.2,
+    test_time_share=0.1,
     gated=True,
 )
 
