@@ -140,6 +140,7 @@ QUICK_SURFELS = dataclasses.replace(
     baseline_steps=2000,
     closeup_steps=200,
     downscale=8,
+    magnification=(1.5, 3.0),
     leave_out_source=True,
     label_share=0.05,
     test_time_share=0.1,
