@@ -58,7 +58,10 @@ def run() -> None:
                 f"  {found['leaked']:>6.1%}",
                 flush=True,
             )
-        print(f"{name:>8}  ceiling on close-ups: {_ceiling(scene, exact):.2f} dB", flush=True)
+        ceilings = (
+            f"{_ceiling(scene, exact):.2f} dB, at 1/{2 * DOWNSCALE} {_ceiling_at(name):.2f} dB"
+        )
+        print(f"{name:>8}  ceiling on close-ups: {ceilings}", flush=True)
         label_pictures(
             jax.random.key(1),
             [],
@@ -69,6 +72,12 @@ def run() -> None:
             render_depth=render_depth,
         )
     print(f"pictures: {PICTURES}")
+
+
+def _ceiling_at(name: str) -> float:
+    """The ceiling at the size of the quick presets."""
+    scene = load_scene(name, downscale=2 * DOWNSCALE)
+    return _ceiling(scene, exact_depths(scene, scene.train.cameras))
 
 
 def _ceiling(scene: Scene, exact: jax.Array) -> float:
