@@ -32,7 +32,7 @@ from experiments.manifest import (
     write_manifest,
 )
 from experiments.pictures import comparisons, label_pictures, write_renders
-from experiments.presets import Preset, for_wanted_views, initial_points, pseudo_settings
+from experiments.presets import Preset, initial_points, pseudo_settings
 from experiments.report import in_short, write_json, write_report
 from experiments.zoom_ladder import ladder_in_short, ladder_targets
 from jaxcloseup.artifacts.checkpoints import Checkpoints
@@ -177,7 +177,7 @@ def run(
             data = cameras, seen, views, depths, settings
             labels = jax.jit(label_views)(*data, sources=sources)
         steps = preset.test_time_steps * (len(scene.test) if names["method"] == "surfels" else 1)
-        data = views, labels, for_wanted_views(settings, preset)
+        data = views, labels, settings
         fine_tune("test_time", "test_time_control", "targets", *data, steps=steps)
 
     with timed(seconds, "report"):

@@ -48,7 +48,6 @@ class Preset:
       forward_label: colours from the forward warps.
       leave_out_source: labels are held against the other views alone.
       label_share: of the labels' loss in a step's, unless both are pooled.
-      test_time_share: the same of labels of wanted views.
       test_time_steps: in total for a NeRF, for each target view for surfels.
       gated: labels weigh what left-out photographs show that they deserve, which may be nothing.
     """
@@ -70,7 +69,6 @@ class Preset:
     forward_label: bool = False
     leave_out_source: bool = False
     label_share: float = 0.5
-    test_time_share: float = 0.5
     test_time_steps: int = 200
     gated: bool = False
 
@@ -143,7 +141,6 @@ QUICK_SURFELS = dataclasses.replace(
     magnification=(1.5, 3.0),
     leave_out_source=True,
     label_share=0.05,
-    test_time_share=0.1,
     gated=True,
 )
 
@@ -238,11 +235,4 @@ def pseudo_settings(preset: Preset) -> PseudoSettings:
         forward_label=jnp.float32(preset.forward_label),
         leave_out_source=jnp.float32(preset.leave_out_source),
         label_share=jnp.float32(preset.label_share),
-    )
-
-
-def for_wanted_views(settings: PseudoSettings, preset: Preset) -> PseudoSettings:
-    """Settings of labels, weighed or not, with the share that labels of wanted views have."""
-    return settings.replace(
-        label_share=settings.label_share * preset.test_time_share / preset.label_share
     )

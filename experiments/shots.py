@@ -11,7 +11,7 @@ import numpy as np
 from experiments.camera_paths import Shots, one_by_one
 from experiments.gate import print_gate, weigh_labels
 from experiments.loop import Programs
-from experiments.presets import for_wanted_views, pseudo_settings
+from experiments.presets import pseudo_settings
 from jaxcloseup.artifacts.images import (
     Image,
     colorize_depth,
@@ -69,8 +69,7 @@ def fine_tune(
     if coverage == 0:
         print("nothing is fine-tuned")
         return state
-    data = views, labels, for_wanted_views(settings, preset)
-    state, values = programs.run("targets", state, *data, count=steps)
+    state, values = programs.run("targets", state, views, labels, settings, count=steps)
     numbers = {key: value for key, value in values.items() if isinstance(value, float)}
     print("  ".join(f"{key} {value:.4g}" for key, value in numbers.items()))
     return state

@@ -45,7 +45,7 @@ from experiments.pipeline import (
     training_depths,
     versions,
 )
-from experiments.presets import Preset, for_wanted_views, pseudo_settings
+from experiments.presets import Preset, pseudo_settings
 from experiments.report import SPLIT_TITLES, Picture
 from experiments.set_up import set_up
 from experiments.sweep_report import print_sweep, write_sweep
@@ -229,8 +229,7 @@ def run_sweep(
             whole = isinstance(preset.field, SurfelConfig)
             steps = preset.test_time_steps * (len(scene.test) if whole else 1)
         name = f"{arm.name}_{seed}"
-        wanted = arm.name == "test_time"
-        data = views, labels, for_wanted_views(arm.settings, preset) if wanted else arm.settings
+        data = views, labels, arm.settings
         try:
             state, history = stage(name, programs, "targets", start.state, *data, steps=steps)
         except TrainingError as error:
