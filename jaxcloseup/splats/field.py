@@ -37,6 +37,9 @@ from jaxcloseup.splats.render import SurfelAux, render_surfels
 from jaxcloseup.splats.surfels import Surfels, surfels_from_points
 
 
+_UNCHANGED_SHARE = 0.3  # of the loss of colours as they are, where images may change them
+
+
 @dataclasses.dataclass(frozen=True)
 class SurfelConfig:
     """Surfels and their training; lengths are in extents of the capture.
@@ -50,7 +53,8 @@ class SurfelConfig:
         are held against; arms of a sweep may have labels from the other.
       background: grey level in [0, 1] behind the scene; None is black.
       colour_ridge: in training each image may change its colours by an affine map, to which this
-        is the resistance, see `fit_colours`; None allows none. Rendered images have no such change.
+        is the resistance, see `fit_colours`; None allows none. Rendered images have no such change:
+        a part of the loss holds their colours to the photographs' as they are.
       ssim_weight: share of 1 - SSIM in the loss; the rest is the absolute difference.
       normal_weight: of the disagreement between normals and depth.
       distortion_weight: of the spread of light along a ray, for a mean depth of 1.
@@ -259,19 +263,26 @@ def _loss(rendering, target_rgb, weight, config):
 
     # What weighs nothing must not show in windows beside it either.
     counts = weight[..., None] > 0
+
+    def distance(seen):
+        target = jnp.where(counts, target_rgb, jax.lax.stop_gradient(seen))
+        difference = mean(jnp.mean(jnp.abs(seen - target), axis=-1))
+        similarity = ssim(seen, target, weight=weight)
+        dissimilarity = jnp.where(jnp.isnan(similarity), 0, 1 - similarity)
+        return (1 - config.ssim_weight) * difference + config.ssim_weight * dissimilarity
+
     seen = rendering.rgb
+    image = distance(seen)
     if config.colour_ridge is not None:
         data = jax.lax.stop_gradient(seen), target_rgb, weight
         matrix, offset = fit_colours(*data, ridge=config.colour_ridge)
         matrix = jnp.where(total > 0, matrix, jnp.eye(3, dtype=matrix.dtype))
         seen = matmul(seen, matrix[None]) + jnp.where(total > 0, offset, 0)[None, None]
-    target_rgb = jnp.where(counts, target_rgb, jax.lax.stop_gradient(seen))
-    difference = mean(jnp.mean(jnp.abs(seen - target_rgb), axis=-1))
-    similarity = ssim(seen, target_rgb, weight=weight)
-    dissimilarity = jnp.where(jnp.isnan(similarity), 0, 1 - similarity)
-    image = (1 - config.ssim_weight) * difference + config.ssim_weight * dissimilarity
+        # Colours that are free in every photograph would drift away from all of them.
+        image = _UNCHANGED_SHARE * image + (1 - _UNCHANGED_SHARE) * distance(seen)
     prior = jnp.where(total > 0, rendering.aux.prior, 0)
-    squared = mean(jnp.mean((jnp.clip(seen, 0, 1) - target_rgb) ** 2, axis=-1))
+    off = jnp.where(counts, jnp.clip(seen, 0, 1) - target_rgb, 0)
+    squared = mean(jnp.mean(off**2, axis=-1))
     metrics = {
         "psnr": -10 * jnp.log10(squared),
         "overflow": rendering.aux.surfels.overflow.astype(jnp.float32),
