@@ -53,6 +53,9 @@ flags.DEFINE_enum(
     ["mcmc", "classic"],
     "how surfels are added: Monte Carlo moves, or clone, split and prune",
 )
+flags.DEFINE_integer(
+    "capacity", None, "most surfels there can be; default: the preset's", lower_bound=1
+)
 flags.DEFINE_float(
     "colour_ridge",
     None,
@@ -92,7 +95,7 @@ flags.DEFINE_enum(
     "transparent pixels of photographs show a white background, or weigh as a mask does",
 )
 _OF_CAPTURE = ("format", "split", "zoom", "invert_masks", "alpha_mode")
-_OF_METHOD = {"nerf": ("compute_dtype",), "surfels": ("density", "colour_ridge")}
+_OF_METHOD = {"nerf": ("compute_dtype",), "surfels": ("density", "capacity", "colour_ridge")}
 
 
 def preset_from_flags() -> Preset:
@@ -116,7 +119,10 @@ def preset_from_flags() -> Preset:
     if FLAGS.method == "nerf":
         given["field"] = dataclasses.replace(preset.field, compute_dtype=FLAGS.compute_dtype)
     else:
-        field = dataclasses.replace(preset.field, colour_ridge=FLAGS.colour_ridge)
+        capacity = FLAGS.capacity or preset.field.capacity
+        field = dataclasses.replace(
+            preset.field, capacity=capacity, colour_ridge=FLAGS.colour_ridge
+        )
         if FLAGS.density == "classic":
             field = with_classic_density(field, FLAGS.preset)
         given["field"] = field

@@ -119,6 +119,7 @@ def test_a_preset_of_the_other_method_is_one_sentence(parsed_flags, tmp_path):
     [
         ("nerf", "density", "classic"),
         ("nerf", "colour_ridge", 0.1),
+        ("nerf", "capacity", 500),
         ("surfels", "compute_dtype", "bfloat16"),
     ],
 )
@@ -132,8 +133,8 @@ def test_a_flag_of_the_other_method_is_one_sentence(parsed_flags, tmp_path, meth
 
 
 def test_surfels_can_be_cloned_and_split(parsed_flags):
-    with flagsaver.flagsaver(method="surfels", density="classic", colour_ridge=0.01):
+    with flagsaver.flagsaver(method="surfels", density="classic", capacity=300, colour_ridge=0.01):
         field = command_line.preset_from_flags().field
     assert isinstance(field.density, AdaptiveDensityConfig)
-    assert field.colour_ridge == 0.01
+    assert field.colour_ridge == 0.01 and field.capacity == 300
     assert field.opacity_weight == 0
