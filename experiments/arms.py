@@ -19,7 +19,7 @@ NAMED_ARMS: dict[str, dict[str, Any]] = {
     "diverse": {},
 }
 ARMS_IN_TURN = ("oracle", "resolved", "test_time")  # labelled once, before their first step
-
+KINDS = ("baseline", *NAMED_ARMS, *ARMS_IN_TURN)
 
 # Of settings that may not be any number from 0 on.
 BOUNDS = {"label_share": (0.0, 1.0), "magnification": (1.0, np.inf), "num_sources": (1.0, np.inf)}
@@ -30,6 +30,7 @@ class Arm(NamedTuple):
 
     Attributes:
       name: as it was asked for.
+      kind: what it is before it is changed: `baseline`, `diverse`, one in turn, ...
       settings: of its labels.
       expected_depth: whether these are made with the expected depth or the median one; None for
         what the field has by itself.
@@ -37,6 +38,7 @@ class Arm(NamedTuple):
     """
 
     name: str
+    kind: str
     settings: PseudoSettings
     expected_depth: bool | None = None
     depth_error: float | None = None
@@ -44,7 +46,7 @@ class Arm(NamedTuple):
     @property
     def in_turn(self) -> bool:
         """Whether it is trained alone, on views that are labelled before its first step."""
-        return self.name in ARMS_IN_TURN or self.depth_error is not None
+        return self.kind in ARMS_IN_TURN or self.depth_error is not None
 
     @property
     def outlook(self) -> str:
@@ -55,38 +57,48 @@ class Arm(NamedTuple):
 
 
 def make_arm(name: str, settings: PseudoSettings) -> Arm:
-    """An arm by its name, with the preset's settings changed as the name says.
+    """An arm by its name: the preset's settings, changed as the name says.
+
+    That is one of `KINDS`, settings with values as in `rate=2+magnification=2:4`, or the former
+    and then the latter, with a plus between them.
 
     Raises:
       ValueError: the name is none, with what it could be.
     """
-    if name == "baseline" or name in ARMS_IN_TURN:
-        return Arm(name, settings)
-    changes = dict(NAMED_ARMS[name] if name in NAMED_ARMS else _parse(name))
+    kind, *changed = name.split("+")
+    if kind not in KINDS:
+        kind, changed = "diverse", name.split("+")
+    if kind == "baseline" and changed:
+        raise ValueError(f"--arms={name}: baseline has no fine-tuning to change")
+    changes = NAMED_ARMS.get(kind, {}) | _parse(name, changed)
     expected_depth, depth_error = (changes.pop(k, None) for k in ("expected_depth", "depth_error"))
     for field, value in changes.items():
         settings = _change(settings, name, field, value)
     if expected_depth not in (None, 0.0, 1.0):
         raise ValueError(f"--arms={name}: expected_depth is 0 (labels from median depth) or 1")
+    if kind in ARMS_IN_TURN and (expected_depth, depth_error) != (None, None):
+        raise ValueError(f"--arms={name}: {kind} takes no other depth than its own")
     if None not in (expected_depth, depth_error):
         raise ValueError(f"--arms={name}: expected_depth and depth_error do not go together")
     if depth_error is not None and not (np.ndim(depth_error) == 0 and depth_error >= 0):
         raise ValueError(f"--arms={name}: depth_error is a part, as in 0.5, and not negative")
     expected_depth = None if expected_depth is None else bool(expected_depth)
-    return Arm(name, settings, expected_depth, depth_error)
+    return Arm(name, kind, settings, expected_depth, depth_error)
 
 
-def _parse(name):
+def _parse(name, changed):
     changes = {}
-    for change in name.split("+"):
-        field, equals, text = change.partition("=")
+    for change in changed:
+        field, equals, value = change.partition("=")
         try:
-            values = [float(value) for value in text.split(":")]
+            values = [float(number) for number in value.split(":")]
         except ValueError:
             equals = ""
         if not equals:
-            known = ", ".join(["baseline", *NAMED_ARMS, *ARMS_IN_TURN])
-            raise ValueError(f"--arms={name} is not an arm: name {known}, or setting=number")
+            raise ValueError(
+                f"--arms={name} is not an arm: name {', '.join(KINDS)}, or setting=number, more "
+                "of them after a plus"
+            )
         if field in changes:
             raise ValueError(f"--arms={name} sets {field} twice: leave one out")
         changes[field] = values[0] if len(values) == 1 else values
@@ -113,10 +125,10 @@ def _change(settings, arm, field, value):
 
 def why_not(arm: Arm, scene: Scene) -> str | None:
     """Why a scene cannot have an arm, or None."""
-    if scene.surface is None and arm.name in ("oracle", "resolved"):
+    if scene.surface is None and arm.kind in ("oracle", "resolved"):
         return "nobody knows the true pixels"
     if scene.surface is None and arm.depth_error is not None:
         return "nobody knows the true depth"
-    if scene.test is None and arm.name == "test_time":
+    if scene.test is None and arm.kind == "test_time":
         return "it has no close-ups to label"
     return None

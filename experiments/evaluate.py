@@ -24,6 +24,8 @@ from jaxcloseup.scenes.images import read_image, read_mask
 
 
 FLAGS = flags.FLAGS
+for _name in ("lpips_weights", "compilation_cache"):
+    flags.declare_key_flag(_name)
 flags.DEFINE_string("renders", None, "folder of images to score")
 flags.DEFINE_string("truth", None, "folder of what they should be")
 flags.DEFINE_string("masks", None, "folder of masks, white where pixels count; default: all count")

@@ -27,6 +27,13 @@ def write_renders(folder: pathlib.Path, renderings: Mapping[str, Rendering], sce
         write_png(folder / "depth" / f"{name}.png", depth)
 
 
+def write_truth(folder: pathlib.Path, targets: Mapping[str, Sequence[Target]]) -> None:
+    """Write `<split>/rgb/<name>.png`, what renders are scored against, as anyone may again."""
+    for split, views in targets.items():
+        for target in views:
+            write_png(folder / split / "rgb" / f"{target.name}.png", target.rgb)
+
+
 def comparisons(
     folder: pathlib.Path,
     targets: Mapping[str, Sequence[Target]],
@@ -74,19 +81,19 @@ def label_pictures(
     """Write pictures of labels: of random virtual views, and of the held-out close-ups."""
     label_image = jax.jit(make_label)
     sample = jax.jit(sample_virtual_camera)
-    shots: list[tuple[str, Camera, Any, Any]] = []
+    shots: list[tuple[str, Camera, jax.Array, Any, Any]] = []
     for i, one in enumerate(jax.random.split(key, SHOWN_LABELS)):
         camera, index = sample(one, scene.train, depths, settings)
         truth = scene.surface(camera).rgb if scene.surface else None
-        shots.append((f"virtual_{i}", camera, index, truth))
+        shots.append((f"virtual_{i}", camera, render_depth(camera), index, truth))
     nearest = jax.jit(best_source)
     for target in targets[:SHOWN_LABELS]:
-        index = nearest(target.camera, scene.train, depths, depth=render_depth(target.camera))
-        shots.append((f"closeup_{target.name}", target.camera, index, target.rgb))
+        depth = render_depth(target.camera)
+        index = nearest(target.camera, scene.train, depths, depth=depth)
+        shots.append((f"closeup_{target.name}", target.camera, depth, index, target.rgb))
     pictures = []
-    for name, camera, index, truth in shots:
+    for name, camera, depth, index, truth in shots:
         pixels = pixel_grid(camera.height, camera.width)
-        depth = render_depth(camera)
         label = label_image(camera, pixels, depth, index, scene.train, depths, settings)
         kept = np.where(label.weight[..., None] > 0, label.rgb, 0)
         panels = {"backward warp": label.backward, "forward warp": label.forward, "kept": kept}

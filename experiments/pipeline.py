@@ -31,8 +31,8 @@ from experiments.manifest import (
     write_dataparser_transforms,
     write_manifest,
 )
-from experiments.pictures import comparisons, label_pictures, write_renders
-from experiments.presets import Preset, initial_points, pseudo_settings
+from experiments.pictures import comparisons, label_pictures, write_renders, write_truth
+from experiments.presets import Preset, initial_points, pseudo_settings, test_time_steps
 from experiments.report import in_short, write_json, write_report
 from experiments.zoom_ladder import ladder_in_short, ladder_targets
 from jaxcloseup.artifacts.checkpoints import Checkpoints
@@ -142,6 +142,7 @@ def run(
         exact = exact_depths(scene, views.cameras) if scene.surface else None
         targets = targets_by_split(scene, depths, exact, render)
         held_out = targets | ({} if exact is None else ladder_targets(scene, exact))
+    write_truth(output_dir / "renders" / "truth", held_out)
     score("baseline", baseline)
     gate = None
     if preset.gated:
@@ -170,13 +171,15 @@ def run(
     if "closeup" in to_run:
         data = views, depths, settings, sources
         fine_tune("closeup", "control", "virtual", *data, steps=preset.closeup_steps)
-    if "test_time" in to_run and scene.test is not None:
+    if "test_time" in to_run and scene.test is None:
+        print(f"no test_time: no close-ups of {scene.name} are held out (--split=closest does)")
+    elif "test_time" in to_run:
         with timed(seconds, "test_time_labels"):
             cameras = scene.test.cameras
             seen = rendered_depths(render, cameras, scene, near=0.0)
             data = cameras, seen, views, depths, settings
             labels = jax.jit(label_views)(*data, sources=sources)
-        steps = preset.test_time_steps * (len(scene.test) if names["method"] == "surfels" else 1)
+        steps = test_time_steps(preset, len(scene.test))
         data = views, labels, settings
         fine_tune("test_time", "test_time_control", "targets", *data, steps=steps)
 

@@ -220,6 +220,12 @@ def unit_cube(scene: Scene) -> tuple[tuple[float, float, float], float]:
     return tuple(((low + high) / 2).tolist()), float(2 / (high - low).max())
 
 
+def test_time_steps(preset: Preset, count: int) -> int:
+    """Steps in all for `count` wanted views: surfels take the preset's for each of them."""
+    whole_images = isinstance(preset.field, SurfelConfig)
+    return preset.test_time_steps * (count if whole_images else 1)
+
+
 def pseudo_settings(preset: Preset) -> PseudoSettings:
     """The preset's traced settings."""
     return PseudoSettings(

@@ -24,6 +24,9 @@ from jaxcloseup.scenes import SceneError
 
 
 FLAGS = flags.FLAGS
+flags.adopt_module_key_flags(command_line)  # these are in --help too
+for _name in ("output_dir", "lpips_weights", "compilation_cache"):
+    flags.declare_key_flag(_name)
 flags.DEFINE_string(
     "scene", "table", "a built-in scene (counter, table, room, bench, stairs) or a folder"
 )

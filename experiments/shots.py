@@ -11,7 +11,8 @@ import numpy as np
 from experiments.camera_paths import Shots, one_by_one
 from experiments.gate import print_gate, weigh_labels
 from experiments.loop import Programs
-from experiments.presets import pseudo_settings
+from experiments.pipeline import rendered_depths
+from experiments.presets import pseudo_settings, test_time_steps
 from jaxcloseup.artifacts.images import (
     Image,
     colorize_depth,
@@ -20,10 +21,8 @@ from jaxcloseup.artifacts.images import (
     write_png,
 )
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
-from jaxcloseup.geometry.union_warp import block_sources
 from jaxcloseup.pseudo import label_views
 from jaxcloseup.scenes import Scene
-from jaxcloseup.splats.field import SurfelConfig
 from jaxcloseup.support import find_support
 from jaxcloseup.train import TrainState, labelled_depth
 
@@ -54,15 +53,9 @@ def fine_tune(
         if not found["weight"]:
             print("nothing is fine-tuned")
             return state
-    # Targets may be nearer to the surface than any photograph was.
-    seen = (render(camera) for _, camera in one_by_one(shots))
-    targets = jnp.stack([labelled_depth(one, near=0, far=scene.far) for one in seen])
-    sources = jax.jit(block_sources)(views.cameras, depths, views.weight)
-    data = shots.cameras, targets, views, depths, settings
-    labels = jax.jit(label_views)(*data, sources=sources)
-    steps = preset.test_time_steps
-    if isinstance(preset.field, SurfelConfig):
-        steps *= len(shots.names)
+    targets = rendered_depths(render, shots.cameras, scene, near=0.0)
+    labels = jax.jit(label_views)(shots.cameras, targets, views, depths, settings)
+    steps = test_time_steps(preset, len(shots.names))
     steps = min(steps, most or steps)
     coverage = float(jnp.mean(labels.weight))
     print(f"labels on {coverage:.0%} of the pixels to be rendered; {steps} steps", flush=True)

@@ -21,7 +21,7 @@ from absl import app, flags
 
 import jaxcloseup
 from experiments import command_line
-from experiments.arms import ARMS_IN_TURN, NAMED_ARMS, make_arm, why_not
+from experiments.arms import KINDS, make_arm, why_not
 from experiments.evaluation import (
     NO_PERCEPTUAL,
     Perceptual,
@@ -45,7 +45,7 @@ from experiments.pipeline import (
     training_depths,
     versions,
 )
-from experiments.presets import Preset, pseudo_settings
+from experiments.presets import Preset, pseudo_settings, test_time_steps
 from experiments.report import SPLIT_TITLES, Picture
 from experiments.set_up import set_up
 from experiments.sweep_report import print_sweep, write_sweep
@@ -71,15 +71,18 @@ class _Start(NamedTuple):
 
 
 FLAGS = flags.FLAGS
+flags.adopt_module_key_flags(command_line)  # these are in --help too
+for _name in ("output_dir", "lpips_weights", "compilation_cache"):
+    flags.declare_key_flag(_name)
 flags.DEFINE_list("scenes", ["table"], "built-in scenes or folders")
 flags.DEFINE_integer("seeds", 3, "random seeds 0, 1, ...", lower_bound=1)
 flags.DEFINE_list(
     "arms",
-    ["baseline", *NAMED_ARMS, *ARMS_IN_TURN],
+    list(KINDS),
     "arms: baseline, control, labels (no mask, four poses), mask, diverse (the preset's), oracle "
     "(true pixels of close-ups), resolved (these, as sharp as the photographs are), test_time, and "
     "the preset with other settings, as in rgb_tolerance=0.02+label_share=0.5 or magnification=2:4 "
-    "(a wrong one is answered with the names of all)",
+    "(a wrong one is answered with the names of all), or both, as in mask+rate=2",
 )
 flags.DEFINE_integer(
     "max_parallel", 8, "arms and seeds trained at once, which bounds memory", lower_bound=1
@@ -141,7 +144,7 @@ def run_sweep(
     identity |= {"version": jaxcloseup.__version__, "data_sha256": hash_data(scene)}
     together = [(arm, seed) for arm in chosen for seed in range(seeds)]
     in_turn = [(arm, seed) for arm, seed in together if arm.in_turn]
-    together = [pair for pair in together if not pair[0].in_turn and pair[0].name != "baseline"]
+    together = [pair for pair in together if not pair[0].in_turn and pair[0].kind != "baseline"]
     # Side by side, arms that look from the same places share their forward warps.
     together.sort(key=lambda pair: (pair[1], pair[0].outlook))
     # Rows of what is kept are told apart by their place.
@@ -218,16 +221,15 @@ def run_sweep(
         if arm.depth_error is not None:
             data = *data, depths_of, arm.settings
             labels = labels_of_less_error(jax.random.key(seed), *data, share=arm.depth_error)
-        elif arm.name != "test_time":
-            blurred = arm.name == "resolved"
+        elif arm.kind != "test_time":
+            blurred = arm.kind == "resolved"
             data = *data, arm.settings
             labels = true_close_ups(jax.random.key(seed), *data, blurred=blurred)
         else:
             cameras = scene.test.cameras
             data = cameras, depths_of(cameras), scene.train, start.depths, arm.settings
             labels = jax.jit(label_views)(*data, sources=start.sources)
-            whole = isinstance(preset.field, SurfelConfig)
-            steps = preset.test_time_steps * (len(scene.test) if whole else 1)
+            steps = test_time_steps(preset, len(scene.test))
         name = f"{arm.name}_{seed}"
         data = views, labels, arm.settings
         try:

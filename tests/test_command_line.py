@@ -7,7 +7,7 @@ from absl import flags
 from absl.testing import flagsaver
 from tiny_runs import TINY
 
-from experiments import command_line
+from experiments import command_line, sweep
 from experiments import run as program
 from experiments.pipeline import config
 from experiments.presets import PRESETS
@@ -19,6 +19,15 @@ def parsed_flags():
     flags.FLAGS(["run"])
     with flagsaver.flagsaver(compilation_cache=""):
         yield
+
+
+def test_help_lists_the_flags_that_programs_share():
+    keys = flags.FLAGS.key_flags_by_module_dict()
+    defined = flags.FLAGS.flags_by_module_dict()[command_line.__name__]
+    shared = {flag.name for flag in defined} | {"output_dir"}
+    for module in (program, sweep):
+        assert shared <= {flag.name for flag in keys[module.__name__]}
+    assert "preset" in shared
 
 
 def test_nothing_to_resume_is_one_sentence(parsed_flags, tmp_path):

@@ -11,7 +11,8 @@ import pytest
 from tiny_runs import TINY, TINY_SURFELS
 
 from experiments.audit import blur_to_footprint
-from experiments.evaluation import Target, score, summarise
+from experiments.evaluate import evaluate_folders
+from experiments.evaluation import NO_PERCEPTUAL, Target, score, summarise
 from experiments.finished import choose_stage, load_run_scene, read_run, restore
 from experiments.gate import AGREEMENT, verdict, weigh_labels
 from experiments.loop import Programs, TrainingError, run_stage
@@ -176,6 +177,9 @@ def test_a_saved_render_reproduces_its_score(finished, capture_folder):
     truth = cv2.imread(str(capture_folder / "test" / "0.png"))
     expected = results["stages"]["closeup"]["test"]["psnr"]
     np.testing.assert_allclose(cv2.PSNR(image, truth), expected, atol=1e-3)
+    folders = (output_dir / "renders" / of / "test" / "rgb" for of in ("closeup", "truth"))
+    again = evaluate_folders(*folders, None, NO_PERCEPTUAL)
+    assert again["psnr"] == pytest.approx(expected, abs=1e-3)
 
 
 def test_a_run_leaves_pictures_and_a_page_without_links(finished):

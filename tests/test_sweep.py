@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -230,6 +231,9 @@ def test_the_interval_is_that_of_the_mean():
         ("label_share=1.5", "label_share lies between 0 and 1"),
         ("rate=-1", "rate lies between 0 and inf"),
         ("rate=1+rate=2", "sets rate twice"),
+        ("mask+", "is not an arm"),
+        ("baseline+rate=2", "baseline has no fine-tuning"),
+        ("oracle+depth_error=0.5", "oracle takes no other depth"),
     ],
 )
 def test_a_name_that_is_no_arm_is_one_sentence(name, message):
@@ -279,6 +283,12 @@ def test_names_change_settings():
     assert (arm.settings.pose.look_at, arm.settings.num_sources) == (1, 3)
     assert make_arm("diverse", pseudo_settings(TINY)).expected_depth is None
     assert make_arm("depth_error=0", pseudo_settings(TINY)).in_turn
+    arm = make_arm("resolved+magnification=2:3", pseudo_settings(TINY))
+    assert arm.in_turn and arm.kind == "resolved"
+    assert arm.settings.pose.magnification.tolist() == [2, 3]
+    both = make_arm("mask+rate=2", pseudo_settings(TINY)).settings
+    mask = make_arm("mask", pseudo_settings(TINY)).settings
+    chex.assert_trees_all_equal(both, mask.replace(rate=jnp.float32(2)))
 
 
 def test_an_arm_may_have_labels_from_the_other_depth(capture_folder, tmp_path):
