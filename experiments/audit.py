@@ -26,6 +26,7 @@ from jaxcloseup.pseudo import (
     sample_virtual_camera,
 )
 from jaxcloseup.scenes import Scene
+from jaxcloseup.train import labelled_depth
 
 
 CURVE_POINTS = 20
@@ -238,7 +239,7 @@ def audit_left_out(
     for index in _spread(views, count):
         seen = render(camera_at(views.cameras, index))
         for row, settings in enumerate(candidates):
-            sums[row] += audit(index, seen.rgb, seen.depth, views, depths, settings)
+            sums[row] += audit(index, seen.rgb, labelled_depth(seen), views, depths, settings)
     rows = []
     for label, model, kept, total in sums:
         of_label, of_model = (
@@ -267,7 +268,7 @@ def left_out_curve(
     total = 0
     for index in _spread(views, count):
         seen = render(camera_at(views.cameras, index))
-        data = index, seen.depth, views, depths, _of_any_colour(settings)
+        data = index, labelled_depth(seen), views, depths, _of_any_colour(settings)
         label, truth, weight = label_of(*data)
         inside = np.asarray(label.weight * weight) > 0
         columns = (

@@ -26,6 +26,7 @@ from jaxcloseup.train import TrainState, labelled_step, pseudo_step, run_steps, 
 
 
 HOSTS_WAIT = 24 * 3600  # seconds
+PERSISTENT = 10  # steps on end whose loss is not finite
 
 
 class TrainingError(Exception):
@@ -122,10 +123,8 @@ class Programs:
         `data` is what `train_step`, `pseudo_step` (with its sources) and `labelled_step` take.
         "arms" are those of a sweep, one on each device or several: all of the state but its step,
         and all data but the views, have a leading axis of arms. Metrics are then means over arms,
-        but for `skipped`, how many steps were skipped, a list of all arms' numbers.
-
-        Raises:
-          TrainingError: no step had a finite loss and gradient.
+        but for `skipped`, how many steps were skipped for loss or gradient were not finite, a list
+        of all arms' numbers.
         """
         if kind == "arms":
             if jax.process_count() > 1:
@@ -150,11 +149,6 @@ class Programs:
             overflow = [metrics.pop(key, np.zeros(())) for key in ("overflow", "label_overflow")]
             if not any(np.any(values) for values in overflow):
                 skipped = np.round(metrics.pop("skipped") * count).astype(int)
-                if kind != "arms" and skipped == count:
-                    raise TrainingError(
-                        f"loss or gradient was not finite in each of {count} steps: lower the "
-                        "learning rate, or look for broken photographs or poses"
-                    )
                 if skipped.any():
                     whose = f", by arm: {skipped.tolist()}" if kind == "arms" else ""
                     print(f"warning: {skipped.max()} of {count} steps skipped, not finite{whose}")
@@ -233,6 +227,10 @@ def run_stage(
 
     Returns:
       The state, and for each chunk its metrics with `step`, counted within the stage.
+
+    Raises:
+      TrainingError: `PERSISTENT` steps on end, or all of the stage's, were not finite; what was
+        good is kept.
     """
     chunk = max(1, min(-(-steps // 10), 500))
     history: list[dict[str, Any]] = []
@@ -252,18 +250,25 @@ def run_stage(
         checkpoints.save(name, done, state, progress)
 
     start = time.perf_counter()
+    failing, good = 0, (done, state)
     while done < steps:
         count = min(chunk, steps - done)
-        try:
-            state, values = programs.run(kind, state, *data, count=count)
-        except TrainingError as error:
+        state, values = programs.run(kind, state, *data, count=count)
+        done += count
+        failing = failing + count if values["skipped"] == count else 0
+        if failing >= min(PERSISTENT, steps):
+            done, state = good
+            history = [entry for entry in history if entry["step"] <= done]
             if done > saved:
                 keep()
+            where = f", whose state is kept in {checkpoints.folder}" if done else ""
             raise TrainingError(
-                f"{name} stopped after {done} good steps, whose state is kept in "
-                f"{checkpoints.folder}: {error}"
-            ) from error
-        done += count
+                f"{name} stopped after {done} good steps{where}: loss or gradient was not finite "
+                f"in each of the next {failing}: lower the learning rate, or look for broken "
+                "photographs or poses"
+            )
+        if not failing:
+            good = done, state
         history.append({"step": done} | values)
         rate = (done - begun) / (time.perf_counter() - start)
         left = (steps - done) / rate
@@ -276,7 +281,7 @@ def run_stage(
         )
         if log is not None:
             log.write(history[-1])
-        if done == steps or done - saved >= save_every:
+        if done == steps or (done - saved >= save_every and not failing):
             keep()
             saved = done
     return state, history

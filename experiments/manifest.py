@@ -1,8 +1,10 @@
 """manifest.json: what made a run, so that its numbers can be traced and its scene loaded again."""
 
 import hashlib
+import json
 import pathlib
 import subprocess
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -31,6 +33,14 @@ def write_manifest(
       seconds: wall time of each stage since the run was begun or resumed; for a sweep by scene.
     """
     commit, changed = git_commit(pathlib.Path(jaxcloseup.__file__).parent)
+    if (folder / NAME).exists():
+        before = json.loads((folder / NAME).read_bytes()).get("git_commit")
+        if None not in (before, commit) and before != commit:
+            warnings.warn(
+                f"{folder} was begun with commit {before[:9]} and goes on with {commit[:9]}: start "
+                "anew if what lies between them matters",
+                stacklevel=2,
+            )
     git = {"git_commit": commit, "git_changed": changed}
     write_json(folder / NAME, {**about, **git, "finished": seconds is not None, "seconds": seconds})
 
@@ -65,7 +75,7 @@ def write_dataparser_transforms(folder: pathlib.Path, scene: Scene) -> None:
 
 
 def hash_data(scene: Scene) -> str:
-    """SHA-256, in hexadecimal, of everything that training reads of a scene."""
+    """SHA-256, in hexadecimal, of what training reads of a scene, wanted views apart."""
     views = scene.train
     arrays = {
         "rgb": views.rgb,
@@ -76,6 +86,18 @@ def hash_data(scene: Scene) -> str:
         "points_rgb": scene.rgb,
         "near_far": np.array([scene.near, scene.far], np.float64),
     }
+    return _hash(arrays)
+
+
+def hash_wanted(scene: Scene) -> str | None:
+    """SHA-256 of the cameras of the close-ups, which `test_time` labels; None without any."""
+    if scene.test is None:
+        return None
+    cameras = scene.test.cameras
+    return _hash({"camtoworld": cameras.camtoworld, "intrinsics": cameras.intrinsics})
+
+
+def _hash(arrays):
     digest = hashlib.sha256()
     for name, array in arrays.items():
         array = np.ascontiguousarray(array)

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import functools
+import math
 import pathlib
 import platform
 import time
@@ -28,6 +29,7 @@ from experiments.loop import Programs, run_stage
 from experiments.manifest import (
     about_scene,
     hash_data,
+    hash_wanted,
     write_dataparser_transforms,
     write_manifest,
 )
@@ -87,7 +89,7 @@ def run(
     programs = Programs(preset, scene)
     identity = {"scene": scene.name, "seed": seed, "config": config(preset), **names}
     identity |= {"resolution": [size.width, size.height], "version": jaxcloseup.__version__}
-    identity["data_sha256"] = hash_data(scene)
+    identity |= {"data_sha256": hash_data(scene), "wanted_sha256": hash_wanted(scene)}
     checkpoints = Checkpoints(output_dir / "checkpoints", identity)
     log = TrainLog(output_dir, tensorboard=tensorboard)
     settings = pseudo_settings(preset)
@@ -188,7 +190,7 @@ def run(
             "scene": scene,
             "settings": settings,
             "depths": depths,
-            "render_depth": lambda camera: render(camera).depth,
+            "render_depth": lambda camera: labelled_depth(render(camera)),
         }
         pictures = comparisons(output_dir / "compare", targets, renderings)
         shown = targets.get("test", [])
@@ -226,6 +228,9 @@ def state_to_begin(programs: Programs, seed: int) -> TrainState:
     """What a seed's baseline is trained from, in a run and in a sweep."""
     key_init, _, _ = jax.random.split(jax.random.key(seed), 3)
     points = initial_points(jax.random.fold_in(key_init, 2), programs.scene)
+    most = getattr(programs.preset.field, "capacity", math.inf)
+    if len(points[0]) > most:
+        print(f"{most} of {len(points[0])} points are begun with: --capacity allows more surfels")
     return init_state(key_init, *points, field=programs.field, optimizer=programs.optimizer)
 
 

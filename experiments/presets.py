@@ -26,6 +26,9 @@ from jaxcloseup.train import TrainConfig
 from jaxcloseup.volume.nerf import NerfConfig, nerf
 
 
+FEWEST_POINTS = 100  # of a capture, to begin with these alone
+
+
 @dataclasses.dataclass(frozen=True)
 class Preset:
     """One experiment; plain numbers, so that it prints and serialises.
@@ -48,6 +51,7 @@ class Preset:
       forward_label: colours from the forward warps.
       leave_out_source: labels are held against the other views alone.
       label_share: of the labels' loss in a step's, unless both are pooled.
+      source_tolerance: relative agreement in depth of a wanted view with its source; inf: none.
       test_time_steps: in total for a NeRF, for each target view for surfels.
       gated: labels weigh what left-out photographs show that they deserve, which may be nothing.
     """
@@ -69,6 +73,7 @@ class Preset:
     forward_label: bool = False
     leave_out_source: bool = False
     label_share: float = 0.5
+    source_tolerance: float = math.inf
     test_time_steps: int = 200
     gated: bool = False
 
@@ -108,6 +113,7 @@ QUICK = dataclasses.replace(
     rgb_tolerance=0.04,
     depth_tolerance=0.02,
     leave_out_source=True,
+    source_tolerance=0.05,
 )
 
 WHOLE_IMAGES = TrainConfig(num_rays=None, num_label_rays=None)
@@ -140,6 +146,7 @@ QUICK_SURFELS = dataclasses.replace(
     downscale=8,
     magnification=(1.5, 3.0),
     leave_out_source=True,
+    source_tolerance=0.05,
     label_share=0.05,
     gated=True,
 )
@@ -171,10 +178,12 @@ def with_classic_density(field: SurfelConfig, preset: str) -> SurfelConfig:
 def make_field(preset: Preset, scene: Scene, *, growth: int = 1) -> RadianceField:
     """The preset's field for a scene; `growth` multiplies a rasteriser's capacity."""
     if isinstance(preset.field, SurfelConfig):
-        raster = preset.field.raster
-        raster = dataclasses.replace(raster, capacity=raster.capacity * growth)
+        raster, size = preset.field.raster, extent(scene)
+        # In a small scene the near plane must not hide what close-ups are for.
+        near = min(raster.near, 0.01 * size)
+        raster = dataclasses.replace(raster, capacity=raster.capacity * growth, near=near)
         config = dataclasses.replace(preset.field, raster=raster)
-        return surfel_field(config, extent=extent(scene))
+        return surfel_field(config, extent=size)
     centre, scale = (0.0, 0.0, 0.0), 1.0
     if preset.normalise:
         centre, scale = unit_cube(scene)
@@ -197,16 +206,21 @@ def make_optimizer(preset: Preset, scene: Scene) -> optax.GradientTransformation
 
 
 def initial_points(key: jax.Array, scene: Scene, count: int = 5000) -> tuple[Any, Any]:
-    """Points `[P, 3]` and colours to start from: the capture's, or else random ones, in grey."""
-    if len(scene.points):
+    """Points `[P, 3]` and colours to start from: the capture's, and if few random, grey ones."""
+    if len(scene.points) >= FEWEST_POINTS:
         return scene.points, scene.rgb
     points = random_points(key, scene.train.cameras, near=scene.near, far=scene.far, count=count)
-    return points, jnp.full_like(points, 0.5)
+    grey = jnp.full_like(points, 0.5)
+    if not len(scene.points):
+        return points, grey
+    return np.concatenate([scene.points, points]), np.concatenate([scene.rgb, grey])
 
 
 def extent(scene: Scene) -> float:
     """Size of a capture: the reach of its cameras, or half its depth if they stand in one place."""
-    return float(camera_extent(scene.train.cameras)) or 0.5 * scene.far
+    reach = float(camera_extent(scene.train.cameras))
+    # Of equal positions the mean is another one, by rounding.
+    return reach if reach > 1e-4 * scene.far else 0.5 * scene.far
 
 
 def unit_cube(scene: Scene) -> tuple[tuple[float, float, float], float]:
@@ -241,4 +255,5 @@ def pseudo_settings(preset: Preset) -> PseudoSettings:
         forward_label=jnp.float32(preset.forward_label),
         leave_out_source=jnp.float32(preset.leave_out_source),
         label_share=jnp.float32(preset.label_share),
+        source_tolerance=jnp.float32(preset.source_tolerance),
     )

@@ -10,7 +10,7 @@ import numpy as np
 
 from experiments.camera_paths import Shots, one_by_one
 from experiments.gate import print_gate, weigh_labels
-from experiments.loop import Programs
+from experiments.loop import Programs, TrainingError
 from experiments.pipeline import rendered_depths
 from experiments.presets import pseudo_settings, test_time_steps
 from jaxcloseup.artifacts.images import (
@@ -63,6 +63,8 @@ def fine_tune(
         print("nothing is fine-tuned")
         return state
     state, values = programs.run("targets", state, views, labels, settings, count=steps)
+    if values["skipped"] == steps:
+        raise TrainingError(f"loss or gradient was not finite in each of {steps} steps for them")
     numbers = {key: value for key, value in values.items() if isinstance(value, float)}
     print("  ".join(f"{key} {value:.4g}" for key, value in numbers.items()))
     return state

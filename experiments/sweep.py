@@ -34,7 +34,7 @@ from experiments.fixed_labels import labels_of_less_error, true_close_ups
 from experiments.logs import TrainLog, check_tensorboard
 from experiments.loop import HOSTS_WAIT, Programs, TrainingError, run_stage
 from experiments.manifest import NAME as MANIFEST
-from experiments.manifest import about_scene, hash_data, write_manifest
+from experiments.manifest import about_scene, hash_data, hash_wanted, write_manifest
 from experiments.output_dir import make
 from experiments.pictures import comparisons
 from experiments.pipeline import (
@@ -142,6 +142,7 @@ def run_sweep(
     identity |= {"resolution": [views.cameras.width, views.cameras.height]}
     identity |= {"max_parallel": max_parallel, "devices": len(jax.devices())}
     identity |= {"version": jaxcloseup.__version__, "data_sha256": hash_data(scene)}
+    identity["wanted_sha256"] = hash_wanted(scene)
     together = [(arm, seed) for arm in chosen for seed in range(seeds)]
     in_turn = [(arm, seed) for arm, seed in together if arm.in_turn]
     together = [pair for pair in together if not pair[0].in_turn and pair[0].kind != "baseline"]

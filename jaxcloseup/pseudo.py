@@ -24,6 +24,7 @@ from jaxcloseup.numerics import safe_divide, safe_norm
 # Photographs to blend are ranked on so many of the virtual pixels, or up to twice as many.
 _RANKING_PIXELS = 256
 _RANKING_TOLERANCE = 0.05
+_SOURCE_TOLERANCE = 0.05
 _ROUNDING = 1e-6  # of a cosine in float32
 
 
@@ -49,6 +50,8 @@ class PseudoSettings:
         which there is no label; inf: off.
       num_sources: `[]` photographs whose colours are averaged: the source view, and those that see
         most of the virtual pixels under small angles. 1 in the paper.
+      source_tolerance: `[]` relative; a wanted view has the photograph that sees most of what it
+        sees, within this tolerance of depth; inf: that has most pixels landing in it, as published.
       rate: `[]` factor on what the optimizer changes in steps with labels.
     """
 
@@ -62,6 +65,7 @@ class PseudoSettings:
     label_share: jax.Array = _by_default(0.5)
     max_ray_angle: jax.Array = _by_default(jnp.inf)
     num_sources: jax.Array = _by_default(1)
+    source_tolerance: jax.Array = _by_default(_SOURCE_TOLERANCE)
     rate: jax.Array = _by_default(1)
 
 
@@ -224,7 +228,9 @@ def label_views(
 
     def one_view(target):
         camera, depth = target
-        source = best_source(camera, views, depths, depth=depth)
+        source = best_source(
+            camera, views, depths, depth=depth, tolerance=settings.source_tolerance
+        )
         data = source, views, depths, settings
         label = make_label(camera, pixels, depth, *data, sources=sources)
         return label.rgb, label.weight
@@ -239,7 +245,7 @@ def best_source(
     depths: jax.Array,
     *,
     depth: jax.Array | None = None,
-    tolerance: float = 0.05,
+    tolerance: jax.Array | float = _SOURCE_TOLERANCE,
 ) -> jax.Array:
     """The training view `[]` with most pixels landing in `camera` with their own depth.
 

@@ -5,6 +5,7 @@
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -160,7 +161,7 @@ def pseudo_step(
         return field.render(params, buffers, camera, pixels, key)
 
     def label_of(seen):
-        depth = seen.depth * seen.alpha if config.undivided_depth else seen.depth
+        depth = labelled_depth(seen, divided=not config.undivided_depth)
         data = source_index, views, depths, settings
         return make_label(camera, label_pixels, depth, *data, sources=sources)
 
@@ -278,6 +279,7 @@ def render_depths(
 
     Depth is 0, undefined, where alpha is under `min_alpha` or depth outside [near, far]. The
     released script renders with sampling noise (`key`) and does not divide by alpha (`divided`).
+    Of surfels, `overflow` goes unseen here: render one by one where pairs may not fit.
     """
 
     def one_view(view):
@@ -292,8 +294,8 @@ def render_depths(
 def labelled_depth(
     rendering: Rendering,
     *,
-    near: float,
-    far: float,
+    near: float = 0.0,
+    far: float = math.inf,
     min_alpha: float = 0.5,
     divided: bool = True,
 ) -> jax.Array:

@@ -65,6 +65,13 @@ def test_the_dead_join_the_living(key):
         assert bool(changed[row]) == (n > 1)
 
 
+def test_a_few_grow_too(key):
+    alive = jnp.arange(COUNT) < 2
+    for growth, more in ((1.1, 1), (1.0, 0)):
+        _, now, _ = move(key, scene_with_dead([]), alive, config=DensityConfig(growth=growth))
+        assert now.sum() == 2 + more
+
+
 def test_donors_are_drawn_by_their_opacity():
     opacity = np.full(COUNT, 0.004)
     opacity[:2] = 0.2, 0.6

@@ -7,7 +7,7 @@ import pytest
 from absl import flags
 from absl.testing import flagsaver
 
-from experiments import sweep
+from experiments import manifest, sweep
 from experiments.manifest import about_scene, git_commit, hash_data
 from jaxcloseup.scenes import load_scene
 
@@ -63,6 +63,27 @@ def test_the_commit_is_that_of_the_package_alone(tmp_path):
 def test_git_that_is_missing_is_no_error(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     assert git_commit(tmp_path) == (None, None)
+
+
+def test_a_run_that_goes_on_with_other_code_says_so(tmp_path, monkeypatch):
+    commits = iter(["a" * 40, "a" * 40, "b" * 40, None])
+    monkeypatch.setattr(manifest, "git_commit", lambda _: (next(commits), False))
+    for _ in range(2):
+        manifest.write_manifest(tmp_path, {})
+    with pytest.warns(UserWarning, match="begun with commit aaaaaaaaa and goes on with bbbbbbbbb"):
+        manifest.write_manifest(tmp_path, {})
+    manifest.write_manifest(tmp_path, {})
+
+
+def test_wanted_views_are_told_apart_by_their_cameras(capture_folder):
+    scene = load_scene(str(capture_folder))
+    known = manifest.hash_wanted(scene)
+    turned = scene.test.replace(
+        cameras=scene.test.cameras.replace(camtoworld=-scene.test.cameras.camtoworld)
+    )
+    assert known == manifest.hash_wanted(load_scene(str(capture_folder)))
+    assert manifest.hash_wanted(dataclasses.replace(scene, test=turned)) != known
+    assert manifest.hash_wanted(dataclasses.replace(scene, test=None)) is None
 
 
 def test_a_sweep_leaves_a_manifest(capture_folder, tmp_path, monkeypatch):

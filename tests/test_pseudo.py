@@ -255,6 +255,22 @@ def test_best_source_does_not_look_through_walls(capture):
     assert best_source(target, views, behind, depth=jnp.asarray(depth, jnp.float32)) != 1
 
 
+def test_wanted_views_may_have_the_published_source(capture):
+    views, depths, _ = capture
+    behind = depths.at[1].multiply(1.5)  # as above: most of its pixels land, of what nobody sees
+    stacked, exact = plane.make_views([plane.camera_above(0.0, 0.0, 3.9)])
+    seen = [
+        label_views(stacked.cameras, exact, views, behind, settings(use_mask=0.0, **changed)).rgb
+        for changed in ({}, {"source_tolerance": jnp.inf})
+    ]
+    camera = jax.tree.map(lambda leaf: leaf[0], stacked.cameras)
+    for rgb, given in zip(seen, (exact[0], None), strict=True):
+        source = best_source(camera, views, behind, depth=given)
+        alone = label(camera, GRID, exact[0], source, views, behind, settings(use_mask=0.0))
+        np.testing.assert_allclose(rgb[0], alone.rgb, atol=1e-6)
+    assert np.abs(seen[0] - seen[1]).max() > 0.01
+
+
 def test_target_views_are_labelled_from_their_best_source(capture):
     views, depths, closeup = capture
     targets = [closeup, plane.camera_above(-0.9, 0.0, 2.0)]

@@ -230,27 +230,32 @@ def test_training_that_is_no_longer_finite_stops_with_what_was_good(capture_fold
         state = init_state(key, *points, field=programs.field, optimizer=programs.optimizer)
         broken = scene.train.replace(rgb=jnp.full(scene.train.rgb.shape, jnp.nan))
         checkpoints = Checkpoints(tmp_path, {"scene": "plane"})
-        good, run = [], programs.run
+        good, calls, run = [], [], programs.run
 
-        def breaks_after_two(kind, state, views, *, count):
-            now = run(kind, state, views if len(good) < 2 else broken, count=count)
-            good.append(now[0])
+        def breaks_in_the_second_and_after_four(kind, state, views, *, count):
+            calls.append(count)
+            broke = len(calls) == 2 or len(calls) > 4
+            now = run(kind, state, broken if broke else views, count=count)
+            if not broke:
+                good.append(now[0])
             return now
 
-        programs.run = breaks_after_two
-        with pytest.raises(TrainingError, match=r"stopped after 2 good .* not finite in each of 1"):
+        programs.run = breaks_in_the_second_and_after_four
+        message = r"stopped after 8 good .* kept in .* not finite in each of the next 10:"
+        with pytest.raises(TrainingError, match=message):
             run_stage(
                 "baseline",
                 programs,
                 "photographs",
                 state,
                 scene.train,
-                steps=10,
+                steps=20,
                 checkpoints=checkpoints,
                 save_every=1000,
             )
         step, kept, progress = Checkpoints(tmp_path, {"scene": "plane"}).load("baseline", state)
-    assert step == len(good) == len(progress["history"]) == 2
+    assert [entry["skipped"] for entry in progress["history"]] == [0, 2, 0, 0]
+    assert step == 8 and calls == [2] * 9
     jax.tree.map(np.testing.assert_array_equal, kept.params, good[-1].params)
 
 

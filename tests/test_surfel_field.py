@@ -10,6 +10,7 @@ import plane
 import pytest
 from splat_scenes import random_scene, to_camera, to_surfels
 
+from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.metrics import psnr
 from jaxcloseup.splats import RasterizeConfig
@@ -50,19 +51,23 @@ def capture():
 
 
 @pytest.fixture(scope="module")
-def trained(capture):
+def run():
+    bound = {
+        "field": FIELD,
+        "optimizer": OPTIMIZER,
+        "config": TrainConfig(num_rays=None, num_label_rays=None),
+    }
+    return jax.jit(functools.partial(run_steps, functools.partial(train_step, **bound)))
+
+
+@pytest.fixture(scope="module")
+def trained(capture, run):
     views, _ = capture
     rng = np.random.default_rng(0)
     points = rng.uniform([-1.6, -1.4, -0.15], [1.6, 1.4, 0.15], (250, 3))
     points = jnp.asarray(points, jnp.float32)
     grey = jnp.full_like(points, 0.5)
     state = init_state(jax.random.key(0), points, grey, field=FIELD, optimizer=OPTIMIZER)
-    bound = {
-        "field": FIELD,
-        "optimizer": OPTIMIZER,
-        "config": TrainConfig(num_rays=None, num_label_rays=None),
-    }
-    run = jax.jit(functools.partial(run_steps, functools.partial(train_step, **bound)))
     with jax.numpy_dtype_promotion("standard"):  # optax mixes integers and floats
         first, _ = run(state, views, count=STEPS // 2)
         last, metrics = run(first, views, count=STEPS // 2)
@@ -133,6 +138,31 @@ def test_schedules_follow_the_step(trained):
     assert end.buffers.alive.sum() == int(int(middle.buffers.alive.sum()) * 1.1)
     assert start.step == 0
     assert end.step == STEPS
+
+
+def test_what_is_saved_goes_on_to_the_same_bits(trained, capture, run, tmp_path):
+    """Through relocations, and with surfels that were born before and after."""
+    start, middle, end, _ = trained
+    Checkpoints(tmp_path, {}).save("baseline", STEPS // 2, middle, {})
+    _, kept, _ = Checkpoints(tmp_path, {}).load("baseline", start)
+    with jax.numpy_dtype_promotion("standard"):
+        again, _ = run(kept, capture[0], count=STEPS // 2)
+    for now, before in zip(jax.tree.leaves(again), jax.tree.leaves(end), strict=True):
+        if jax.dtypes.issubdtype(now.dtype, jax.dtypes.prng_key):
+            now, before = jax.random.key_data(now), jax.random.key_data(before)
+        np.testing.assert_array_equal(now, before)
+
+
+def test_late_surfels_wander_as_little_as_they_learn(trained):
+    """The noise follows the learning rate of the means."""
+    state = trained[2].replace(step=jnp.int32(STEPS + 1))
+    moves = []
+    for late_rate in (1.0, 0.1):
+        field = surfel_field(dataclasses.replace(CONFIG, late_rate=late_rate), extent=EXTENT)
+        after = field.adapt(jax.random.key(1), state)
+        moves.append(np.asarray(after.params.means - state.params.means, np.float64))
+    assert np.abs(moves[0]).max() > 1e-4
+    assert np.linalg.norm(moves[1]) == pytest.approx(0.1 * np.linalg.norm(moves[0]), rel=1e-2)
 
 
 def test_the_optimizer_forgets_surfels_that_moved(trained):

@@ -121,8 +121,9 @@ def _difference(name, kept, identity):
     """What differs, down to the innermost field."""
     old, new = kept.get(name), identity.get(name)
     while isinstance(old, dict) and isinstance(new, dict):
-        inner = next(k for k in sorted(old.keys() | new.keys()) if old.get(k) != new.get(k))
-        name, old, new = f"{name}.{inner}", old.get(inner), new.get(inner)
+        both = ((k, old.get(k, "absent"), new.get(k, "absent")) for k in sorted({*old, *new}))
+        inner, old, new = next(values for values in both if values[1] != values[2])
+        name = f"{name}.{inner}"
     return f"whose {name} is {old} and not {new}"
 
 

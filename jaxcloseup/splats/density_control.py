@@ -61,9 +61,10 @@ def relocate(
     opacity = jax.nn.sigmoid(surfels.opacity_logits)
     donor = alive & (opacity > config.min_opacity)
     number = jnp.sum(alive, dtype=jnp.int32)
-    grown = (
-        jnp.minimum((number.astype(jnp.float32) * config.growth).astype(jnp.int32), count) - number
-    )
+    more = (number.astype(jnp.float32) * config.growth).astype(jnp.int32)
+    # Of a few, a share rounds to none.
+    more = jnp.maximum(more, number + int(config.growth > 1))
+    grown = jnp.minimum(more, count) - number
     newborn = ~alive & (jnp.cumsum(~alive, dtype=jnp.int32) <= grown)
     receiver = ((alive & ~donor) | newborn) & jnp.any(donor)
 

@@ -235,7 +235,7 @@ def surfel_optimizer(config: SurfelConfig, *, extent: float) -> optax.GradientTr
             opacity_logits=config.opacity_rate,
             sh=by_band[None, :, None],
         )
-        late = jnp.where(state.count < config.decay_steps, 1, config.late_rate)
+        late = _late(config, state.count)
         updates = jax.tree.map(lambda rate, update: -late * rate * update, rates, updates)
         return updates, optax.ScaleByScheduleState(count=state.count + 1)
 
@@ -244,6 +244,10 @@ def surfel_optimizer(config: SurfelConfig, *, extent: float) -> optax.GradientTr
     if isinstance(config.density, AdaptiveDensityConfig):
         return optax.chain(measure_pull(), adam)
     return adam
+
+
+def _late(config, step):
+    return jnp.where(step < config.decay_steps, 1, config.late_rate)
 
 
 def means_rate(config: SurfelConfig, step: jax.Array) -> jax.Array:
@@ -313,7 +317,7 @@ def _adapt(key, state, config, extent):
         return _replace_surfels(state, surfels, alive, changed)
 
     state = jax.lax.cond(due, move, lambda state: state, state)
-    rate = means_rate(config, state.step) * extent
+    rate = _late(config, state.step) * means_rate(config, state.step) * extent
     surfels = wander(key_wander, state.params, state.buffers.alive, rate, density)
     return state.replace(params=surfels)
 

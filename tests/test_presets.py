@@ -1,0 +1,57 @@
+"""What presets make of a scene: its size, its near plane and the points to begin with."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tiny_runs import TINY_SURFELS
+
+from experiments import presets
+from experiments.presets import FEWEST_POINTS, extent, initial_points, make_field
+from jaxcloseup.scenes import load_scene
+
+
+@pytest.fixture
+def scene(capture_folder):
+    return load_scene(str(capture_folder))
+
+
+def moved(scene, change):
+    """The scene with other positions `[V, 3]` of its cameras."""
+    cameras = scene.train.cameras
+    poses = cameras.camtoworld.at[..., 3].set(change(cameras.position))
+    return dataclasses.replace(
+        scene, train=scene.train.replace(cameras=cameras.replace(camtoworld=poses))
+    )
+
+
+def test_cameras_in_one_place_have_the_size_of_what_they_see(scene):
+    for place in np.random.default_rng(0).uniform(-3, 3, (8, 3)):
+        here = moved(scene, lambda old, place=place: jnp.broadcast_to(place, old.shape))
+        assert extent(here) == pytest.approx(0.5 * scene.far)
+    assert extent(scene) == pytest.approx(1.1 * np.hypot(1, 0.1), rel=1e-3)
+
+
+def test_the_near_plane_is_small_in_a_small_scene(scene, monkeypatch):
+    seen = []
+    monkeypatch.setattr(presets, "surfel_field", lambda config, *, extent: seen.append(config))
+    small = moved(scene, lambda old: 0.01 * old)
+    for one in (scene, small, dataclasses.replace(small, far=0.01 * scene.far)):
+        make_field(TINY_SURFELS, one)
+    near = [config.raster.near for config in seen]
+    assert near[0] == TINY_SURFELS.field.raster.near
+    assert near[1] == near[2] == pytest.approx(0.01 * 0.01 * extent(scene))
+
+
+def test_few_points_have_random_ones_beside_them(scene):
+    key = jax.random.key(0)
+    for count in (0, 3, FEWEST_POINTS):
+        some = np.random.default_rng(0).uniform(-1, 1, (count, 3)).astype(np.float32)
+        of_capture = dataclasses.replace(scene, points=some, rgb=some)
+        points, rgb = initial_points(key, of_capture, count=200)
+        assert len(points) == len(rgb) == count + (200 if count < FEWEST_POINTS else 0)
+        np.testing.assert_array_equal(points[:count], some)
+        np.testing.assert_array_equal(rgb[:count], some)
+        np.testing.assert_array_equal(rgb[count:], 0.5)
