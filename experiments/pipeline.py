@@ -135,6 +135,7 @@ def run(
                 path = output_dir / "splats" / f"{stage}.ply"
                 write_surfels(path, state.params, state.buffers.alive)
 
+    say_what_is_left_out(programs)
     state = state_to_begin(programs, seed)
     baseline = train("baseline", "photographs", state, views, steps=preset.baseline_steps)
     render = functools.partial(programs.render, baseline)
@@ -228,10 +229,14 @@ def state_to_begin(programs: Programs, seed: int) -> TrainState:
     """What a seed's baseline is trained from, in a run and in a sweep."""
     key_init, _, _ = jax.random.split(jax.random.key(seed), 3)
     points = initial_points(jax.random.fold_in(key_init, 2), programs.scene)
-    most = getattr(programs.preset.field, "capacity", math.inf)
-    if len(points[0]) > most:
-        print(f"{most} of {len(points[0])} points are begun with: --capacity allows more surfels")
     return init_state(key_init, *points, field=programs.field, optimizer=programs.optimizer)
+
+
+def say_what_is_left_out(programs: Programs) -> None:
+    """Print how many points surfels begin with, where there is room for some alone."""
+    most, count = getattr(programs.preset.field, "capacity", math.inf), len(programs.scene.points)
+    if count > most:
+        print(f"{most} of {count} points are begun with: --capacity makes room for more")
 
 
 def training_depths(programs: Programs, state: TrainState, seed: int) -> jax.Array:

@@ -40,6 +40,7 @@ from experiments.pictures import comparisons
 from experiments.pipeline import (
     config,
     rendered_depths,
+    say_what_is_left_out,
     state_to_begin,
     timed,
     training_depths,
@@ -165,6 +166,7 @@ def run_sweep(
         sources = jax.jit(block_sources)(views.cameras, depths, views.weight)
         return _Start(state, depths, sources, skipped)
 
+    say_what_is_left_out(programs)
     for seed in range(seeds):
         data = programs, "photographs", state_to_begin(programs, seed), views
         state, history = stage(f"baseline_{seed}", *data, steps=preset.baseline_steps)

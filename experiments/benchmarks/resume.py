@@ -18,9 +18,9 @@ COMMAND = (
     "-m",
     "experiments.run",
     "--scene=table",
-    "--baseline_steps=100",
+    "--baseline_steps=700",  # relocations, harmonics and regularisers begin before
     "--closeup_steps=20",
-    "--save_every=10",
+    "--save_every=50",
 )
 
 
