@@ -20,13 +20,13 @@ from absl import flags
 from absl.testing import flagsaver
 from tiny_runs import TINY, TINY_SURFELS
 
-from experiments import sweep
+from experiments import sweep, sweep_pipeline
 from experiments.arms import make_arm
 from experiments.loop import Programs
 from experiments.pictures import comparisons
 from experiments.pipeline import rendered_depths
 from experiments.presets import initial_points, pseudo_settings
-from experiments.sweep import run_sweep, stack_arms
+from experiments.sweep_pipeline import run_sweep, stack_arms
 from experiments.sweep_report import paired_bootstrap, rows, write_sweep
 from jaxcloseup.geometry.union_warp import block_sources
 from jaxcloseup.scenes import load_scene
@@ -130,7 +130,7 @@ def sweep_tiny(scene, folder, arms=("baseline", "control", "diverse", "test_time
 def test_a_sweep_cut_off_and_resumed_ends_the_same(capture_folder, tmp_path, monkeypatch, capsys):
     scene = load_scene(str(capture_folder))
     programs = Programs(TINY_STEPS, scene)  # compiled once for both
-    monkeypatch.setattr(sweep, "Programs", lambda preset, scene: programs)
+    monkeypatch.setattr(sweep_pipeline, "Programs", lambda preset, scene: programs)
     whole = sweep_tiny(scene, tmp_path / "sweep")
     assert list(whole) == ["baseline", "control", "diverse", "test_time"]
     assert all(list(of_arm) == ["0", "1"] for of_arm in whole.values())

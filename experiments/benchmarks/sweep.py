@@ -9,7 +9,7 @@ from experiments.benchmarks.timing import interleaved_medians
 from experiments.loop import Programs
 from experiments.pipeline import rendered_depths
 from experiments.presets import PRESETS, initial_points, pseudo_settings
-from experiments.sweep import stack_arms
+from experiments.sweep_pipeline import stack_arms
 from jaxcloseup.geometry.union_warp import block_sources
 from jaxcloseup.scenes import load_scene
 from jaxcloseup.train import init_state
