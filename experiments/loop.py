@@ -123,8 +123,8 @@ class Programs:
         `data` is what `train_step`, `pseudo_step` (with its sources) and `labelled_step` take.
         "arms" are those of a sweep, one on each device or several: all of the state but its step,
         and all data but the views, have a leading axis of arms. Metrics are then means over arms,
-        but for `skipped`, how many steps were skipped for loss or gradient were not finite, a list
-        of all arms' numbers.
+        but for `skipped`, how many steps were skipped because loss or gradient was not finite, a
+        list of all arms' numbers.
         """
         if kind == "arms":
             if jax.process_count() > 1:

@@ -1,5 +1,6 @@
 """manifest.json: what made a run, so that its numbers can be traced and its scene loaded again."""
 
+import contextlib
 import hashlib
 import json
 import pathlib
@@ -33,14 +34,15 @@ def write_manifest(
       seconds: wall time of each stage since the run was begun or resumed; for a sweep by scene.
     """
     commit, changed = git_commit(pathlib.Path(jaxcloseup.__file__).parent)
-    if (folder / NAME).exists():
-        before = json.loads((folder / NAME).read_bytes()).get("git_commit")
-        if None not in (before, commit) and before != commit:
-            warnings.warn(
-                f"{folder} was begun with commit {before[:9]} and goes on with {commit[:9]}: start "
-                "anew if what lies between them matters",
-                stacklevel=2,
-            )
+    before = None
+    with contextlib.suppress(OSError, ValueError):
+        before = json.loads((folder / NAME).read_bytes())["git_commit"]
+    if None not in (before, commit) and before != commit:
+        warnings.warn(
+            f"{folder} was begun with commit {before[:9]} and goes on with {commit[:9]}: start "
+            "anew if what lies between them matters",
+            stacklevel=2,
+        )
     git = {"git_commit": commit, "git_changed": changed}
     write_json(folder / NAME, {**about, **git, "finished": seconds is not None, "seconds": seconds})
 
