@@ -14,6 +14,7 @@ import time
 
 
 KILLS = 10
+KILLS_OF_A_RUN = 2  # more would meet it where it begins again, and no longer in stage 1
 COMMAND = (
     "-m",
     "experiments.run",
@@ -35,11 +36,11 @@ def run() -> None:
         print(f"left in peace: {whole:.0f} s")
         rng, killed, attempt = random.Random(0), 0, 0
         while killed < KILLS:
-            target = root / f"killed_{attempt}"
+            target, before = root / f"killed_{attempt}", killed
             while not (target / "report.html").exists():
                 process = _start(target, resume=(target / "checkpoints").is_dir())
-                if killed < KILLS:
-                    time.sleep(rng.uniform(0.1, 0.7) * whole)
+                if killed < min(KILLS, before + KILLS_OF_A_RUN):
+                    time.sleep(rng.uniform(0.1, 0.6) * whole)
                     if process.poll() is None:
                         process.send_signal(signal.SIGKILL)
                         killed += 1
