@@ -259,8 +259,9 @@ def test_wanted_views_may_have_the_published_source(capture):
     views, depths, _ = capture
     behind = depths.at[1].multiply(1.5)  # as above: most of its pixels land, of what nobody sees
     stacked, exact = plane.make_views([plane.camera_above(0.0, 0.0, 3.9)])
+    label_all = jax.jit(label_views)
     seen = [
-        label_views(stacked.cameras, exact, views, behind, settings(use_mask=0.0, **changed)).rgb
+        label_all(stacked.cameras, exact, views, behind, settings(use_mask=0.0, **changed)).rgb
         for changed in ({}, {"source_tolerance": jnp.inf})
     ]
     camera = jax.tree.map(lambda leaf: leaf[0], stacked.cameras)
