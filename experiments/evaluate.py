@@ -3,7 +3,7 @@
     python -m experiments.evaluate --renders=renders/rgb --truth=capture/test --output=metrics.json
 
 Pairs are matched by name, whatever the ending. Metrics are those of experiments.run, on 8-bit
-colours: means over images, and each image's own.
+colors: means over images, and each image's own.
 """
 
 import pathlib
@@ -15,12 +15,12 @@ from absl import app, flags
 from rich.console import Console
 from rich.table import Table
 
-from experiments.evaluation import Perceptual, find_perceptual, score_image, summarise
-from experiments.report import COLUMNS, format_metric, write_json
-from experiments.set_up import set_up
-from jaxcloseup.batch import to_float
+from experiments.command_line import set_up
+from experiments.evaluation.scores import Perceptual, find_perceptual, score_image, summarize
+from experiments.reporting.report import COLUMNS, format_metric, write_json
+from jaxcloseup.captures.images import read_image, read_mask
+from jaxcloseup.photographs import to_float
 from jaxcloseup.scenes import SceneError
-from jaxcloseup.scenes.images import read_image, read_mask
 
 
 FLAGS = flags.FLAGS
@@ -96,7 +96,7 @@ def evaluate_folders(
                 )
         arrays = (to_float(jnp.asarray(array)) for array in (image, target, weight))
         views[name] = score_image(*arrays, perceptual)
-    return summarise(views)
+    return summarize(views)
 
 
 def _match(some, these, other, those):

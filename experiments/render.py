@@ -5,7 +5,7 @@
     python -m experiments.render --run=... --orbit --frames=120
     python -m experiments.render --run=... --from=train_003 --pixel=60,40 --magnification=4
 
-A dolly goes from a training view straight towards the surface at a pixel. Beside colour and depth
+A dolly goes from a training view straight towards the surface at a pixel. Beside color and depth
 there are normals, of surfels, and `support`: how many training photographs saw a pixel, and how
 sharply. `--fine_tune` first trains for exactly these cameras, with labels made for them;
 `--target=FILE` is `--camera_path=FILE --fine_tune`.
@@ -21,19 +21,18 @@ import cv2
 import numpy as np
 from absl import app, flags
 
-from experiments import camera_paths
-from experiments.camera_paths import CameraError, Shots
-from experiments.finished import RunError, load_run_scene, named_run, restore
-from experiments.loop import TrainingError
-from experiments.output_dir import check_unused
-from experiments.pipeline import training_depths
-from experiments.set_up import set_up
-from experiments.shots import fine_tune, render_shots
+from experiments.command_line import check_unused, set_up
+from experiments.training.loop import TrainingError
+from experiments.training.stages import training_depths
+from experiments.training.stored_run import RunError, load_run_scene, named_run, restore
+from experiments.viewing import camera_paths
+from experiments.viewing.camera_paths import CameraError, Shots
+from experiments.viewing.frames import fine_tune, render_shots
 from jaxcloseup.artifacts.checkpoints import CheckpointError
 from jaxcloseup.artifacts.video import write_video
-from jaxcloseup.batch import camera_at
+from jaxcloseup.photographs import camera_at
 from jaxcloseup.scenes import SceneError
-from jaxcloseup.train import labelled_depth
+from jaxcloseup.train import label_depth
 
 
 FLAGS = flags.FLAGS
@@ -112,7 +111,7 @@ def _render() -> None:
 
     programs, state = restore(record, scene, stage)
     if way == "from":
-        seen = labelled_depth(programs.render(state, view), near=0, far=scene.far)
+        seen = label_depth(programs.render(state, view), near=0, far=scene.far)
         depth = float(seen[row, column])
         if depth <= 0:
             raise CameraError(

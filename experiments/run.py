@@ -1,4 +1,4 @@
-"""Train, fine-tune on pseudo-labelled close-ups, evaluate, report.
+"""Train, fine-tune on pseudo-labeled close-ups, evaluate, report.
 
     python -m experiments.run --scene=table
 
@@ -11,20 +11,19 @@ import sys
 
 from absl import app, flags
 
-from experiments import command_line
-from experiments.evaluation import find_perceptual
-from experiments.logs import check_tensorboard
-from experiments.loop import TrainingError
-from experiments.output_dir import make
-from experiments.pipeline import STAGES, run
-from experiments.report import print_table
-from experiments.set_up import set_up
+from experiments.command_line import make, set_up
+from experiments.evaluation.scores import find_perceptual
+from experiments.reporting.report import print_table
+from experiments.training import flags as training_flags
+from experiments.training.logs import check_tensorboard
+from experiments.training.loop import TrainingError
+from experiments.training.stages import STAGES, run
 from jaxcloseup.artifacts.checkpoints import CheckpointError
 from jaxcloseup.scenes import SceneError
 
 
 FLAGS = flags.FLAGS
-flags.adopt_module_key_flags(command_line)  # these are in --help too
+flags.adopt_module_key_flags(training_flags)  # these are in --help too
 for _name in ("output_dir", "lpips_weights", "compilation_cache"):
     flags.declare_key_flag(_name)
 flags.DEFINE_string(
@@ -45,12 +44,12 @@ def main(argv: list[str]) -> None:
     try:
         if FLAGS.tensorboard:
             check_tensorboard()
-        preset = command_line.preset_from_flags()
-        output_dir = command_line.choose_output_dir(
+        preset = training_flags.preset_from_flags()
+        output_dir = training_flags.choose_output_dir(
             FLAGS.output_dir, FLAGS.scene, FLAGS.method, resume=FLAGS.resume
         )
-        load_options = command_line.load_options_from_flags(preset)
-        scene = command_line.load(FLAGS.scene, load_options)
+        load_options = training_flags.load_options_from_flags(preset)
+        scene = training_flags.load(FLAGS.scene, load_options)
         perceptual = find_perceptual(FLAGS.lpips_weights)
         make(output_dir)
     except (SceneError, OSError, ValueError) as error:
@@ -61,7 +60,7 @@ def main(argv: list[str]) -> None:
             preset,
             FLAGS.seed,
             output_dir,
-            names=command_line.names_from_flags(),
+            names=training_flags.names_from_flags(),
             to_run=FLAGS.stages,
             save_every=FLAGS.save_every,
             perceptual=perceptual,

@@ -17,27 +17,26 @@ from typing import Any
 import jax
 from absl import app, flags
 
-from experiments import command_line
-from experiments.arms import KINDS, make_arm
-from experiments.evaluation import find_perceptual
-from experiments.logs import TrainLog, check_tensorboard
-from experiments.loop import HOSTS_WAIT, TrainingError
-from experiments.manifest import NAME as MANIFEST
-from experiments.manifest import about_scene, write_manifest
-from experiments.output_dir import make
-from experiments.pipeline import config, versions
-from experiments.presets import Preset, pseudo_settings
-from experiments.report import Picture
-from experiments.set_up import set_up
-from experiments.sweep_pipeline import run_sweep
-from experiments.sweep_report import print_sweep, write_sweep
+from experiments.command_line import make, set_up
+from experiments.evaluation.scores import find_perceptual
+from experiments.methods.presets import Preset, pseudo_settings
+from experiments.reporting.report import Picture
+from experiments.reporting.tables import print_sweep, write_sweep
+from experiments.training import flags as training_flags
+from experiments.training.arms import KINDS, make_arm
+from experiments.training.logs import TrainLog, check_tensorboard
+from experiments.training.loop import HOSTS_WAIT, TrainingError
+from experiments.training.manifest import NAME as MANIFEST
+from experiments.training.manifest import about_scene, write_manifest
+from experiments.training.stages import config, versions
+from experiments.training.sweep import run_sweep
 from jaxcloseup.artifacts.checkpoints import CheckpointError
 from jaxcloseup.scenes import Scene, SceneError
 from jaxcloseup.splats.field import SurfelConfig
 
 
 FLAGS = flags.FLAGS
-flags.adopt_module_key_flags(command_line)  # these are in --help too
+flags.adopt_module_key_flags(training_flags)  # these are in --help too
 for _name in ("output_dir", "lpips_weights", "compilation_cache"):
     flags.declare_key_flag(_name)
 flags.DEFINE_list("scenes", ["table"], "built-in scenes or folders")
@@ -47,7 +46,7 @@ flags.DEFINE_list(
     list(KINDS),
     "arms: baseline, control, labels (no mask, four poses), mask, diverse (the preset's), oracle "
     "(true pixels of close-ups), resolved (these, as sharp as the photographs are), test_time, and "
-    "the preset with other settings, as in rgb_tolerance=0.02+label_share=0.5 or magnification=2:4 "
+    "the preset with other settings, as in rgb_tolerance=0.02+label_loss_weight=0.5 or magnification=2:4 "
     "(a wrong one is answered with the names of all), or both, as in mask+rate=2",
 )
 flags.DEFINE_integer(
@@ -88,10 +87,13 @@ def _check_flags(preset: Preset) -> None:
         if made.expected_depth is not None and not isinstance(preset.field, SurfelConfig):
             raise ValueError(f"--arms={arm}: a NeRF has expected depth only; leave it out")
         changes = made.settings
-        if preset.train.pooled_loss and 0 < float(changes.label_share) != preset.label_share:
+        if (
+            preset.train.pooled_loss
+            and 0 < float(changes.label_loss_weight) != preset.label_loss_weight
+        ):
             raise ValueError(
                 f"--arms={arm}: this preset pools the losses of photographs and labels, which have "
-                "no shares then; only label_share=0 makes a difference"
+                "no shares then; only label_loss_weight=0 makes a difference"
             )
     if "control" not in FLAGS.arms:
         print("warning: without the arm control there are no gains in the tables")
@@ -116,22 +118,22 @@ def main(argv: list[str]) -> None:
     if len(argv) > 1:
         raise app.UsageError(f"unexpected argument: {argv[1]}")
     set_up()
-    names = command_line.names_from_flags()
+    names = training_flags.names_from_flags()
     try:
         hosts = _hosts()
         first = hosts is None or hosts[-1] == 0
         if FLAGS.tensorboard:
             check_tensorboard()
-        preset = command_line.preset_from_flags()
+        preset = training_flags.preset_from_flags()
         _check_flags(preset)
         output_dir = pathlib.Path(FLAGS.output_dir or "")
         if first:
-            output_dir = command_line.choose_output_dir(
+            output_dir = training_flags.choose_output_dir(
                 FLAGS.output_dir, "sweep", FLAGS.method, resume=FLAGS.resume
             )
         perceptual = find_perceptual(FLAGS.lpips_weights)
-        load_options = command_line.load_options_from_flags(preset)
-        captures = [command_line.load(name, load_options) for name in FLAGS.scenes]
+        load_options = training_flags.load_options_from_flags(preset)
+        captures = [training_flags.load(name, load_options) for name in FLAGS.scenes]
         _check_scenes(captures, output_dir)
         make(output_dir)
     except (SceneError, OSError, ValueError) as error:

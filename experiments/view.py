@@ -13,8 +13,8 @@ import sys
 
 from absl import app, flags
 
-from experiments.finished import RunError, load_run_scene, named_run, restore
-from experiments.set_up import set_up
+from experiments.command_line import set_up
+from experiments.training.stored_run import RunError, load_run_scene, named_run, restore
 from jaxcloseup.artifacts.checkpoints import CheckpointError
 from jaxcloseup.scenes import SceneError
 
@@ -32,19 +32,19 @@ def main(argv: list[str]) -> None:
         raise app.UsageError(f"unexpected argument: {argv[1]}")
     set_up()
     try:
-        from experiments import serving, viewer
+        from experiments.viewing import page, server
     except ModuleNotFoundError as error:
         if error.name != "viser":
             raise
         sys.exit('experiments.view: needs viser: install jaxcloseup with the extra "viewer"')
     try:
         record, stage = named_run()
-        serving.check_address(FLAGS.host, FLAGS.port)
+        server.check_address(FLAGS.host, FLAGS.port)
         scene = load_run_scene(record, FLAGS.data)
         programs, state = restore(record, scene, stage)
-        server = serving.serve(FLAGS.host, FLAGS.port)
-        page = viewer.Viewer(server, programs, state, stage=stage, seed=record.identity["seed"])
-    except (RunError, serving.ServeError, SceneError, CheckpointError, OSError) as error:
+        server = server.serve(FLAGS.host, FLAGS.port)
+        page = page.Viewer(server, programs, state, stage=stage, seed=record.identity["seed"])
+    except (RunError, server.ServeError, SceneError, CheckpointError, OSError) as error:
         sys.exit(f"experiments.view: {error}")
     print(f"open http://{FLAGS.host}:{FLAGS.port} in a browser; Ctrl-C ends this", flush=True)
     with contextlib.suppress(KeyboardInterrupt):

@@ -14,16 +14,23 @@ class Rendering(NamedTuple):
     """What a field renders; `[...]` is the pixels' shape, or `[H, W]` for a whole image.
 
     Attributes:
-      rgb: `[..., 3]` colours, background included.
-      depth: `[...]` expected z-depth of the surface in world units; 0 where alpha is 0.
+      rgb: `[..., 3]` colors, background included.
+      depth: `[...]` z-depth of the surface in world units; 0 where alpha is 0.
       alpha: `[...]` accumulated opacity in [0, 1].
       aux: any pytree, private to its field.
+      normal: `[..., 3]` normals in the world's frame, towards the camera, of any length, from
+        fields that have them; None from others.
+      overflow: `[]` int32, how much did not fit into the field's static capacity; None from fields
+        that have none. Where it is not 0 the image is wrong: render it again with a field that has
+        more room.
     """
 
     rgb: jax.Array
     depth: jax.Array
     alpha: jax.Array
     aux: Any = ()
+    normal: jax.Array | None = None
+    overflow: jax.Array | None = None
 
 
 class RadianceField(NamedTuple):
@@ -37,9 +44,12 @@ class RadianceField(NamedTuple):
       loss: `(rendering, target_rgb, weight) -> (scalar, metrics)`, a weighted mean over pixels that
         is 0, not NaN, where no pixel weighs anything.
       adapt: `(key, state) -> state`, density control or occupancy refresh; identity by default.
+      gradient_chunk: pixels that training differentiates at once, see `rendered_loss`; None for
+        all. With chunks, every array that `render` returns is per pixel.
     """
 
     init: Callable[..., tuple[Any, Any]]
     render: Callable[..., Rendering]
     loss: Callable[..., tuple[jax.Array, dict[str, jax.Array]]]
     adapt: Callable[..., Any] = lambda key, state: state
+    gradient_chunk: int | None = None

@@ -20,7 +20,7 @@ from jaxcloseup.numerics import safe_norm
 from jaxcloseup.torch_file import TorchFileError, read_tensors
 
 
-# Means and deviations of ImageNet's colours, for images in [-1, 1].
+# Means and deviations of ImageNet's colors, for images in [-1, 1].
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 

@@ -1,4 +1,4 @@
-"""Image quality: PSNR, SSIM and colour-corrected PSNR, each for one image and weighted by pixel.
+"""Image quality: PSNR, SSIM and color-corrected PSNR, each for one image and weighted by pixel.
 
 Images are `[H, W, 3]` floats in [0, 1]; batch with `jax.vmap`. Published numbers are those of 8-bit
 images: `quantize` both first, and a saved PNG reproduces the number. A weight that is 0 everywhere
@@ -43,7 +43,7 @@ def ssim(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = None
     Args:
       image: `[H, W, 3]` in [0, 1], at least 11 pixels a side.
       target: `[H, W, 3]` in [0, 1].
-      weight: `[H, W]`; a window weighs what the pixel at its centre does, whatever else it covers,
+      weight: `[H, W]`; a window weighs what the pixel at its center does, whatever else it covers,
         so crop padding away rather than give it the weight 0.
     """
     weight = _check(image, target, weight)
@@ -58,24 +58,24 @@ def ssim(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = None
 
 
 def cc_psnr(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = None) -> jax.Array:
-    """PSNR after the affine change of the image's colours that fits the target best.
+    """PSNR after the affine change of the image's colors that fits the target best.
 
-    The change, a 3x3 matrix and an offset for the whole image, minimises the weighted squared error
+    The change, a 3x3 matrix and an offset for the whole image, minimizes the weighted squared error
     and its result is clipped to [0, 1]: exposure and white balance are forgiven. Programs fit
     different families of changes (multinerf adds quadratic terms, gsplat takes each channel alone),
-    so these numbers compare only among themselves. Where colours span less than three dimensions,
-    as in a grey image, the change of least norm is taken. Arguments as in `psnr`.
+    so these numbers compare only among themselves. Where colors span less than three dimensions,
+    as in a gray image, the change of least norm is taken. Arguments as in `psnr`.
     """
     weight = _check(image, target, weight)
-    matrix, offset = fit_colours(image, target, weight)
+    matrix, offset = fit_colors(image, target, weight)
     fitted = matmul(image, matrix[None]) + offset[None, None]
     return psnr(jnp.clip(fitted, 0, 1), target, weight=weight)
 
 
-def fit_colours(
+def fit_colors(
     image: jax.Array, target: jax.Array, weight: jax.Array, *, ridge: float = 0.0
 ) -> tuple[jax.Array, jax.Array]:
-    """The affine change of an image's colours with the least weighted squared error.
+    """The affine change of an image's colors with the least weighted squared error.
 
     Args:
       image: `[H, W, 3]`.
@@ -84,17 +84,17 @@ def fit_colours(
       ridge: weight of the change's squared distance from none, against the mean squared error.
 
     Returns:
-      Matrix `[3, 3]` and offset `[3]`: rows of colours times the matrix, plus the offset. NaN where
-      the weights sum to 0; of least norm where the colours leave it open.
+      Matrix `[3, 3]` and offset `[3]`: rows of colors times the matrix, plus the offset. NaN where
+      the weights sum to 0; of least norm where the colors leave it open.
     """
     share = safe_divide(weight, jnp.sum(weight), fill=jnp.nan)[..., None]
     mean = jnp.sum(share * image, axis=(0, 1), keepdims=True)
     target_mean = jnp.sum(share * target, axis=(0, 1), keepdims=True)
-    # Centred colours take the offset out of the system and keep its condition low.
-    colours, targets = (image - mean).reshape(-1, 3), (target - target_mean).reshape(-1, 3)
-    weighted = colours.T * share.reshape(1, -1)
+    # Centerd colors take the offset out of the system and keep its condition low.
+    colors, targets = (image - mean).reshape(-1, 3), (target - target_mean).reshape(-1, 3)
+    weighted = colors.T * share.reshape(1, -1)
     towards = ridge * jnp.eye(3, dtype=image.dtype)
-    inverse = jnp.linalg.pinv(matmul(weighted, colours) + towards, rtol=1e-5, hermitian=True)
+    inverse = jnp.linalg.pinv(matmul(weighted, colors) + towards, rtol=1e-5, hermitian=True)
     matrix = matmul(inverse, matmul(weighted, targets) + towards)
     mean, target_mean = mean[0, 0], target_mean[0, 0]
     reached = mean + (target_mean - mean) / (1 + ridge)

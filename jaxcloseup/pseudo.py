@@ -12,13 +12,14 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxcloseup.batch import Views, camera_at, look_up, to_float
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points, points_to_pixels
 from jaxcloseup.geometry.masks import depth_consistent, in_bounds, rgb_consistent
 from jaxcloseup.geometry.poses import PoseSettings, four_anchors, sample_closeup_camera
 from jaxcloseup.geometry.union_warp import SourceBlocks, block_sources, union_warp
+from jaxcloseup.geometry.visibility import sample_where_visible
 from jaxcloseup.geometry.warp import backward_warp
 from jaxcloseup.numerics import safe_divide, safe_norm
+from jaxcloseup.photographs import Views, camera_at, to_float
 
 
 # Photographs to blend are ranked on so many of the virtual pixels, or up to twice as many.
@@ -38,17 +39,17 @@ class PseudoSettings:
 
     Attributes:
       pose: how virtual cameras are drawn.
-      use_mask: `[]` 1 keeps labels where both warps agree in colour, 0 keeps every defined label.
+      use_mask: `[]` 1 keeps labels where both warps agree in color, 0 keeps every defined label.
       rgb_tolerance: `[]` epsilon of the mask, largest difference of a channel.
       depth_tolerance: `[]` relative; the source view's depth must confirm the label's; inf: off.
       fixed_anchors: `[]` 1 draws only the four fixed anchors of the paper's ablation.
-      forward_label: `[]` 1 takes the colour from the forward warps (released), 0 the backward one.
+      forward_label: `[]` 1 takes the color from the forward warps (released), 0 the backward one.
       leave_out_source: `[]` 1 keeps the source view out of the union that checks its label.
-      label_share: `[]` share of the labels' loss in a step's, 1/2 in the paper; 0: no labels. Where
+      label_loss_weight: `[]` share of the labels' loss in a step's, 1/2 in the paper; 0: no labels. Where
         both losses are pooled, any other share is as good.
       max_ray_angle: `[]` radians between the rays of a virtual pixel and of its source, beyond
         which there is no label; inf: off.
-      num_sources: `[]` photographs whose colours are averaged: the source view, and those that see
+      num_sources: `[]` photographs whose colors are averaged: the source view, and those that see
         most of the virtual pixels under small angles. 1 in the paper.
       source_tolerance: `[]` relative; a wanted view has the photograph that sees most of what it
         sees, within this tolerance of depth; inf: that has most pixels landing in it, as published.
@@ -62,7 +63,7 @@ class PseudoSettings:
     fixed_anchors: jax.Array = _by_default(0)
     forward_label: jax.Array = _by_default(0)
     leave_out_source: jax.Array = _by_default(0)
-    label_share: jax.Array = _by_default(0.5)
+    label_loss_weight: jax.Array = _by_default(0.5)
     max_ray_angle: jax.Array = _by_default(jnp.inf)
     num_sources: jax.Array = _by_default(1)
     source_tolerance: jax.Array = _by_default(_SOURCE_TOLERANCE)
@@ -70,7 +71,7 @@ class PseudoSettings:
 
 
 class PseudoLabel(NamedTuple):
-    """Colours for virtual pixels, and how far to trust them.
+    """Colors for virtual pixels, and how far to trust them.
 
     Attributes:
       rgb: `[..., 3]` the label.
@@ -113,7 +114,7 @@ def make_label(
 
     Args:
       camera: the virtual camera.
-      pixels: `[..., 2]` pixel centres of it.
+      pixels: `[..., 2]` pixel centers of it.
       depth: `[...]` their rendered z-depth D'; 0 where undefined.
       source_index: the training view n that the backward warp reads.
       views: the training photographs.
@@ -135,20 +136,20 @@ def make_label(
 
     def add_source(rank, sums):
         index = ranked[rank]
-        colour, weight = _read_source(camera, points, index, views, depths, settings)
+        color, weight = _read_source(camera, points, index, views, depths, settings)
         weight = jnp.where(defined, weight, 0)
-        known = (weight > 0).astype(colour.dtype)
-        new = known[..., None] * colour, weight, known
+        known = (weight > 0).astype(color.dtype)
+        new = known[..., None] * color, weight, known
         return jax.tree.map(jnp.add, sums, new)
 
     none = jnp.zeros(depth.shape, points.dtype)
     count = jnp.clip(settings.num_sources.astype(jnp.int32), 1, len(views))
-    colours, weight, known = jax.lax.fori_loop(
+    colors, weight, known = jax.lax.fori_loop(
         0, count, add_source, (jnp.zeros((*depth.shape, 3), points.dtype), none, none)
     )
     defined = known > 0
     weight = safe_divide(weight, known)
-    backward = safe_divide(colours, known[..., None])
+    backward = safe_divide(colors, known[..., None])
     # Forward: every training pixel, the nearest on each virtual pixel.
     exclude = jnp.where(settings.leave_out_source > 0, source_index, -1)
     union = union_warp(sources, views.cameras, views.rgb, camera, pixels, exclude=exclude)
@@ -169,11 +170,11 @@ def _read_source(camera, points, index, views, depths, settings):
     """What view `index` shows at points `[..., 3]`, and its weight, 0 where that is no label."""
     source = camera_at(views.cameras, index)
     maps = depths[index], views.weight[index]
-    landed, _, weight = look_up(source, *maps, points, settings.depth_tolerance)
+    landed, _, weight = sample_where_visible(source, *maps, points, settings.depth_tolerance)
     near_enough = _cosine_between(camera, source, points) >= _least_cosine(settings)
     known = (weight > 0) & near_enough
-    colour = backward_warp(to_float(views.rgb[index]), landed)
-    return jnp.where(known[..., None], colour, 0), jnp.where(known, weight, 0)
+    color = backward_warp(to_float(views.rgb[index]), landed)
+    return jnp.where(known[..., None], color, 0), jnp.where(known, weight, 0)
 
 
 def _rank_sources(camera, points, first, views, depths, settings):
@@ -182,7 +183,7 @@ def _rank_sources(camera, points, first, views, depths, settings):
     def score(view):
         source, depth, weight = view
         tolerance = jnp.minimum(settings.depth_tolerance, _RANKING_TOLERANCE)
-        _, _, weight = look_up(source, depth, weight, points, tolerance)
+        _, _, weight = sample_where_visible(source, depth, weight, points, tolerance)
         cosine = _cosine_between(camera, source, points)
         sees = (weight > 0) & (cosine >= _least_cosine(settings))
         return jnp.sum(jnp.where(sees, cosine, 0))

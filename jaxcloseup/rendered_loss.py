@@ -6,9 +6,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxcloseup.batch import Batch
 from jaxcloseup.field import RadianceField
 from jaxcloseup.numerics import safe_divide, take_turns
+from jaxcloseup.photographs import Batch
 
 
 Loss = tuple[jax.Array, dict[str, jax.Array]]
@@ -33,7 +33,7 @@ def rendered_loss(
     Args:
       params: differentiated.
       buffers: of the field.
-      batch: pixels and their colours.
+      batch: pixels and their colors.
       key: consumed by the rendering; None renders deterministically.
       field: static; renders and judges.
       chunk: static; pixels differentiated at once, None for all of them.

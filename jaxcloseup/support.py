@@ -6,9 +6,10 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxcloseup.batch import Views, look_up
 from jaxcloseup.geometry.cameras import Camera, pixels_to_points
+from jaxcloseup.geometry.visibility import sample_where_visible
 from jaxcloseup.numerics import safe_divide
+from jaxcloseup.photographs import Views
 
 
 class Support(NamedTuple):
@@ -47,7 +48,7 @@ def find_support(
 
     Args:
       camera: of the rendered view.
-      pixels: `[..., 2]` pixel centres of it.
+      pixels: `[..., 2]` pixel centers of it.
       depth: `[...]` their z-depth; 0 is undefined, and then nobody saw it.
       views: the training photographs.
       depths: `[V, H, W]` their z-depth; 0 is undefined.
@@ -59,7 +60,9 @@ def find_support(
 
     def add_view(found, view):
         source, view_depth, weight = view
-        _, landed_depth, weight = look_up(source, view_depth, weight, points, tolerance)
+        _, landed_depth, weight = sample_where_visible(
+            source, view_depth, weight, points, tolerance
+        )
         saw = (depth > 0) & (weight > 0)
         footprint = safe_divide(landed_depth / _focal(source), own_side)
         finest = jnp.where(saw, jnp.minimum(found.footprint, footprint), found.footprint)

@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from jaxcloseup.batch import Batch, Views, sample_image, sample_pixels
 from jaxcloseup.field import RadianceField, Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.geometry.union_warp import SourceBlocks
 from jaxcloseup.numerics import take_turns
+from jaxcloseup.photographs import Batch, Views, sample_image, sample_pixels
 from jaxcloseup.pseudo import PseudoSettings, make_label, sample_virtual_camera
 from jaxcloseup.rendered_loss import rendered_loss
 
@@ -51,7 +51,7 @@ class TrainConfig:
 
     Attributes:
       num_rays: training pixels of a step; None takes one whole photograph.
-      num_label_rays: pseudo-labelled pixels of a step; None takes the whole virtual image.
+      num_label_rays: pseudo-labeled pixels of a step; None takes the whole virtual image.
       perturbed_depth: render virtual depth with sampling noise, as released, not without (paper).
       undivided_depth: use depth not divided by alpha, as released, for labels.
       pooled_loss: one mean over all valid pixels, as released, not half of each mean (paper);
@@ -81,7 +81,7 @@ def init_state(
     Args:
       key: random key.
       points: `[P, 3]` initial points, for fields that start from them.
-      rgb: `[P, 3]` their colours.
+      rgb: `[P, 3]` their colors.
       field: what is trained.
       optimizer: how.
     """
@@ -126,10 +126,10 @@ def pseudo_step(
     config: TrainConfig,
     sources: SourceBlocks | None = None,
 ) -> tuple[TrainState, Metrics]:
-    """One step on training photographs and on one pseudo-labelled virtual close-up.
+    """One step on training photographs and on one pseudo-labeled virtual close-up.
 
-    L = (1 - s) L_c + s L_pl with `settings.label_share` s, 1/2 in the paper, where L_pl is the mean
-    over labelled pixels only, and 0 without any. The photographs' draw is that of `train_step` at
+    L = (1 - s) L_c + s L_pl with `settings.label_loss_weight` s, 1/2 in the paper, where L_pl is the mean
+    over labeled pixels only, and 0 without any. The photographs' draw is that of `train_step` at
     the same step, so that a control is paired.
 
     Args:
@@ -143,8 +143,8 @@ def pseudo_step(
       sources: `block_sources(views.cameras, depths, views.weight)`; recomputed here if absent.
 
     Returns:
-      The next state, and metrics with `label_coverage`, the share of labelled virtual pixels; where
-      the two means are not pooled, the field's metrics of the labelled pixels as `label_<name>`.
+      The next state, and metrics with `label_coverage`, the share of labeled virtual pixels; where
+      the two means are not pooled, the field's metrics of the labeled pixels as `label_<name>`.
     """
     key_step = jax.random.fold_in(state.key, state.step)
     key_batch, key_render, key_adapt, key_label = jax.random.split(key_step, 4)
@@ -161,7 +161,7 @@ def pseudo_step(
         return field.render(params, buffers, camera, pixels, key)
 
     def label_of(seen):
-        depth = labelled_depth(seen, divided=not config.undivided_depth)
+        depth = label_depth(seen, divided=not config.undivided_depth)
         data = source_index, views, depths, settings
         return make_label(camera, label_pixels, depth, *data, sources=sources)
 
@@ -182,7 +182,7 @@ def pseudo_step(
             coverage = jnp.mean(label.weight)
             virtual = Batch(camera, pixels, label.rgb, label.weight)
             if config.pooled_loss:
-                some = (settings.label_share > 0).astype(label.weight.dtype)
+                some = (settings.label_loss_weight > 0).astype(label.weight.dtype)
                 pooled = _pool(batch, virtual._replace(weight=some * label.weight))
                 value, metrics = loss_of(params, state.buffers, pooled, key_render)
                 return value, metrics | {"label_coverage": coverage}
@@ -191,14 +191,14 @@ def pseudo_step(
             )
         batch_loss, metrics = loss_of(params, state.buffers, batch, key_render)
         metrics = metrics | {f"label_{name}": value for name, value in virtual_metrics.items()}
-        share = settings.label_share
+        share = settings.label_loss_weight
         value = (1 - share) * batch_loss + share * virtual_loss
         return value, metrics | {"label_coverage": coverage}
 
     return _update(state, loss, key_adapt, field, optimizer, settings.rate)
 
 
-def labelled_step(
+def labeled_step(
     state: TrainState,
     views: Views,
     labels: Views,
@@ -208,7 +208,7 @@ def labelled_step(
     optimizer: optax.GradientTransformation,
     config: TrainConfig,
 ) -> tuple[TrainState, Metrics]:
-    """One step on training photographs and on views labelled once, for test-time fine-tuning.
+    """One step on training photographs and on views labeled once, for test-time fine-tuning.
 
     The loss is that of `pseudo_step`, never pooled; the photographs' draw is that of `train_step`.
 
@@ -216,7 +216,7 @@ def labelled_step(
       state: what is trained.
       views: training photographs.
       labels: of `label_views`.
-      settings: of which `label_share` and `rate` count.
+      settings: of which `label_loss_weight` and `rate` count.
       field: static.
       optimizer: static.
       config: static.
@@ -226,15 +226,15 @@ def labelled_step(
     key_label_batch, key_label_render = jax.random.split(key_label)
     batch = _sample_batch(key_batch, views, config)
     if config.num_label_rays is None:
-        labelled = sample_image(key_label_batch, labels)
+        labeled = sample_image(key_label_batch, labels)
     else:
-        labelled = sample_pixels(key_label_batch, labels, config.num_label_rays)
+        labeled = sample_pixels(key_label_batch, labels, config.num_label_rays)
     loss_of = functools.partial(rendered_loss, field=field, chunk=config.gradient_chunk)
 
     def loss(params):
         batch_loss, metrics = loss_of(params, state.buffers, batch, key_render)
-        label_loss, label_metrics = loss_of(params, state.buffers, labelled, key_label_render)
-        share = settings.label_share
+        label_loss, label_metrics = loss_of(params, state.buffers, labeled, key_label_render)
+        share = settings.label_loss_weight
         value = (1 - share) * batch_loss + share * label_loss
         return value, metrics | {f"label_{name}": value for name, value in label_metrics.items()}
 
@@ -285,13 +285,13 @@ def render_depths(
     def one_view(view):
         camera, key = view
         seen = field.render(params, buffers, camera, None, key)
-        return labelled_depth(seen, near=near, far=far, min_alpha=min_alpha, divided=divided)
+        return label_depth(seen, near=near, far=far, min_alpha=min_alpha, divided=divided)
 
     keys = None if key is None else jax.random.split(key, cameras.intrinsics.shape[0])
     return jax.lax.map(one_view, (cameras, keys))
 
 
-def labelled_depth(
+def label_depth(
     rendering: Rendering,
     *,
     near: float = 0.0,
@@ -312,7 +312,7 @@ def _sample_batch(key, views, config):
 
 
 def _sample_virtual_pixels(key, camera, count):
-    """Pixel centres `[count, 2]`, drawn with replacement, or None for all."""
+    """Pixel centers `[count, 2]`, drawn with replacement, or None for all."""
     if count is None:
         return None
     size = jnp.array([[camera.width, camera.height]])

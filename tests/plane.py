@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcloseup.batch import Views
 from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.photographs import Views
 
 
 HEIGHT, WIDTH, FOCAL = 24, 32, 30.0
@@ -21,13 +21,13 @@ def camera_above(x, y, height, *, tilt=0.0):
 
 
 def texture(points):
-    """Smooth colours `[..., 3]` of points `[..., 3]` of the plane."""
+    """Smooth colors `[..., 3]` of points `[..., 3]` of the plane."""
     x, y = points[..., 0], points[..., 1]
     return 0.5 + 0.4 * np.stack([np.sin(2 * x), np.cos(3 * y), np.sin(x + 2 * y)], axis=-1)
 
 
 def photograph(camera):
-    """Colours, depths and points, `[H, W, ...]` in float64, ray by ray from the definition."""
+    """Colors, depths and points, `[H, W, ...]` in float64, ray by ray from the definition."""
     fx, fy, cx, cy = np.asarray(camera.intrinsics, np.float64)
     pose = np.asarray(camera.camtoworld, np.float64)
     x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)

@@ -1,6 +1,6 @@
-"""A world at infinity whose colours are a function of the direction of rays, for tests of cameras.
+"""A world at infinity whose colors are a function of the direction of rays, for tests of cameras.
 
-Photographs follow from what a capture's file says, colours that are expected from loaded cameras.
+Photographs follow from what a capture's file says, colors that are expected from loaded cameras.
 """
 
 import numpy as np
@@ -10,7 +10,7 @@ SIZE = (47, 35)
 LENS = {"fx": 41.0, "fy": 43.0, "cx": 22.3, "cy": 18.6}
 
 
-def colours(directions):
+def colors(directions):
     """Of a world at infinity, [..., 3] in levels; about 30 of them lie between two pixels."""
     x, y, z = np.moveaxis(directions / np.linalg.norm(directions, axis=-1, keepdims=True), -1, 0)
     waves = [np.sin(19 * x + 3 * z), np.sin(17 * y + 5 * x), np.sin(13 * (x + y + z))]
@@ -24,14 +24,14 @@ def turned(angle):
 
 
 def photograph(pose, lens=LENS, size=SIZE, first=0.5):
-    """What the capture's camera takes; `first` is the coordinate of the first pixel's centre."""
+    """What the capture's camera takes; `first` is the coordinate of the first pixel's center."""
     column, row = np.meshgrid(first + np.arange(size[0]), first + np.arange(size[1]))
     x, y = (column - lens["cx"]) / lens["fx"], (row - lens["cy"]) / lens["fy"]
-    return np.rint(colours(np.stack([x, -y, -np.ones_like(x)], -1) @ pose[:3, :3].T)).astype("u1")
+    return np.rint(colors(np.stack([x, -y, -np.ones_like(x)], -1) @ pose[:3, :3].T)).astype("u1")
 
 
 def seen(cameras, index, offsets=((0.0, 0.0),)):
-    """Mean colours [H, W, 3] along loaded cameras' rays through pixel centres moved by offsets."""
+    """Mean colors [H, W, 3] along loaded cameras' rays through pixel centers moved by offsets."""
     pose = np.asarray(cameras.camtoworld, np.float64)[index]
     fx, fy, cx, cy = np.asarray(cameras.intrinsics, np.float64)[index]
     column, row = np.meshgrid(np.arange(cameras.width) + 0.5, np.arange(cameras.height) + 0.5)
@@ -39,4 +39,4 @@ def seen(cameras, index, offsets=((0.0, 0.0),)):
         np.stack([(column + x - cx) / fx, (row + y - cy) / fy, np.ones_like(row)], -1)
         for x, y in offsets
     ]
-    return np.mean([colours(directions @ pose[:, :3].T) for directions in ahead], 0)
+    return np.mean([colors(directions @ pose[:, :3].T) for directions in ahead], 0)

@@ -38,7 +38,7 @@ def forward_warp(values, pixels, depths, shape):
 
 
 def composite_ray(rgb, density, depth, length):
-    """Weights, colour, alpha, depth, alpha times depth and median depth of one ray's samples."""
+    """Weights, color, alpha, depth, alpha times depth and median depth of one ray's samples."""
     rgb, density, depth = (np.asarray(x, np.float64) for x in (rgb, density, depth))
     transmittance, weights, median = 1.0, [], 0.0
     for i in range(len(density)):

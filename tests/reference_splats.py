@@ -1,8 +1,8 @@
 """A slow splatter in NumPy float64: rays against planes, every splat at every pixel, no tiles.
 
 It shares neither code nor formulas with the package: it intersects, where the package interpolates
-homographies. What the two agree on by decision is listed here: the constants, the order (by centre
-depth, not nearer than `near`), the floor about the projected centre, and depth held to the disc's
+homographies. What the two agree on by decision is listed here: the constants, the order (by center
+depth, not nearer than `near`), the floor about the projected center, and depth held to the disc's
 own range where that floor wins.
 """
 
@@ -19,8 +19,8 @@ def rotation_of(wxyz):
     return np.stack([e + 2 * np.cross(v, np.cross(v, e) + w * e) for e in np.eye(3)], axis=1)
 
 
-def sh_colour(sh, direction):
-    """Colour of coefficients `[K, 3]` along a unit direction, basis written out as numbers."""
+def sh_color(sh, direction):
+    """Color of coefficients `[K, 3]` along a unit direction, basis written out as numbers."""
     x, y, z = direction
     basis = [
         0.28209479177387814,
@@ -42,7 +42,7 @@ def sh_colour(sh, direction):
 
 
 def depth_reach(surfels, camtoworld):
-    """How far in depth each disc extends from its centre, out to where it fades."""
+    """How far in depth each disc extends from its center, out to where it fades."""
     rotation = np.asarray(camtoworld)[:, :3]
     opacity = 1 / (1 + np.exp(-surfels["opacity_logits"]))
     cutoff = np.sqrt(2 * np.log(np.maximum(255 * opacity, 1)))
@@ -57,7 +57,7 @@ def intersect(surfels, camtoworld, intrinsics, pixels, *, near, reach=None):
     """Opacity and depth `[N, P]` of every surfel at `pixels[P, 2]`; opacity 0 is not drawn.
 
     `reach` is held fixed by finite differences: the package gives the depth range of a disc no
-    derivative but that of its centre.
+    derivative but that of its center.
     """
     rotation, position = np.asarray(camtoworld)[:, :3], np.asarray(camtoworld)[:, 3]
     fx, fy, cx, cy = intrinsics
@@ -76,8 +76,8 @@ def intersect(surfels, camtoworld, intrinsics, pixels, *, near, reach=None):
         behind = ~(z > 0)
         rho = np.where(behind, np.inf, rho)
         if mu[2] > near:
-            centre = np.array([fx * mu[0] / mu[2] + cx, fy * mu[1] / mu[2] + cy])
-            floor = LOW_PASS * np.sum((pixels - centre) ** 2, axis=-1)
+            center = np.array([fx * mu[0] / mu[2] + cx, fy * mu[1] / mu[2] + cy])
+            floor = LOW_PASS * np.sum((pixels - center) ** 2, axis=-1)
             low, high = max(mu[2] - reach[i], near), max(mu[2] + reach[i], near)
             clipped = np.clip(np.where(behind, np.inf, z), low, high)
             depth = np.where(floor < rho, clipped, z)
@@ -130,7 +130,7 @@ def render(surfels, camtoworld, intrinsics, height, width, *, near, background=N
         offset = mean - camtoworld[:, 3]
         normal = rotation_of(quaternion)[:, 2]
         normal = normal if normal @ offset < 0 else -normal
-        payload.append([*sh_colour(sh, offset / np.linalg.norm(offset)), *normal])
+        payload.append([*sh_color(sh, offset / np.linalg.norm(offset)), *normal])
         order.append(max(offset @ camtoworld[:, 2], near))
     by_depth = np.argsort(order, kind="stable")
     sums, alpha, depth, median, distortion = composite(

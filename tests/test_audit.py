@@ -7,17 +7,17 @@ import plane
 import pytest
 from tiny_runs import TINY
 
-from experiments.audit import (
+from experiments.evaluation.audit import (
     audit_labels,
     error_curve,
     left_out_curve,
     resolved_by_photographs,
 )
-from experiments.presets import pseudo_settings
+from experiments.methods.presets import pseudo_settings
 from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_rays
+from jaxcloseup.scene import Surface
 from jaxcloseup.scenes import Scene
-from jaxcloseup.scenes.scene import Surface
 
 
 WAVELENGTH = 0.3
@@ -112,7 +112,7 @@ def test_left_out_photographs_judge_labels_and_model():
     cameras = [plane.camera_above(x, 0.1 * x, 4.0, tilt=0.1 * x) for x in (-1.0, 0.0, 1.0)]
     views, depths = plane.make_views(cameras)
 
-    def render(camera):  # a model that is right in depth and off by 0.1 in colour
+    def render(camera):  # a model that is right in depth and off by 0.1 in color
         rgb, depth, _ = plane.photograph(camera)
         rgb, depth = (jnp.asarray(a, jnp.float32) for a in (rgb - 0.1, depth))
         return Rendering(rgb, depth, jnp.ones_like(depth))

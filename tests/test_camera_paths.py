@@ -8,11 +8,17 @@ import numpy as np
 import plane
 import pytest
 
-from experiments import camera_paths
-from experiments.camera_paths import CameraError, check_pixel, dolly, looked_at, read_camera_path
-from experiments.manifest import write_dataparser_transforms
-from jaxcloseup.batch import camera_at
+from experiments.training.manifest import write_dataparser_transforms
+from experiments.viewing import camera_paths
+from experiments.viewing.camera_paths import (
+    CameraError,
+    check_pixel,
+    dolly,
+    looked_at,
+    read_camera_path,
+)
 from jaxcloseup.geometry.cameras import Camera, pixels_to_points, points_to_pixels
+from jaxcloseup.photographs import camera_at
 from jaxcloseup.scenes import SceneError, load_scene
 
 
@@ -216,44 +222,44 @@ def test_a_pixel_outside_is_one_sentence(pixel):
         check_pixel(camera, pixel)
 
 
-def ring(centre, radius, height, count=12):
-    """Stacked cameras on a circle in the plane z = `height`, looking at its centre below."""
+def ring(center, radius, height, count=12):
+    """Stacked cameras on a circle in the plane z = `height`, looking at its center below."""
     poses = []
     for angle in np.linspace(0, 2 * np.pi, count, endpoint=False):
-        position = centre + np.array([radius * np.cos(angle), radius * np.sin(angle), height])
-        poses.append(camera_paths.look(position, centre, np.array([0.0, 0, 1])))
+        position = center + np.array([radius * np.cos(angle), radius * np.sin(angle), height])
+        poses.append(camera_paths.look(position, center, np.array([0.0, 0, 1])))
     intrinsics = jnp.tile(jnp.array([40.0, 40, 16, 12]), (count, 1))
     return Camera(jnp.asarray(np.array(poses), jnp.float32), intrinsics, 24, 32)
 
 
 def test_an_orbit_is_the_circle_of_cameras_that_stand_on_one(capture_folder):
     scene = load_scene(str(capture_folder))
-    centre = np.array([1.0, -2.0, 0.5])
-    cameras = ring(centre, 3.0, 2.0)
+    center = np.array([1.0, -2.0, 0.5])
+    cameras = ring(center, 3.0, 2.0)
     scene = dataclasses.replace(scene, train=scene.train.replace(cameras=cameras))
     shots = camera_paths.orbit(scene, 12)
     # From the first camera round, one way or the other.
     np.testing.assert_allclose(shots.cameras.camtoworld, cameras.camtoworld, atol=1e-4)
-    pixel, depth = jax.vmap(points_to_pixels, (0, None))(shots.cameras, jnp.asarray(centre, "f"))
+    pixel, depth = jax.vmap(points_to_pixels, (0, None))(shots.cameras, jnp.asarray(center, "f"))
     np.testing.assert_allclose(pixel, np.tile([16, 12], (12, 1)), atol=1e-2)
     np.testing.assert_allclose(depth, math.hypot(3, 2), rtol=1e-5)
 
 
 def test_an_orbit_stands_upright_in_the_direction_that_is_given(capture_folder):
     scene = load_scene(str(capture_folder))
-    centre, radius, height = np.array([1.0, -2.0, 0.5]), 3.0, 2.0
-    cameras = ring(centre, radius, height)
+    center, radius, height = np.array([1.0, -2.0, 0.5]), 3.0, 2.0
+    cameras = ring(center, radius, height)
     scene = dataclasses.replace(scene, train=scene.train.replace(cameras=cameras))
     # About -z the circle is the same, and every camera upside down.
     shots = camera_paths.orbit(scene, 12, up=(0, 0, -3))
-    offset = np.asarray(shots.cameras.position) - centre
+    offset = np.asarray(shots.cameras.position) - center
     np.testing.assert_allclose(offset[:, 2], height, atol=1e-4)
     np.testing.assert_allclose(np.linalg.norm(offset[:, :2], axis=1), radius, atol=1e-4)
     down = np.asarray(shots.cameras.rotation)[..., 1]
     np.testing.assert_allclose(down[:, 2], radius / math.hypot(radius, height), atol=1e-4)
     # About x: as far from that axis as the cameras of the ring, who are evenly on both its sides.
     shots = camera_paths.orbit(scene, 8, up=(0.1, 0, 0))
-    offset = np.asarray(shots.cameras.position) - centre
+    offset = np.asarray(shots.cameras.position) - center
     np.testing.assert_allclose(offset[:, 0], 0, atol=1e-4)
     angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
     expected = np.median(np.hypot(radius * np.sin(angles), height))

@@ -24,7 +24,7 @@ def make_camera(angles=(0.3, -0.4, 0.2), position=(0.5, -1.0, 2.0)):
     return Camera(camtoworld, jnp.array([9.0, 11.0, 3.2, 2.9]), HEIGHT, WIDTH)
 
 
-def test_pixel_grid_holds_centres_as_x_y():
+def test_pixel_grid_holds_centers_as_x_y():
     grid = pixel_grid(HEIGHT, WIDTH)
     assert grid.shape == (HEIGHT, WIDTH, 2)
     np.testing.assert_array_equal(grid[0, 0], [0.5, 0.5])

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from tiny_capture import POSE, frame, paper_capture, single_file, write_json
 
-from jaxcloseup.scenes import SceneError, SceneWarning, load_scene
-from jaxcloseup.scenes.errors import (
+from jaxcloseup.scene import (
     UnknownKeyWarning,
 )
+from jaxcloseup.scenes import SceneError, SceneWarning, load_scene
 
 
 @pytest.fixture
@@ -160,8 +160,8 @@ def test_wrong_json(capture, data, message):
 
 
 @pytest.mark.parametrize("background", [-0.1, 2, np.nan])
-def test_background_is_a_grey_level(capture, background):
-    with pytest.raises(SceneError, match=r"background must be a grey level in \[0, 1\], got "):
+def test_background_is_a_gray_level(capture, background):
+    with pytest.raises(SceneError, match=r"background must be a gray level in \[0, 1\], got "):
         load_scene(capture, background=background)
 
 
@@ -181,13 +181,13 @@ def test_what_the_system_refuses(capture, monkeypatch):
 
 def test_unknown_keys_warn_once_for_each_file(capture):
     frames = [frame("train/a.png", time=0, sharpness=3), frame("train/b.png", time=1)]
-    write_json(capture / "transforms_train.json", frames, aabb_scale=4, colour="red")
+    write_json(capture / "transforms_train.json", frames, aabb_scale=4, color="red")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         load_scene(capture)
     assert [warning.category for warning in caught] == [UnknownKeyWarning]
     assert str(caught[0].message).endswith("transforms_train.json: these fields are not read: "
-                                           "colour, time.")  # fmt: skip
+                                           "color, time.")  # fmt: skip
     assert issubclass(UnknownKeyWarning, SceneWarning)
 
 

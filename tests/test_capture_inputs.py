@@ -13,23 +13,23 @@ from tiny_capture import (
     write_ply,
 )
 
-from jaxcloseup.scenes import SceneError
-from jaxcloseup.scenes.bounds import near_far_from_cameras, near_far_from_points
-from jaxcloseup.scenes.errors import (
+from jaxcloseup.captures.bounds import near_far_from_cameras, near_far_from_points
+from jaxcloseup.captures.images import read_image
+from jaxcloseup.captures.points import read_ply_points
+from jaxcloseup.scene import (
     PointsWarning,
 )
-from jaxcloseup.scenes.images import read_image
-from jaxcloseup.scenes.points import read_ply_points
+from jaxcloseup.scenes import SceneError
 
 
 # Decoding
 
 
-def test_grey_deep_and_transparent_images(tmp_path):
-    grey = np.arange(48, dtype=np.uint8).reshape(HEIGHT, WIDTH)
-    write_image(tmp_path / "grey.png", grey)
+def test_gray_deep_and_transparent_images(tmp_path):
+    gray = np.arange(48, dtype=np.uint8).reshape(HEIGHT, WIDTH)
+    write_image(tmp_path / "gray.png", gray)
     np.testing.assert_array_equal(
-        read_image(tmp_path / "grey.png"), np.repeat(grey[..., None], 3, 2)
+        read_image(tmp_path / "gray.png"), np.repeat(gray[..., None], 3, 2)
     )
     deep = np.zeros((HEIGHT, WIDTH, 3), np.uint16)
     deep[0, 0] = [65535, 257 * 100 + 128, 257 * 100 + 129]
@@ -105,14 +105,14 @@ def test_cmyk_becomes_rgb(tmp_path):
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
-@pytest.mark.parametrize("colour", ["u1", "u2", "f4"])
-def test_ply_encodings(tmp_path, encoding, colour):
-    properties = [("blue", colour), ("nx", "f4"), *PROPERTIES[:3][::-1], ("segment", "i4")]
-    properties += [("red", colour), ("green", colour)]
+@pytest.mark.parametrize("color", ["u1", "u2", "f4"])
+def test_ply_encodings(tmp_path, encoding, color):
+    properties = [("blue", color), ("nx", "f4"), *PROPERTIES[:3][::-1], ("segment", "i4")]
+    properties += [("red", color), ("green", color)]
     rows = vertices(properties)
     write_ply(tmp_path / "p.ply", rows, encoding, after=b"3 0 1 2\n")
     points, rgb = read_ply_points(tmp_path / "p.ply")
-    scale = {"u1": 255, "u2": 65535, "f4": 1}[colour]
+    scale = {"u1": 255, "u2": 65535, "f4": 1}[color]
     assert points.dtype == rgb.dtype == np.float32
     np.testing.assert_allclose(points, np.stack([rows[axis] for axis in "xyz"], -1), rtol=1e-6)
     for channel, name in enumerate(("red", "green", "blue")):

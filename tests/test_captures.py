@@ -19,12 +19,12 @@ from tiny_capture import (
     write_ply,
 )
 
-from jaxcloseup.scenes import SceneError, load_scene
-from jaxcloseup.scenes.errors import (
+from jaxcloseup.scene import (
     DuplicateFileWarning,
     ImageSizeWarning,
     NearFarWarning,
 )
+from jaxcloseup.scenes import SceneError, load_scene
 
 
 @pytest.fixture
@@ -264,7 +264,7 @@ def test_names_of_built_in_scenes(monkeypatch, tmp_path, capture):
         PROCEDURAL_SCENES=("table", "room"),
         procedural_scene=lambda name, *, downscale: (name, downscale),
     )
-    monkeypatch.setitem(sys.modules, "jaxcloseup.scenes.procedural", built_in)
+    monkeypatch.setitem(sys.modules, "jaxcloseup.procedural.loading", built_in)
     assert load_scene("table", downscale=2) == ("table", 2)
     with pytest.raises(SceneError, match=r"tabel is neither .* choose one of table, room"):
         load_scene("tabel")
@@ -281,7 +281,7 @@ def test_plush(shared):
     scene = load_scene(shared / "data" / "plush")
     assert (len(scene.train), len(scene.test), len(scene.test_far)) == (49, 11, 7)
     assert scene.train.rgb.shape[1:] == (600, 800, 3) and scene.points.shape == (7548, 3)
-    points, colours = scene.points[::8], scene.rgb[::8]
+    points, colors = scene.points[::8], scene.rgb[::8]
     shifts = [(0, 0), (4, 0), (-4, 0), (0, 4), (0, -4)]
     differences = {shift: [] for shift in shifts}
     for index in (0, 20, 40):
@@ -293,7 +293,7 @@ def test_plush(shared):
         for shift in shifts:
             column, row = (pixels[inside] + shift).astype(int).T
             seen = photo[row, column] / 255
-            differences[shift].append(np.abs(seen - colours[inside]).mean(1))
+            differences[shift].append(np.abs(seen - colors[inside]).mean(1))
     medians = [np.median(np.concatenate(differences[shift])) for shift in shifts]
     assert medians[0] < 0.08  # about half of 0.15, that of points in any other order
     assert medians[0] < 0.75 * min(medians[1:]), medians

@@ -83,8 +83,8 @@ def test_another_run_is_refused_by_the_first_difference(tmp_path):
     other = RUN | {"config": {"field": {"capacity": 200}, "steps": [1, 2]}}
     with pytest.raises(CheckpointError, match=r"whose config.field.capacity is 100 and not 200"):
         Checkpoints(tmp_path, other)
-    other = RUN | {"config": RUN["config"] | {"colours": None}}  # of a version that has none
-    with pytest.raises(CheckpointError, match=r"whose config.colours is absent and not None"):
+    other = RUN | {"config": RUN["config"] | {"colors": None}}  # of a version that has none
+    with pytest.raises(CheckpointError, match=r"whose config.colors is absent and not None"):
         Checkpoints(tmp_path, other)
     with pytest.raises(CheckpointError, match=r"whose seed is 0 and not 1"):
         Checkpoints(tmp_path, RUN | {"seed": 1})

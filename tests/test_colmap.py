@@ -9,7 +9,8 @@ import reference
 from tiny_capture import HEIGHT, WIDTH, single_file, write_image
 from tiny_models import PINHOLE, POINTS, colmap_capture, image_line, random_pose, write_model
 
-from jaxcloseup.scenes import SceneError, captures, load_scene
+from jaxcloseup.captures import loading
+from jaxcloseup.scenes import SceneError, load_scene
 
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -237,7 +238,7 @@ def test_wrong_binary_models(tmp_path):
 
 def test_plush_loads_three_ways(shared, monkeypatch):
     none = np.zeros((0, 3), np.float32)
-    monkeypatch.setattr(captures, "triangulate", lambda *_: (none, none))  # takes seconds
+    monkeypatch.setattr(loading, "triangulate", lambda *_: (none, none))  # takes seconds
     folder = shared / "data" / "plush_raw"
     binary = load_scene(folder, format="colmap")
     text = load_scene(folder / "sparse_text")
@@ -269,7 +270,7 @@ def test_plush_loads_three_ways(shared, monkeypatch):
 def test_points_of_plush_are_drawn_where_they_were_measured(shared):
     """Undistorted, the model's points fall on what the undistorted photographs show there."""
     scene = load_scene(shared / "data" / "plush_raw", format="colmap")
-    points, colours = scene.points[::8], scene.rgb[::8]
+    points, colors = scene.points[::8], scene.rgb[::8]
     differences = {shift: [] for shift in [(0, 0), (4, 0), (-4, 0), (0, 4), (0, -4)]}
     for index in (0, 20, 40):
         camera = jax.tree.map(lambda leaf, i=index: np.asarray(leaf[i]), scene.train.cameras)
@@ -278,7 +279,7 @@ def test_points_of_plush_are_drawn_where_they_were_measured(shared):
         photo = np.asarray(scene.train.rgb[index])
         for shift, found in differences.items():
             column, row = (pixels[inside] + shift).astype(int).T
-            found.append(np.abs(photo[row, column] / 255 - colours[inside]).mean(1))
+            found.append(np.abs(photo[row, column] / 255 - colors[inside]).mean(1))
     medians = [np.median(np.concatenate(found)) for found in differences.values()]
     assert medians[0] < 0.8 * min(medians[1:]), medians
 

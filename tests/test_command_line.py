@@ -7,11 +7,12 @@ from absl import flags
 from absl.testing import flagsaver
 from tiny_runs import TINY
 
-from experiments import command_line, sweep
 from experiments import run as program
-from experiments.pipeline import config
-from experiments.presets import PRESETS
-from jaxcloseup.splats.adaptive_density import AdaptiveDensityConfig
+from experiments import sweep
+from experiments.methods.presets import PRESETS
+from experiments.training import flags as training_flags
+from experiments.training.stages import config
+from jaxcloseup.splats.adaptive import AdaptiveConfig
 
 
 @pytest.fixture
@@ -23,7 +24,7 @@ def parsed_flags():
 
 def test_help_lists_the_flags_that_programs_share():
     keys = flags.FLAGS.key_flags_by_module_dict()
-    defined = flags.FLAGS.flags_by_module_dict()[command_line.__name__]
+    defined = flags.FLAGS.flags_by_module_dict()[training_flags.__name__]
     shared = {flag.name for flag in defined} | {"output_dir"}
     for module in (program, sweep):
         assert shared <= {flag.name for flag in keys[module.__name__]}
@@ -49,23 +50,23 @@ def test_an_unknown_scene_is_one_sentence(parsed_flags, tmp_path):
 
 def test_format_and_split_reach_the_capture(parsed_flags, capture_folder, capsys):
     with flagsaver.flagsaver(format="transforms", split="every8"):
-        options = command_line.load_options_from_flags(TINY)
-        scene = command_line.load(str(capture_folder), options)
-        names = command_line.names_from_flags()
+        options = training_flags.load_options_from_flags(TINY)
+        scene = training_flags.load(str(capture_folder), options)
+        names = training_flags.names_from_flags()
     assert (names["format"], names["split"]) == ("transforms", "every8")
     assert scene.metadata["split"] == "every8" and scene.test is None
     printed = capsys.readouterr().out
     assert "reading transforms_train.json" in printed and "every 8th of its" in printed
-    assert set(command_line.names_from_flags()) == {"method", "preset"}
+    assert set(training_flags.names_from_flags()) == {"method", "preset"}
     with flagsaver.flagsaver(split="zoom", zoom=3):
-        options = command_line.load_options_from_flags(TINY)
-        assert command_line.load(str(capture_folder), options).metadata["times_nearer"][0] == 3
-        assert command_line.names_from_flags()["zoom"] == 3
+        options = training_flags.load_options_from_flags(TINY)
+        assert training_flags.load(str(capture_folder), options).metadata["times_nearer"][0] == 3
+        assert training_flags.names_from_flags()["zoom"] == 3
     with (
         flagsaver.flagsaver(invert_masks=True, alpha_mode="mask"),
         pytest.raises(ValueError, match="no photograph has a mask to invert"),
     ):
-        command_line.load(str(capture_folder), command_line.load_options_from_flags(TINY))
+        training_flags.load(str(capture_folder), training_flags.load_options_from_flags(TINY))
 
 
 def test_a_format_that_is_not_there_is_one_sentence(parsed_flags, capture_folder, tmp_path):
@@ -101,7 +102,7 @@ def test_a_folder_that_cannot_be_made_is_one_sentence(parsed_flags, capture_fold
 def test_flags_override_the_preset(parsed_flags):
     given = {"preset": "paper", "closeup_steps": 7, "compute_dtype": "bfloat16"}
     with flagsaver.flagsaver(method="nerf", **given):
-        preset = command_line.preset_from_flags()
+        preset = training_flags.preset_from_flags()
     assert preset.closeup_steps == 7
     assert preset.field.compute_dtype == "bfloat16"
     assert preset.baseline_steps == PRESETS["nerf"]["paper"].baseline_steps == 200_000
@@ -127,7 +128,7 @@ def test_a_preset_of_the_other_method_is_one_sentence(parsed_flags, tmp_path):
     ("method", "flag", "value"),
     [
         ("nerf", "density", "classic"),
-        ("nerf", "colour_ridge", 0.1),
+        ("nerf", "color_ridge", 0.1),
         ("nerf", "capacity", 500),
         ("surfels", "compute_dtype", "bfloat16"),
     ],
@@ -142,8 +143,8 @@ def test_a_flag_of_the_other_method_is_one_sentence(parsed_flags, tmp_path, meth
 
 
 def test_surfels_can_be_cloned_and_split(parsed_flags):
-    with flagsaver.flagsaver(method="surfels", density="classic", capacity=300, colour_ridge=0.01):
-        field = command_line.preset_from_flags().field
-    assert isinstance(field.density, AdaptiveDensityConfig)
-    assert field.colour_ridge == 0.01 and field.capacity == 300
+    with flagsaver.flagsaver(method="surfels", density="classic", capacity=300, color_ridge=0.01):
+        field = training_flags.preset_from_flags().field
+    assert isinstance(field.density, AdaptiveConfig)
+    assert field.color_ridge == 0.01 and field.capacity == 300
     assert field.opacity_weight == 0

@@ -10,8 +10,8 @@ from jaxcloseup.volume import compositing
 composite = jax.jit(compositing.composite)
 
 
-def grey(density, depth, length=1.0):
-    """Composite colourless samples along one ray."""
+def gray(density, depth, length=1.0):
+    """Composite colorless samples along one ray."""
     density = jnp.asarray(density, jnp.float32)
     return composite(
         jnp.ones((*density.shape, 3)), density, jnp.asarray(depth), jnp.full((), length)
@@ -37,13 +37,13 @@ def test_against_the_loop(key, shape):
 def test_constant_fog_absorbs_exponentially(length):
     depth = jnp.linspace(2.0, 5.0, 301)
     density = jnp.full(301, 0.4).at[-1].set(0)
-    alpha = grey(density, depth, length).alpha
+    alpha = gray(density, depth, length).alpha
     np.testing.assert_allclose(alpha, 1 - np.exp(-0.4 * 3 * length), rtol=1e-5)
 
 
 def test_an_opaque_wall_is_where_it_is():
     depth = jnp.linspace(1.0, 2.0, 11)
-    seen = grey(jnp.where(depth >= 1.45, 1e4, 0), depth)
+    seen = gray(jnp.where(depth >= 1.45, 1e4, 0), depth)
     for value in (seen.depth, seen.expected_depth, seen.median_depth):
         np.testing.assert_allclose(value, 1.5, rtol=1e-6)
     np.testing.assert_allclose(seen.alpha, 1, rtol=1e-6)
@@ -61,7 +61,7 @@ def test_two_slabs_share_the_light():
 
 
 def test_nothing_is_seen_of_nothing():
-    seen = grey(jnp.zeros(4), jnp.arange(1.0, 5))
+    seen = gray(jnp.zeros(4), jnp.arange(1.0, 5))
     for value in (seen.alpha, seen.depth, seen.expected_depth, seen.median_depth):
         np.testing.assert_array_equal(value, 0)
 
@@ -71,7 +71,7 @@ def test_gradients_stay_finite(density):
     depth = jnp.arange(1.0, 6)
 
     def total(density):
-        seen = grey(density, depth)
+        seen = gray(density, depth)
         return seen.depth + seen.alpha + seen.rgb.sum() + seen.median_depth
 
     gradient = jax.jit(jax.grad(total))(jnp.full(5, density))

@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 from tiny_capture import POSE, write_image, write_json
 
+from jaxcloseup.captures.distortion import read_distortion, undistort, undistortion
 from jaxcloseup.scenes import load_scene
-from jaxcloseup.scenes.distortion import read_distortion, undistort, undistortion
 
 
 WIDTH, HEIGHT = 60, 44
@@ -54,25 +54,25 @@ def straighten(u, v, model, coefficients):
     return x, y
 
 
-def colours(x, y):
+def colors(x, y):
     """uint8 `[..., 3]` of a ray, smooth over several pixels."""
     waves = np.stack([np.sin(5 * x + 1), np.cos(6 * y - x), np.sin(4 * x * y + 3 * y)], -1)
     return np.rint(127.5 + 120 * waves).astype(np.uint8)
 
 
 def grid():
-    """Pixel centres as positions on the image plane, in focal lengths."""
+    """Pixel centers as positions on the image plane, in focal lengths."""
     fx, fy, cx, cy = INTRINSICS
     column, row = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     return (column - cx) / fx, (row - cy) / fy
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_rays_keep_their_colours(model):
+def test_rays_keep_their_colors(model):
     lens = LENSES[model]
     distortion = read_distortion("lens", {"camera_model": model, **lens})
     remap = undistortion(distortion, INTRINSICS, WIDTH, HEIGHT)
-    photograph = colours(*straighten(*grid(), model, lens))
+    photograph = colors(*straighten(*grid(), model, lens))
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     image, weight = undistort(photograph, mask, remap)
 
@@ -85,10 +85,10 @@ def test_rays_keep_their_colours(model):
     np.testing.assert_array_equal(weight, np.where(inside, 255, 0))
     well_inside = (abs(column - WIDTH / 2) < WIDTH / 2 - 2) & (abs(row - HEIGHT / 2) < 20)
     assert well_inside.mean() > 0.6
-    error = image[well_inside].astype(int) - colours(*grid())[well_inside]
+    error = image[well_inside].astype(int) - colors(*grid())[well_inside]
     assert abs(error).max() <= 2 and abs(error).mean() < 0.5
     # It is not that the lens bends too little to be seen.
-    assert abs(photograph.astype(int) - colours(*grid())).max() > 10
+    assert abs(photograph.astype(int) - colors(*grid())).max() > 10
 
 
 def test_directions_beyond_the_fold_are_not_shown():
@@ -118,10 +118,10 @@ def test_a_pinhole_is_left_alone(lens):
 
 
 def test_transforms_with_a_bent_lens(tmp_path):
-    """Loaded, photographs are those of a pinhole with the file's own focal lengths and centre."""
+    """Loaded, photographs are those of a pinhole with the file's own focal lengths and center."""
     fx, fy, cx, cy = INTRINSICS
     lens = LENSES["OPENCV"]
-    write_image(tmp_path / "a.png", colours(*straighten(*grid(), "OPENCV", lens)))
+    write_image(tmp_path / "a.png", colors(*straighten(*grid(), "OPENCV", lens)))
     pose = {"file_path": "a.png", "transform_matrix": POSE.tolist()}
     about = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": WIDTH, "h": HEIGHT}
     write_json(tmp_path / "transforms.json", [{**pose, **about, **lens}])
@@ -130,8 +130,8 @@ def test_transforms_with_a_bent_lens(tmp_path):
     weight, rgb = jax.device_get((scene.train.weight[0], scene.train.rgb[0]))
     assert set(np.unique(weight)) <= {0.0, 1.0} and weight.mean() > 0.8
     inner = np.s_[8:-8, 8:-8]
-    assert abs(rgb.astype(int) - colours(*grid()))[inner].max() <= 2
-    # Integer pixel centres in the file mean a principal point half a pixel further.
+    assert abs(rgb.astype(int) - colors(*grid()))[inner].max() <= 2
+    # Integer pixel centers in the file mean a principal point half a pixel further.
     about |= {"cx": cx - 0.5, "cy": cy - 0.5}
     write_json(tmp_path / "transforms.json", [{**pose, **about, **lens}])
     shifted = load_scene(tmp_path, half_pixel=True)

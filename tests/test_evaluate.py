@@ -10,7 +10,7 @@ from absl import flags
 from absl.testing import flagsaver
 
 from experiments import evaluate as program
-from experiments.evaluation import NO_PERCEPTUAL
+from experiments.evaluation.scores import NO_PERCEPTUAL
 
 
 @pytest.fixture(autouse=True)

@@ -20,7 +20,7 @@ def test_covariances_are_those_of_thin_ellipsoids():
     np.testing.assert_allclose(found.opacities, 1 / (1 + np.exp(-scene["opacity_logits"])), 1e-5)
 
 
-def test_colours_are_the_constant_ones_in_range():
+def test_colors_are_the_constant_ones_in_range():
     surfels = to_surfels(random_scene(3))
     sh = jnp.zeros((16, 4, 3)).at[:, 1:].set(9.0).at[:, 0].set(jnp.array([-9.0, 0.0, 9.0]))
     found = as_gaussians(surfels.replace(sh=sh), jnp.ones(16, bool))

@@ -82,18 +82,18 @@ def test_colorize_depth():
     depth = np.array([[1.0, 2, 4, 0], [np.nan, np.inf, -1, 9]])
     valid = np.ones((2, 4), bool)
     valid[1, 3] = False
-    colours = colorize_depth(depth, near=1, far=4, valid=valid)
-    assert colours.dtype == np.uint8 and colours.shape == (2, 4, 3)
+    colors = colorize_depth(depth, near=1, far=4, valid=valid)
+    assert colors.dtype == np.uint8 and colors.shape == (2, 4, 3)
     # Turbo: dark red, then green to the blue side of the middle (1/2 is a third of [1/4, 1]), then
     # dark blue; nothing is black.
-    red, green, blue = colours[0, :3].astype(int).T
+    red, green, blue = colors[0, :3].astype(int).T
     assert red[0] > 100 > green[0] and blue[0] < 20
     assert green[1] > 200 > red[1]
     assert blue[2] > red[2] and green[2] < 60
-    assert not colours[0, 3].any() and not colours[1].any()
-    assert colours[0, :3].any(-1).all()
+    assert not colors[0, 3].any() and not colors[1].any()
+    assert colors[0, :3].any(-1).all()
     np.testing.assert_array_equal(
-        colorize_depth(jnp.asarray([[1.0, 2, 4]]), near=1, far=4), colours[:1, :3]
+        colorize_depth(jnp.asarray([[1.0, 2, 4]]), near=1, far=4), colors[:1, :3]
     )
 
 
@@ -108,12 +108,12 @@ def test_colorize_depth_is_robust():
 
 def test_colorize_error():
     error = np.linspace(0, 0.5, 9)[None]
-    colours = colorize_error(error).astype(int)
-    assert (np.diff(colours.sum(-1)[0, :5]) > 0).all()  # brighter with error, to 0.25
-    assert (colours[0, 4:] == colours[0, 4]).all() and colours[0, 0].sum() < 10
-    np.testing.assert_array_equal(colorize_error(-error), colours)
-    np.testing.assert_array_equal(colorize_error(np.repeat(error[..., None], 3, -1)), colours)
-    np.testing.assert_array_equal(colorize_error(error * 2, highest=0.5), colours)
+    colors = colorize_error(error).astype(int)
+    assert (np.diff(colors.sum(-1)[0, :5]) > 0).all()  # brighter with error, to 0.25
+    assert (colors[0, 4:] == colors[0, 4]).all() and colors[0, 0].sum() < 10
+    np.testing.assert_array_equal(colorize_error(-error), colors)
+    np.testing.assert_array_equal(colorize_error(np.repeat(error[..., None], 3, -1)), colors)
+    np.testing.assert_array_equal(colorize_error(error * 2, highest=0.5), colors)
 
 
 def test_side_by_side(image):
@@ -152,11 +152,11 @@ def test_support_is_drawn_in_steps_with_unseen_pixels_apart():
     sharp, often = (picture[24 + factor // 2, left : left + 360 : factor] for left in (0, 368))
     unseen = [230, 0, 126]
     for row, groups in ((sharp, "aabbcdeeu"), (often, "aabccdeeu")):
-        colours = {group: row[i].tolist() for i, group in enumerate(groups)}
-        assert colours["u"] == unseen
-        assert [colours[group] for group in groups] == row.tolist()
-        steps = [sum(colours[group]) for group in "abcde"]
+        colors = {group: row[i].tolist() for i, group in enumerate(groups)}
+        assert colors["u"] == unseen
+        assert [colors[group] for group in groups] == row.tolist()
+        steps = [sum(colors[group]) for group in "abcde"]
         assert steps == sorted(steps, reverse=True) and len(set(steps)) == 5
-    # The legend shows the same colours, in the same order.
+    # The legend shows the same colors, in the same order.
     legend = picture[-12, 8:360:60].tolist()
     assert legend == [sharp[i].tolist() for i in (0, 2, 4, 5, 6, 8)]

@@ -1,4 +1,4 @@
-"""The layouts of Blender's datasets and of the paper's: colours meet the rays of loaded cameras."""
+"""The layouts of Blender's datasets and of the paper's: colors meet the rays of loaded cameras."""
 
 import warnings
 
@@ -7,8 +7,8 @@ import pytest
 from ray_world import LENS, SIZE, photograph, seen, turned
 from tiny_capture import frame, write_image, write_json
 
+from jaxcloseup.scene import NearFarWarning
 from jaxcloseup.scenes import load_scene
-from jaxcloseup.scenes.errors import NearFarWarning
 
 
 def differences(views):
@@ -46,7 +46,7 @@ def test_blender(tmp_path):
 
 
 def test_the_paper(tmp_path):
-    """Whole numbers are pixels' centres, each frame has a lens, and a video has no photographs."""
+    """Whole numbers are pixels' centers, each frame has a lens, and a video has no photographs."""
     for count, split in ((3, "train"), (2, "test")):
         frames = []
         for i in range(count):

@@ -13,8 +13,9 @@ import pytest
 from absl import flags
 from absl.testing import flagsaver
 
-from experiments import logs, run, sweep
-from experiments.logs import TrainLog
+from experiments import run, sweep
+from experiments.training import logs
+from experiments.training.logs import TrainLog
 
 
 HISTORY = [{"step": 10 * i, "loss": 1 / i, "skipped": 0} for i in range(1, 5)]

@@ -7,8 +7,9 @@ import pytest
 from absl import flags
 from absl.testing import flagsaver
 
-from experiments import manifest, sweep
-from experiments.manifest import about_scene, git_commit, hash_data
+from experiments import sweep
+from experiments.training import manifest
+from experiments.training.manifest import about_scene, git_commit, hash_data
 from jaxcloseup.scenes import load_scene
 
 

@@ -163,7 +163,7 @@ def test_inverted_masks(tmp_path):
 
 
 def test_alpha_as_a_mask(tmp_path):
-    """Colours are the file's own, and what is transparent colours nothing when it shrinks."""
+    """Colors are the file's own, and what is transparent colors nothing when it shrinks."""
     image = np.full((HEIGHT, WIDTH, 4), [200, 100, 50, 255], np.uint8)
     image[:, 3:, :3], image[:, 3:, 3] = 7, 0
     image[0, 0, 3] = 128

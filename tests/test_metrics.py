@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import reference
 
-from jaxcloseup.metrics import cc_psnr, fit_colours, psnr, quantize, ssim
+from jaxcloseup.metrics import cc_psnr, fit_colors, psnr, quantize, ssim
 
 
 METRICS = {"psnr": psnr, "ssim": ssim, "cc_psnr": cc_psnr}
@@ -59,10 +59,10 @@ def test_ssim_agrees_with_the_oracle(pair, weight):
     expected = reference.ssim_map(*pair)
     assert expected.mean() < 0.95
     np.testing.assert_allclose(ssim(*pair), expected.mean(), atol=1e-5)
-    centres = weight[5:-5, 5:-5]
+    centers = weight[5:-5, 5:-5]
     np.testing.assert_allclose(
         ssim(*pair, weight=weight),
-        (expected.mean(-1) * centres).sum() / centres.sum(),
+        (expected.mean(-1) * centers).sum() / centers.sum(),
         atol=1e-5,
     )
 
@@ -94,7 +94,7 @@ def test_cc_psnr_agrees_with_least_squares(pair, weight):
 
 
 @pytest.mark.parametrize("ridge", [1e-4, 0.1, 1e6])
-def test_a_ridge_holds_colours_back(pair, weight, ridge):
+def test_a_ridge_holds_colors_back(pair, weight, ridge):
     """Least squares with the distance from no change as further rows."""
     image, target = (np.asarray(x, np.float64).reshape(-1, 3) for x in pair)
     share = weight.ravel() / weight.sum()
@@ -104,15 +104,15 @@ def test_a_ridge_holds_colours_back(pair, weight, ridge):
     no_change = np.concatenate([np.eye(3), mean[None]])
     wanted = np.concatenate([target * np.sqrt(share)[:, None], np.sqrt(ridge) * no_change])
     fit = np.linalg.lstsq(rows, wanted, rcond=None)[0]
-    matrix, offset = fit_colours(*pair, weight, ridge=ridge)
+    matrix, offset = fit_colors(*pair, weight, ridge=ridge)
     np.testing.assert_allclose(matrix, fit[:3], atol=2e-4)
     np.testing.assert_allclose(offset, fit[3] - mean @ fit[:3], atol=2e-4)
 
 
-def test_cc_psnr_of_degenerate_colours(pair):
-    grey = jnp.repeat(pair[0][..., :1], 3, axis=-1)
-    assert cc_psnr(grey, 0.5 * grey) > 100  # nothing but rounding is left
-    flat = jnp.full_like(grey, 0.3)
+def test_cc_psnr_of_degenerate_colors(pair):
+    gray = jnp.repeat(pair[0][..., :1], 3, axis=-1)
+    assert cc_psnr(gray, 0.5 * gray) > 100  # nothing but rounding is left
+    flat = jnp.full_like(gray, 0.3)
     expected = -10 * np.log10(((pair[1] - pair[1].mean((0, 1))) ** 2).mean())
     np.testing.assert_allclose(cc_psnr(flat, pair[1]), expected, rtol=1e-4)
 
@@ -127,7 +127,7 @@ def test_pixels_of_weight_zero_do_not_count(pair, weight, name):
     image, target = pair
     outside = weight < 0.5
     changed = np.where(outside[..., None], np.float32(0.5), image)
-    if name != "ssim":  # a window reads its neighbours, whatever they weigh
+    if name != "ssim":  # a window reads its neighbors, whatever they weigh
         np.testing.assert_allclose(
             METRICS[name](changed, target, weight=np.where(outside, np.float32(0), weight)),
             METRICS[name](image, target, weight=np.where(outside, np.float32(0), weight)),

@@ -8,13 +8,13 @@ import optax
 import pytest
 import reference
 
-from jaxcloseup.batch import Batch
 from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
+from jaxcloseup.photographs import Batch
 from jaxcloseup.rendered_loss import rendered_loss
 from jaxcloseup.volume.encodings import positional_encoding
-from jaxcloseup.volume.mlp import apply_network, init_network
 from jaxcloseup.volume.nerf import NerfAux, NerfConfig, nerf
+from jaxcloseup.volume.networks import apply_network, init_network
 
 
 TINY = NerfConfig(
@@ -149,8 +149,8 @@ def test_stacked_cameras_see_their_own_pixels():
 
 
 def test_scaled_coordinates_move_the_network_not_the_depth():
-    """A scene seen through `centre` and `scale` is the same scene, transformed."""
-    moved = nerf(TINY, near=2.0, far=6.0, centre=(2.0, 0.0, 4.0), scale=0.5)
+    """A scene seen through `center` and `scale` is the same scene, transformed."""
+    moved = nerf(TINY, near=2.0, far=6.0, center=(2.0, 0.0, 4.0), scale=0.5)
     pose = camera().camtoworld.at[:, 3].set(jnp.array([2 + 2 * 0.3, 0.0, 4 - 2 * 2.0]))
     thin = jax.tree.map(jnp.copy, params())
     for network in thin.values():  # half the density, for twice the distance

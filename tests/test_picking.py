@@ -5,7 +5,7 @@ import numpy as np
 import plane
 import pytest
 
-from experiments.picking import (
+from experiments.viewing.picking import (
     closeup_camera,
     rank_views,
     ray_camera,

@@ -129,8 +129,8 @@ def test_four_fixed_anchors_give_four_fixed_cameras(key, camera):
     fixed = settings(magnification=(4.0, 4.0), max_angle=0.0)
     sampled = draw(key, 64, camera, depth, fixed, weight)
     positions = np.unique(np.round(np.asarray(sampled.position), 4), axis=0)
-    centres = jnp.array([[2.5, 1.5], [6.5, 1.5], [2.5, 4.5], [6.5, 4.5]])
-    anchors = pixels_to_points(camera, centres, jnp.full(4, 2.0))
+    centers = jnp.array([[2.5, 1.5], [6.5, 1.5], [2.5, 4.5], [6.5, 4.5]])
+    anchors = pixels_to_points(camera, centers, jnp.full(4, 2.0))
     expected = (3 * anchors + camera.position[None]) / 4
     np.testing.assert_allclose(positions, np.unique(np.round(expected, 4), axis=0), atol=2e-4)
     np.testing.assert_allclose(sampled.rotation - camera.rotation[None], 0, atol=1e-6)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from tiny_runs import TINY_SURFELS
 
-from experiments import presets
-from experiments.presets import FEWEST_POINTS, extent, initial_points, make_field
+from experiments.methods import presets
+from experiments.methods.presets import FEWEST_POINTS, extent, initial_points, make_field
 from jaxcloseup.scenes import load_scene
 
 

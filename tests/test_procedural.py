@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import reference
 
-from jaxcloseup.batch import camera_at
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points, points_to_pixels
 from jaxcloseup.geometry.warp import backward_warp
-from jaxcloseup.scenes import modelling, planning, procedural
-from jaxcloseup.scenes.builtin import SCENES
-from jaxcloseup.scenes.raycast import cast_rays
+from jaxcloseup.photographs import camera_at
+from jaxcloseup.procedural import loading, modeling, planning
+from jaxcloseup.procedural.builtin import SCENES
+from jaxcloseup.procedural.raycast import cast_rays
 
 
 DOWNSCALE = 20  # 48 x 27
@@ -25,14 +25,14 @@ def cache(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         root = tmp_path_factory.mktemp("cache")
         patch.setenv("XDG_CACHE_HOME", str(root))
-        procedural._world.cache_clear()
+        loading._world.cache_clear()
         yield root / "jaxcloseup"
-        procedural._world.cache_clear()
+        loading._world.cache_clear()
 
 
 @pytest.fixture(scope="module")
 def scene(cache):
-    return procedural.procedural_scene("counter", downscale=DOWNSCALE)
+    return loading.procedural_scene("counter", downscale=DOWNSCALE)
 
 
 @pytest.fixture(scope="module")
@@ -41,12 +41,12 @@ def truth(scene):
     return [(i, scene.surface(camera_at(scene.train.cameras, i))) for i in range(0, 60, 3)]
 
 
-@pytest.mark.parametrize("name", procedural.PROCEDURAL_SCENES)
+@pytest.mark.parametrize("name", loading.PROCEDURAL_SCENES)
 def test_cameras(name, monkeypatch):
     """Every camera stands in free space, and close-ups are close, turned and supported."""
-    monkeypatch.setattr(modelling, "draw_texture", lambda name: np.zeros((1024, 1024, 3)))
+    monkeypatch.setattr(modeling, "draw_texture", lambda name: np.zeros((1024, 1024, 3)))
     model = SCENES[name]()
-    world = modelling.build_world(model, lambda *scene: np.ones((8, 4)))
+    world = modeling.build_world(model, lambda *scene: np.ones((8, 4)))
     rng = np.random.default_rng(7)
     train = planning.plan_far(world.solids, model.rig, rng, 24)
     close = planning.plan_closeups(world.solids, model.rig, train, rng, 5)
@@ -130,7 +130,7 @@ def test_photographs_are_what_the_surface_shows(scene, truth):
 
 
 def test_two_views_agree(scene, truth):
-    """A pixel lifted with its depth finds itself in another view, in depth and in colour."""
+    """A pixel lifted with its depth finds itself in another view, in depth and in color."""
     lift, project = jax.jit(pixels_to_points), jax.jit(points_to_pixels)
     grid = pixel_grid(27, 48)
     shown, errors = [], []
@@ -146,9 +146,9 @@ def test_two_views_agree(scene, truth):
     assert np.median(np.concatenate(errors)) < 0.025
 
 
-def test_points_lie_on_the_surface_with_its_colour(scene, truth):
+def test_points_lie_on_the_surface_with_its_color(scene, truth):
     assert 4500 < len(scene.points) <= 5100
-    solids, seen = procedural._world("counter").solids, np.zeros(len(scene.points), bool)
+    solids, seen = loading._world("counter").solids, np.zeros(len(scene.points), bool)
     for i, surface in truth:
         camera = camera_at(scene.train.cameras, i)
         pixels, depths = reference.project(camera.camtoworld, camera.intrinsics, scene.points)
@@ -181,7 +181,7 @@ def test_zoom_agrees_with_the_plain_view_and_shows_more(scene, truth):
 def test_realism_touches_training_photographs_only(scene):
     options = {"noise": 0.05, "exposure_jitter": 0.1, "pose_noise": 0.01}
     real, again = (
-        procedural.procedural_scene("counter", downscale=DOWNSCALE, **options) for _ in range(2)
+        loading.procedural_scene("counter", downscale=DOWNSCALE, **options) for _ in range(2)
     )
     jax.tree.map(np.testing.assert_array_equal, real.train, again.train)
     jax.tree.map(np.testing.assert_array_equal, real.test, scene.test)
@@ -214,17 +214,17 @@ def test_the_cache_is_used_and_survives_damage(scene, cache, monkeypatch):
         raise AssertionError("rendered again")
 
     with monkeypatch.context() as patch:
-        patch.setattr(procedural, "_capture", must_not_run)
-        again = procedural.procedural_scene("counter", downscale=DOWNSCALE)
+        patch.setattr(loading, "_capture", must_not_run)
+        again = loading.procedural_scene("counter", downscale=DOWNSCALE)
     jax.tree.map(np.testing.assert_array_equal, again.train, scene.train)
 
     # From scratch, the same to the last bit: textures, light, cameras, photographs and points.
     stored[0].write_bytes(stored[0].read_bytes()[:1000])
     for light in cache.glob("counter-light-*.npz"):
         light.write_text("not an archive")
-    procedural._world.cache_clear()
+    loading._world.cache_clear()
     with pytest.warns(UserWarning, match="ignoring the unreadable cache"):
-        rebuilt = procedural.procedural_scene("counter", downscale=DOWNSCALE)
+        rebuilt = loading.procedural_scene("counter", downscale=DOWNSCALE)
     for split in ("train", "test", "test_far"):
         jax.tree.map(np.testing.assert_array_equal, getattr(rebuilt, split), getattr(scene, split))
     np.testing.assert_array_equal(rebuilt.points, scene.points)
@@ -236,34 +236,34 @@ def test_an_unwritable_cache_costs_a_warning(tmp_path, monkeypatch):
     blocked.write_text("in the way")
     monkeypatch.setenv("XDG_CACHE_HOME", str(blocked))
     with pytest.warns(UserWarning, match="cannot keep"):
-        made = procedural._kept("anything", lambda: {"value": np.arange(3)})
+        made = loading._kept("anything", lambda: {"value": np.arange(3)})
     np.testing.assert_array_equal(made["value"], [0, 1, 2])
 
 
 def test_sizes_round_up_and_focal_lengths_follow():
-    camera = procedural._cameras(np.zeros((1, 3, 4)), 120, 68)
+    camera = loading._cameras(np.zeros((1, 3, 4)), 120, 68)
     assert (camera.height, camera.width) == (68, 120)
     np.testing.assert_allclose(camera.intrinsics[0], [100, 800 * 68 / 540, 60, 34], rtol=1e-6)
 
 
 def test_bad_requests():
     with pytest.raises(ValueError, match="no built-in scene 'cellar'; there are counter"):
-        procedural.procedural_scene("cellar")
+        loading.procedural_scene("cellar")
     with pytest.raises(ValueError, match="positive integer"):
-        procedural.procedural_scene("counter", downscale=0)
+        loading.procedural_scene("counter", downscale=0)
 
 
 def test_a_new_camera_reuses_the_compiled_render(scene):
     """One compilation an image size, whatever the camera."""
-    before = procedural._render_surface._cache_size()
+    before = loading._render_surface._cache_size()
     camera = camera_at(scene.test.cameras, 0)
     moved = Camera(camera.camtoworld + 0.01, camera.intrinsics, 27, 48)
     scene.surface(moved)
-    assert procedural._render_surface._cache_size() == before
+    assert loading._render_surface._cache_size() == before
 
 
 def test_a_surface_first_asked_for_inside_a_trace_serves_later_traces(scene):
-    procedural._world.cache_clear()
+    loading._world.cache_clear()
     camera = camera_at(scene.test.cameras, 0)
     for _ in range(2):
         jax.jit(lambda camera: scene.surface(camera).depth).lower(camera)

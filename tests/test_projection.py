@@ -58,10 +58,10 @@ def test_boxes_are_no_larger_than_the_rim():
         offset = scale[0] * np.cos(theta) * tangent_u + scale[1] * np.sin(theta) * tangent_v
         rim = scene["means"][i] + offset
         rim = rim[:, :2] / rim[:, 2:] * INTRINSICS[:2] + INTRINSICS[2:]
-        centre = scene["means"][i, :2] / scene["means"][i, 2] * INTRINSICS[:2] + INTRINSICS[2:]
+        center = scene["means"][i, :2] / scene["means"][i, 2] * INTRINSICS[:2] + INTRINSICS[2:]
         floor = cutoff[i] / np.sqrt(2)
-        low = np.minimum(rim.min(0), centre - floor)
-        high = np.maximum(rim.max(0), centre + floor)
+        low = np.minimum(rim.min(0), center - floor)
+        high = np.maximum(rim.max(0), center + floor)
         slack = 0.05 + 0.01 * (high - low)
         assert np.all(low - box[i, :2] < slack) and np.all(box[i, 2:] - high < slack)
         assert np.all(box[i, :2] <= low) and np.all(box[i, 2:] >= high)

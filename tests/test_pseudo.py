@@ -29,7 +29,7 @@ def settings(**changes):
         "fixed_anchors": 0.0,
         "forward_label": 0.0,
         "leave_out_source": 0.0,
-        "label_share": 0.5,
+        "label_loss_weight": 0.5,
     }
     return PseudoSettings(pose, **{k: jnp.float32(v) for k, v in (values | changes).items()})
 
@@ -63,7 +63,7 @@ def rays_cosine(points, one, other):
     return np.sum(rays[0] * rays[1], axis=-1) / (norms[0] * norms[1])
 
 
-def test_labels_from_exact_depth_are_the_true_colours(capture):
+def test_labels_from_exact_depth_are_the_true_colors(capture):
     views, depths, closeup = capture
     rgb, depth, _ = truth(closeup)
     result = label(closeup, GRID, depth, 1, views, depths, settings())
@@ -73,7 +73,7 @@ def test_labels_from_exact_depth_are_the_true_colours(capture):
     assert np.abs(np.asarray(result.forward)[kept] - rgb[kept]).max() < 0.17
 
 
-def test_without_the_mask_every_pixel_that_the_source_sees_is_labelled(capture):
+def test_without_the_mask_every_pixel_that_the_source_sees_is_labeled(capture):
     views, depths, closeup = capture
     high = plane.camera_above(1.0, 0.0, 3.5)  # sees more than the first photograph does
     for camera in (closeup, high):
@@ -138,7 +138,7 @@ def test_labels_end_at_the_largest_angle_between_rays(capture):
 def test_blended_labels_are_the_mean_of_the_photographs_that_see_most(capture):
     views, depths, closeup = capture
     _, depth, points = truth(closeup)
-    # Photographs of one colour each tell whose colours are in a label.
+    # Photographs of one color each tell whose colors are in a label.
     levels = np.array([0.1, 0.2, 0.4, 0.8])
     flat = views.replace(rgb=jnp.broadcast_to(levels.reshape(-1, 1, 1, 1), views.rgb.shape) * 1.0)
     flat = flat.replace(rgb=flat.rgb.astype(jnp.float32))
@@ -180,7 +180,7 @@ def test_settings_of_the_contract_are_enough(capture):
     by_default = label(closeup, GRID, depth, 1, views, depths, paper)
     spelt_out = label(closeup, GRID, depth, 1, views, depths, settings())
     np.testing.assert_array_equal(by_default.weight, spelt_out.weight)
-    assert paper.label_share == 0.5
+    assert paper.label_loss_weight == 0.5
 
 
 def test_undefined_depth_and_weightless_photographs_give_no_label(capture):
@@ -272,7 +272,7 @@ def test_wanted_views_may_have_the_published_source(capture):
     assert np.abs(seen[0] - seen[1]).max() > 0.01
 
 
-def test_target_views_are_labelled_from_their_best_source(capture):
+def test_target_views_are_labeled_from_their_best_source(capture):
     views, depths, closeup = capture
     targets = [closeup, plane.camera_above(-0.9, 0.0, 2.0)]
     stacked, exact = plane.make_views(targets)

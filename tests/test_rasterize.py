@@ -319,7 +319,7 @@ def test_extreme_parameters_have_finite_images_and_gradients():
     scene["opacity_logits"][:4] = [100, -100, -30, 30]
     scene["log_scales"][4:8] = [[-18, -18], [-60, 2], [60, 60], [0, -18]]
     scene["quaternions"][8] = 0
-    scene["means"][9] = 0  # at the camera's centre
+    scene["means"][9] = 0  # at the camera's center
     scene["means"][10:12] = scene["means"][12]
     scene["means"][13] = [1e10, 0, 1e10]
     scene["means"][14] = [0, 0, NEAR]
@@ -358,8 +358,8 @@ def test_volumetric_gaussians_share_the_kernel():
         axis=1,
     )
     ellipse = local @ covariance @ local.swapaxes(1, 2) + 0.3 * np.eye(2)
-    centre = np.stack([fx * x / z + cx, fy * y / z + cy], axis=-1)
-    opacity, colour = rng.uniform(0.2, 1, COUNT), rng.uniform(0, 1, (COUNT, 3))
+    center = np.stack([fx * x / z + cx, fy * y / z + cy], axis=-1)
+    opacity, color = rng.uniform(0.2, 1, COUNT), rng.uniform(0, 1, (COUNT, 3))
 
     root = np.linalg.cholesky(np.linalg.inv(ellipse)).swapaxes(1, 2)
     rows = np.zeros((COUNT, 3, 3))
@@ -367,27 +367,27 @@ def test_volumetric_gaussians_share_the_kernel():
     rows[:, 2, 0] = 1 / z
     reach = 3.34 * np.sqrt(np.diagonal(ellipse, axis1=1, axis2=2))
     footprints = Footprints(
-        anchor=centre,
+        anchor=center,
         rows=rows,
         opacity=opacity,
         low_pass=np.full(COUNT, 1e9),
         inverse_depth=np.tile([0.0, np.inf], (COUNT, 1)),
-        payload=colour,
+        payload=color,
         order=z,
-        box=np.concatenate([centre - reach, centre + reach], axis=1),
+        box=np.concatenate([center - reach, center + reach], axis=1),
     )
     footprints = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), footprints)
     image = jax.jit(lambda f: rasterize(f, CONFIG, height=HEIGHT, width=WIDTH))(footprints)
 
     gx, gy = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    offset = np.stack([gx.ravel(), gy.ravel()], -1)[None] - centre[:, None]
+    offset = np.stack([gx.ravel(), gy.ravel()], -1)[None] - center[:, None]
     rho = np.einsum("npi,nij,npj->np", offset, np.linalg.inv(ellipse), offset)
     alpha = np.minimum(opacity[:, None] * np.exp(-rho / 2), 0.99)
     alpha[alpha < 1 / 255] = 0
     nearest = np.argsort(z)
     depth = np.broadcast_to(z[:, None], alpha.shape)
     sums, total, expected_depth, median, _ = reference.composite(
-        alpha[nearest], depth[nearest], colour[nearest]
+        alpha[nearest], depth[nearest], color[nearest]
     )
     np.testing.assert_allclose(image.payload, sums.reshape(HEIGHT, WIDTH, 3), atol=2e-5)
     np.testing.assert_allclose(image.alpha, total.reshape(HEIGHT, WIDTH), atol=2e-5)

@@ -7,7 +7,7 @@ import pytest
 import reference
 
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_rays
-from jaxcloseup.scenes import raycast, shading
+from jaxcloseup.procedural import raycast, shading
 
 
 KINDS = ("plane", "box", "sphere", "cylinder")
@@ -50,7 +50,7 @@ def check_against_reference(solids, origins, directions):
         if index < 0:
             assert np.isinf(hits.depth[i])
             continue
-        # Single precision is about a micrometre across the surface: more along a grazing ray.
+        # Single precision is about a micrometer across the surface: more along a grazing ray.
         tolerance = 2e-6 / abs(normal @ direction)
         np.testing.assert_allclose(hits.depth[i], depth, rtol=1e-6, atol=tolerance)
         np.testing.assert_allclose(hits.normal[i], normal, atol=2e-3)
@@ -141,7 +141,7 @@ def test_textures_are_periodic_pyramids_of_means():
     image = rng.integers(0, 256, (size, size, 3)).astype(np.float32) / 255
     texels = jnp.asarray(shading.pack_pyramid(image))[None]
     rows, columns = rng.integers(0, size, (2, 50))
-    centres = (np.stack([columns, rows], -1) + 0.5) / size
+    centers = (np.stack([columns, rows], -1) + 0.5) / size
 
     @jax.jit
     def sample(uv, level):
@@ -150,10 +150,10 @@ def test_textures_are_periodic_pyramids_of_means():
         )
 
     levels = jnp.zeros(50)
-    np.testing.assert_allclose(sample(centres - 3, levels - 1), image[rows, columns], atol=2e-3)
+    np.testing.assert_allclose(sample(centers - 3, levels - 1), image[rows, columns], atol=2e-3)
     # Half way between two texels, across the border as well.
     right = image[rows, (columns + 1) % size]
-    halfway = sample(centres + np.array([0.5 / size, 1]), levels)
+    halfway = sample(centers + np.array([0.5 / size, 1]), levels)
     np.testing.assert_allclose(halfway, (image[rows, columns] + right) / 2, atol=2e-3)
     # Two levels up, texels are means of 4 x 4 (rounded to bytes twice); between levels, both blend.
     means = image.reshape(size // 4, 4, size // 4, 4, 3).mean((1, 3))
@@ -164,4 +164,4 @@ def test_textures_are_periodic_pyramids_of_means():
     np.testing.assert_allclose(
         between, 0.75 * sample(coarse, levels + 1) + 0.25 * at_two, atol=1e-5
     )
-    np.testing.assert_allclose(sample(centres, levels + 99), np.full((50, 3), 0.5), atol=0.01)
+    np.testing.assert_allclose(sample(centers, levels + 99), np.full((50, 3), 0.5), atol=0.01)

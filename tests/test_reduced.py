@@ -6,7 +6,8 @@ import pytest
 from tiny_capture import POSE, write_image, write_json
 from tiny_models import colmap_capture, llff_capture
 
-from jaxcloseup.scenes import SceneError, load_scene, photographs
+from jaxcloseup.captures import photo_reading
+from jaxcloseup.scenes import SceneError, load_scene
 
 
 LENS = {"fl_x": 7.0, "fl_y": 9.0, "cx": 4.5, "cy": 2.5, "w": 9, "h": 7}
@@ -70,7 +71,7 @@ def test_all_of_them_or_none(tmp_path):
         write_image(tmp_path / "images_2" / name, small)
     rgb, _, scene = load(tmp_path, downscale=2)
     np.testing.assert_array_equal(rgb, expected)
-    lacks = "images_2 is not used, since it lacks 2 of 3 photographs, such as a."
+    lacks = "images_2 is not used, since it lacks 2 of 3 photo_reading, such as a."
     assert lacks in scene.metadata["notes"][-1]
     write_image(tmp_path / "images_2/a.jpg", small)
     assert (load(tmp_path, downscale=2)[0] == 0).all()
@@ -111,13 +112,13 @@ def capture(tmp_path, cache):
 @pytest.fixture
 def decoded(monkeypatch):
     """The names of the pictures that are decoded."""
-    names, read = [], photographs.read_image
+    names, read = [], photo_reading.read_image
 
     def count(path, **options):
         names.append(path.name)
         return read(path, **options)
 
-    monkeypatch.setattr(photographs, "read_image", count)
+    monkeypatch.setattr(photo_reading, "read_image", count)
     return names
 
 
@@ -175,7 +176,7 @@ def test_everything_that_matters_is_in_the_key(capture, decoded, monkeypatch):
         (lambda: bend(k1=-0.2), {"downscale": 2}, 2),
         (lambda: bend(k1=-0.2, fl_x=8.0), {"downscale": 2}, 2),
         (lambda: None, {"downscale": 2, "half_pixel": True}, 2),
-        (lambda: monkeypatch.setattr(photographs, "_code", list), {"downscale": 2}, 2),
+        (lambda: monkeypatch.setattr(photo_reading, "_code", list), {"downscale": 2}, 2),
     ]
     for change, options, count in changes:
         change()
@@ -187,8 +188,8 @@ def test_everything_that_matters_is_in_the_key(capture, decoded, monkeypatch):
 def test_a_principal_point_near_the_corner_is_not_the_middle(capture, decoded):
     """The half that is given is not half of a size that is not known before decoding."""
     frames = [{"file_path": "images/a.png", "transform_matrix": POSE.tolist()}]
-    for centre in ({"cx": 0.5, "cy": 0.5}, {}):
-        write_json(capture / "transforms_train.json", frames, fl_x=7.0, k1=-0.1, **centre)
+    for center in ({"cx": 0.5, "cy": 0.5}, {}):
+        write_json(capture / "transforms_train.json", frames, fl_x=7.0, k1=-0.1, **center)
         decoded.clear()
         load_scene(capture, downscale=2)
         assert decoded == ["a.png"]

@@ -14,11 +14,11 @@ from test_camera_paths import path_file
 from tiny_runs import KEPT
 
 from experiments import render as program
-from experiments import shots
-from experiments.finished import load_run_scene, preset_from_config, read_run
-from experiments.loop import Programs
-from experiments.pipeline import config
-from experiments.presets import PRESETS, with_classic_density
+from experiments.methods.presets import PRESETS, with_classic_density
+from experiments.training.loop import Programs
+from experiments.training.stages import config
+from experiments.training.stored_run import load_run_scene, preset_from_config, read_run
+from experiments.viewing import frames
 from jaxcloseup.scenes import load_scene
 
 
@@ -82,10 +82,10 @@ def test_a_camera_path_may_be_fine_tuned_for(render, tmp_path, capsys):
 
 
 def test_nothing_is_fine_tuned_where_the_gate_lets_no_labels_in(capture_folder, monkeypatch):
-    monkeypatch.setattr(shots, "weigh_labels", lambda *data: (data[-1], {"weight": 0.0}))
-    monkeypatch.setattr(shots, "print_gate", lambda _: None)
+    monkeypatch.setattr(frames, "weigh_labels", lambda *data: (data[-1], {"weight": 0.0}))
+    monkeypatch.setattr(frames, "print_gate", lambda _: None)
     programs = Programs(dataclasses.replace(KEPT, gated=True), load_scene(str(capture_folder)))
-    assert shots.fine_tune(programs, "state", None, None, most=None) == "state"
+    assert frames.fine_tune(programs, "state", None, None, most=None) == "state"
 
 
 MISTAKES = {

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxcloseup.batch import Batch
 from jaxcloseup.field import RadianceField, Rendering
 from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.photographs import Batch
 from jaxcloseup.rendered_loss import rendered_loss
 
 
@@ -15,7 +15,7 @@ CAMERA = Camera(jnp.eye(4)[:3], jnp.array([8.0, 8, 4, 4]), 8, 8)
 
 
 def _render(params, buffers, camera, pixels, key):
-    """Colours that depend on the pixel and its camera, through weights that are trained."""
+    """Colors that depend on the pixel and its camera, through weights that are trained."""
     x = pixels / 8 + camera.position[..., :2].reshape(-1, 2) + buffers
     rgb = jnp.tanh(x @ params["first"]) @ params["second"]
     if key is not None:

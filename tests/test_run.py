@@ -10,24 +10,24 @@ import plane
 import pytest
 from tiny_runs import TINY, TINY_SURFELS
 
-from experiments.audit import blur_to_footprint
 from experiments.evaluate import evaluate_folders
-from experiments.evaluation import NO_PERCEPTUAL, Target, score, summarise
-from experiments.finished import choose_stage, load_run_scene, read_run, restore
-from experiments.gate import AGREEMENT, verdict, weigh_labels
-from experiments.loop import Programs, TrainingError, run_stage
-from experiments.pipeline import run
-from experiments.presets import (
+from experiments.evaluation.audit import blur_to_footprint
+from experiments.evaluation.scores import NO_PERCEPTUAL, Target, score, summarize
+from experiments.methods.presets import (
     QUICK_SURFELS,
     initial_points,
     pseudo_settings,
 )
-from experiments.report import write_json
+from experiments.reporting.report import write_json
+from experiments.training.gate import AGREEMENT, verdict, weigh_labels
+from experiments.training.loop import Programs, TrainingError, run_stage
+from experiments.training.stages import run
+from experiments.training.stored_run import choose_stage, load_run_scene, read_run, restore
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.artifacts.images import to_uint8
 from jaxcloseup.artifacts.surfel_ply import read_surfels
-from jaxcloseup.batch import camera_at
 from jaxcloseup.field import Rendering
+from jaxcloseup.photographs import camera_at
 from jaxcloseup.scenes import load_scene
 from jaxcloseup.train import init_state
 
@@ -159,8 +159,8 @@ def test_labels_weigh_what_they_deserve(off):
     low, high = AGREEMENT
     expected = np.clip((found["agreement"] - low) / (high - low), 0, 1)
     assert found["weight"] == pytest.approx(expected)
-    assert changed.label_share == pytest.approx(expected * settings.label_share)
-    assert changed.replace(label_share=settings.label_share) == settings
+    assert changed.label_loss_weight == pytest.approx(expected * settings.label_loss_weight)
+    assert changed.replace(label_loss_weight=settings.label_loss_weight) == settings
     assert found["agreement"] == found["left_out"][0]["coverage"]
     assert found["left_out"][-1]["model_psnr"] < 15
     if off == 1.0:
@@ -287,7 +287,7 @@ def test_scores_ignore_padding_and_say_what_is_missing():
     assert result["coverage_seen1"] == pytest.approx(0.25)
     assert result["psnr_seen3"] is None
     assert result["psnr_seen3_reason"]
-    summary = summarise({"0": result})
+    summary = summarize({"0": result})
     assert summary["psnr_seen3"] is None
     assert summary["psnr_seen3_reason"] == result["psnr_seen3_reason"]
 

@@ -5,8 +5,8 @@ import pytest
 from tiny_capture import HEIGHT, WIDTH, vertices, write_image, write_json, write_ply
 from tiny_models import colmap_capture, llff_capture, llff_rows
 
+from jaxcloseup.scene import UnknownKeyWarning
 from jaxcloseup.scenes import SceneError, load_scene
-from jaxcloseup.scenes.errors import UnknownKeyWarning
 
 
 @pytest.fixture

@@ -4,10 +4,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.surface_error import find_landmarks, point_depth_error, surface_error
+from experiments.evaluation.surface_error import find_landmarks, point_depth_error, surface_error
 from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
-from jaxcloseup.scenes.scene import Surface
+from jaxcloseup.scene import Surface
 from jaxcloseup.splats.field import SurfelFieldAux
 from jaxcloseup.splats.render import SurfelAux
 
@@ -38,7 +38,7 @@ def test_normals_of_surfels_are_their_own_and_what_is_empty_does_not_count():
     hit = jnp.arange(48)[None] < 24
     surface = Surface(jnp.zeros((24, 48, 3)), jnp.where(hit, depth, 0), normal)
     zeros = jnp.zeros((24, 48))
-    of_surfels = jnp.where(hit[..., None], 0.3 * normal, -normal)  # composited, not normalised
+    of_surfels = jnp.where(hit[..., None], 0.3 * normal, -normal)  # composited, not normalized
     aux = SurfelFieldAux(SurfelAux(of_surfels, depth, zeros, jnp.int32(0)), zeros, jnp.float32(0))
     found = surface_error(CAMERA, Rendering(normal, jnp.where(hit, depth, 9), zeros, aux), surface)
     assert float(found["normal_error_p90"]) == pytest.approx(0, abs=0.05)

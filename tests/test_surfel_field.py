@@ -14,13 +14,13 @@ from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.metrics import psnr
 from jaxcloseup.splats import RasterizeConfig
-from jaxcloseup.splats.density_control import DensityConfig
 from jaxcloseup.splats.field import (
     SurfelConfig,
     camera_extent,
     surfel_field,
     surfel_optimizer,
 )
+from jaxcloseup.splats.mcmc import McmcConfig
 from jaxcloseup.splats.surfels import random_points
 from jaxcloseup.train import TrainConfig, init_state, run_steps, train_step
 
@@ -31,12 +31,12 @@ CONFIG = SurfelConfig(
     sh_degree=1,
     sh_every=80,
     initial_opacity=0.5,
-    regularise_from=50,
-    means_rate=(2e-3, 2e-4),
-    sh_rate=2e-2,
-    rotation_rate=1e-2,
+    regularize_from=50,
+    means_lr=(2e-3, 2e-4),
+    sh_lr=2e-2,
+    rotation_lr=1e-2,
     decay_steps=STEPS,
-    density=DensityConfig(every=25, start=25, stop=150, growth=1.1),
+    density=McmcConfig(every=25, start=25, stop=150, growth=1.1),
     raster=RasterizeConfig(capacity=2**13, near=0.2, tile=8, chunk=4, block=12),
 )
 EXTENT = 2.0
@@ -66,8 +66,8 @@ def trained(capture, run):
     rng = np.random.default_rng(0)
     points = rng.uniform([-1.6, -1.4, -0.15], [1.6, 1.4, 0.15], (250, 3))
     points = jnp.asarray(points, jnp.float32)
-    grey = jnp.full_like(points, 0.5)
-    state = init_state(jax.random.key(0), points, grey, field=FIELD, optimizer=OPTIMIZER)
+    gray = jnp.full_like(points, 0.5)
+    state = init_state(jax.random.key(0), points, gray, field=FIELD, optimizer=OPTIMIZER)
     with jax.numpy_dtype_promotion("standard"):  # optax mixes integers and floats
         first, _ = run(state, views, count=STEPS // 2)
         last, metrics = run(first, views, count=STEPS // 2)
@@ -104,13 +104,13 @@ def test_training_finds_the_plane(trained, capture):
     assert after < 0.7 * before
 
 
-def test_colours_of_an_image_may_change_as_a_whole(trained, capture):
+def test_colors_of_an_image_may_change_as_a_whole(trained, capture):
     """A photograph in other light costs three tenths of what it does without the affine change."""
     state, camera = trained[2], jax.tree.map(lambda leaf: leaf[0], capture[0].cameras)
     image = render(state.params, state.buffers, camera)
     change = jnp.array([[0.8, 0.1, 0.0], [0.0, 0.7, 0.1], [0.1, 0.0, 0.9]])
     target = jnp.matmul(image.rgb, change[None], precision="highest") + 0.05
-    free = surfel_field(dataclasses.replace(CONFIG, colour_ridge=1e-6), extent=EXTENT)
+    free = surfel_field(dataclasses.replace(CONFIG, color_ridge=1e-6), extent=EXTENT)
     ones = jnp.ones(target.shape[:2])
 
     def loss_of(field, weight):
@@ -129,9 +129,9 @@ def test_colours_of_an_image_may_change_as_a_whole(trained, capture):
 
 def test_schedules_follow_the_step(trained):
     start, middle, end, _ = trained
-    for state, degree, regularise in ((start, 0, 0), (middle, 1, 1), (end, 1, 1)):
+    for state, degree, regularize in ((start, 0, 0), (middle, 1, 1), (end, 1, 1)):
         assert state.buffers.degree == degree
-        assert state.buffers.regularise == regularise
+        assert state.buffers.regularize == regularize
     assert start.buffers.alive.sum() == 250
     # Relocations at 50, 75, 100, 125, the last one before 150.
     assert middle.buffers.alive.sum() == int(int(int(250 * 1.1) * 1.1) * 1.1)
@@ -157,8 +157,10 @@ def test_late_surfels_wander_as_little_as_they_learn(trained):
     """The noise follows the learning rate of the means."""
     state = trained[2].replace(step=jnp.int32(STEPS + 1))
     moves = []
-    for late_rate in (1.0, 0.1):
-        field = surfel_field(dataclasses.replace(CONFIG, late_rate=late_rate), extent=EXTENT)
+    for late_lr_scale in (1.0, 0.1):
+        field = surfel_field(
+            dataclasses.replace(CONFIG, late_lr_scale=late_lr_scale), extent=EXTENT
+        )
         after = field.adapt(jax.random.key(1), state)
         moves.append(np.asarray(after.params.means - state.params.means, np.float64))
     assert np.abs(moves[0]).max() > 1e-4
@@ -204,7 +206,7 @@ def test_first_step_moves_everything_by_its_learning_rate():
 
 
 def test_late_steps_are_smaller():
-    config = dataclasses.replace(CONFIG, decay_steps=1, late_rate=0.1)
+    config = dataclasses.replace(CONFIG, decay_steps=1, late_lr_scale=0.1)
     optimizer = surfel_optimizer(config, extent=EXTENT)
     surfels = to_surfels(random_scene(0))
     with jax.numpy_dtype_promotion("standard"):

@@ -1,11 +1,11 @@
-"""Initial surfels, their colours, and the losses on their images."""
+"""Initial surfels, their colors, and the losses on their images."""
 
 import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reference_splats import rotation_of, sh_colour
+from reference_splats import rotation_of, sh_color
 from splat_scenes import to_camera
 
 from jaxcloseup.splats import surfels_from_points
@@ -36,8 +36,8 @@ def test_surfels_fill_the_gaps_between_points(key):
     np.testing.assert_allclose(surfels.means[np.asarray(alive)], points[kept])
     np.testing.assert_allclose(scales, np.stack([expected, expected], 1), rtol=1e-4)
     direction = jnp.array([[0.6, 0.0, 0.8]])
-    colours = sh_to_rgb(surfels.sh[np.asarray(alive)], direction)
-    np.testing.assert_allclose(colours, rgb[kept], atol=1e-6)
+    colors = sh_to_rgb(surfels.sh[np.asarray(alive)], direction)
+    np.testing.assert_allclose(colors, rgb[kept], atol=1e-6)
     opacity = jax.nn.sigmoid(surfels.opacity_logits[np.asarray(alive)])
     np.testing.assert_allclose(opacity, 0.1, rtol=1e-5)
     for leaf in jax.tree.leaves(surfels):
@@ -82,12 +82,12 @@ def test_harmonics_turn_within_their_degree():
 
 
 @pytest.mark.parametrize("degree", range(4))
-def test_colours_are_the_written_out_polynomials(degree):
+def test_colors_are_the_written_out_polynomials(degree):
     rng = np.random.default_rng(degree)
     sh = rng.normal(size=((degree + 1) ** 2, 3))
     direction = np.array([0.48, -0.6, 0.64])
     computed = sh_to_rgb(jnp.asarray(sh, jnp.float32), jnp.asarray(direction, jnp.float32))
-    np.testing.assert_allclose(computed, sh_colour(sh, direction), atol=2e-6)
+    np.testing.assert_allclose(computed, sh_color(sh, direction), atol=2e-6)
     np.testing.assert_allclose(
         sh_to_rgb(rgb_to_sh(jnp.array([[0.1, 0.7, 1.0]])), jnp.array([0.0, 0.0, 1.0])),
         [0.1, 0.7, 1.0],

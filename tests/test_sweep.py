@@ -20,14 +20,15 @@ from absl import flags
 from absl.testing import flagsaver
 from tiny_runs import TINY, TINY_SURFELS
 
-from experiments import sweep, sweep_pipeline
-from experiments.arms import make_arm
-from experiments.loop import Programs
-from experiments.pictures import comparisons
-from experiments.pipeline import rendered_depths
-from experiments.presets import initial_points, pseudo_settings
-from experiments.sweep_pipeline import run_sweep, stack_arms
-from experiments.sweep_report import paired_bootstrap, rows, write_sweep
+from experiments import sweep
+from experiments.methods.presets import initial_points, pseudo_settings
+from experiments.reporting.pictures import comparisons
+from experiments.reporting.tables import paired_bootstrap, rows, write_sweep
+from experiments.training import sweep as sweep_stages
+from experiments.training.arms import make_arm
+from experiments.training.loop import Programs
+from experiments.training.stages import rendered_depths
+from experiments.training.sweep import run_sweep, stack_arms
 from jaxcloseup.geometry.union_warp import block_sources
 from jaxcloseup.scenes import load_scene
 from jaxcloseup.train import init_state
@@ -105,7 +106,7 @@ def test_an_arm_is_the_run_alone(preset, capture_folder):
 def test_an_arm_that_diverges_takes_no_other_down(capture_folder, capsys):
     with jax.numpy_dtype_promotion("standard"):
         programs, views, arms = begin(TINY_STEPS, capture_folder)
-        broken = (arms[1][0].replace(label_share=jnp.float32(jnp.nan)), *arms[1][1:])
+        broken = (arms[1][0].replace(label_loss_weight=jnp.float32(jnp.nan)), *arms[1][1:])
         both = []
         for second in (arms[1], broken):
             states, *data = stack_arms([arms[0], second, arms[2]], len(jax.devices()))
@@ -130,7 +131,7 @@ def sweep_tiny(scene, folder, arms=("baseline", "control", "diverse", "test_time
 def test_a_sweep_cut_off_and_resumed_ends_the_same(capture_folder, tmp_path, monkeypatch, capsys):
     scene = load_scene(str(capture_folder))
     programs = Programs(TINY_STEPS, scene)  # compiled once for both
-    monkeypatch.setattr(sweep_pipeline, "Programs", lambda preset, scene: programs)
+    monkeypatch.setattr(sweep_stages, "Programs", lambda preset, scene: programs)
     whole = sweep_tiny(scene, tmp_path / "sweep")
     assert list(whole) == ["baseline", "control", "diverse", "test_time"]
     assert all(list(of_arm) == ["0", "1"] for of_arm in whole.values())
@@ -228,7 +229,7 @@ def test_the_interval_is_that_of_the_mean():
         ("rgb_tolerance=nan", "rgb_tolerance takes no such value"),
         ("magnification=8:2", "magnification is a range"),
         ("magnification=0:4", "magnification lies between 1 and inf"),
-        ("label_share=1.5", "label_share lies between 0 and 1"),
+        ("label_loss_weight=1.5", "label_loss_weight lies between 0 and 1"),
         ("rate=-1", "rate lies between 0 and inf"),
         ("rate=1+rate=2", "sets rate twice"),
         ("mask+", "is not an arm"),
@@ -254,7 +255,7 @@ def parsed_flags():
         ({"arms": ["control", "control"]}, "--arms=control,control must name one or more"),
         ({"scenes": []}, "--scenes= must name one or more"),
         ({"arms": ["warm"]}, "--arms=warm is not an arm"),
-        ({"method": "nerf", "arms": ["label_share=0.3"]}, "this preset pools the losses"),
+        ({"method": "nerf", "arms": ["label_loss_weight=0.3"]}, "this preset pools the losses"),
         ({"method": "nerf", "arms": ["expected_depth=1"]}, "a NeRF has expected depth only"),
         ({"arms": ["expected_depth=2"]}, "expected_depth is 0"),
         ({"arms": ["depth_error=-1"]}, "depth_error is a part"),
@@ -276,8 +277,8 @@ def test_names_change_settings():
     settings = make_arm("rgb_tolerance=0.5+magnification=2:3", pseudo_settings(TINY)).settings
     assert float(settings.rgb_tolerance) == 0.5
     np.testing.assert_array_equal(settings.pose.magnification, [2, 3])
-    assert float(settings.label_share) == 0.5
-    assert float(make_arm("control", pseudo_settings(TINY)).settings.label_share) == 0
+    assert float(settings.label_loss_weight) == 0.5
+    assert float(make_arm("control", pseudo_settings(TINY)).settings.label_loss_weight) == 0
     arm = make_arm("expected_depth=1+look_at=1+num_sources=3", pseudo_settings(TINY))
     assert arm.expected_depth is True
     assert (arm.settings.pose.look_at, arm.settings.num_sources) == (1, 3)
@@ -295,7 +296,7 @@ def test_an_arm_may_have_labels_from_the_other_depth(capture_folder, tmp_path):
     scene = load_scene(str(capture_folder))
     arms = ["diverse", "expected_depth=0", "expected_depth=1"]
     names = {"method": "surfels", "preset": "tiny"}
-    preset = dataclasses.replace(TINY_SMOOTH, label_share=0.5)
+    preset = dataclasses.replace(TINY_SMOOTH, label_loss_weight=0.5)
     with jax.numpy_dtype_promotion("standard"):
         found, _ = run_sweep(scene, preset, arms, 1, tmp_path, names=names)
     as_ever, median, expected = (found[arm]["0"]["splits"]["test"]["psnr"] for arm in arms)

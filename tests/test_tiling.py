@@ -15,9 +15,9 @@ HEIGHT, WIDTH, TILE, BLOCK = 24, 37, 8, 4
 
 def random_boxes(count=40):
     rng = np.random.default_rng(0)
-    centre = rng.uniform(-10, 50, (count, 2))
+    center = rng.uniform(-10, 50, (count, 2))
     half = rng.exponential(4, (count, 2)) - 0.3  # some are empty
-    box = np.concatenate([centre - half, centre + half], axis=1).astype(np.float32)
+    box = np.concatenate([center - half, center + half], axis=1).astype(np.float32)
     box[0] = [-np.inf, -1e30, np.inf, 1e30]
     return box, rng.integers(1, 6, count).astype(np.float32)  # many ties
 

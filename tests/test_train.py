@@ -8,13 +8,13 @@ import plane
 import pytest
 from test_pseudo import settings
 
-from jaxcloseup.batch import sample_image, sample_pixels
 from jaxcloseup.field import RadianceField, Rendering
 from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_rays
+from jaxcloseup.photographs import sample_image, sample_pixels
 from jaxcloseup.train import (
     TrainConfig,
     init_state,
-    labelled_step,
+    labeled_step,
     pseudo_step,
     render_depths,
     run_steps,
@@ -25,8 +25,8 @@ from jaxcloseup.train import (
 RATE = 0.25
 
 
-def one_colour_field():
-    """A field of one trainable colour, whose depth is that of the plane: steps in closed form."""
+def one_color_field():
+    """A field of one trainable color, whose depth is that of the plane: steps in closed form."""
 
     def render(params, buffers, camera, pixels, key):
         if camera.intrinsics.ndim > 1:
@@ -65,7 +65,7 @@ def capture():
 @functools.cache
 def bind(step, **config):
     bound = functools.partial(
-        step, field=one_colour_field(), optimizer=optax.sgd(RATE), config=TrainConfig(**config)
+        step, field=one_color_field(), optimizer=optax.sgd(RATE), config=TrainConfig(**config)
     )
     return jax.jit(bound)
 
@@ -75,13 +75,13 @@ def fresh_state(seed=0):
         jax.random.key(seed),
         jnp.zeros((0, 3)),
         jnp.zeros((0, 3)),
-        field=one_colour_field(),
+        field=one_color_field(),
         optimizer=optax.sgd(RATE),
     )
 
 
 def drawn(state, views, count):
-    """The photographs' colours that a step of this state sees."""
+    """The photographs' colors that a step of this state sees."""
     key = jax.random.split(jax.random.fold_in(state.key, state.step), 4)[0]
     batch = sample_image(key, views) if count is None else sample_pixels(key, views, count)
     return batch.rgb.reshape(-1, 3)
@@ -102,7 +102,7 @@ def test_a_step_on_photographs_is_gradient_descent_on_their_pixels(capture, coun
 
 
 @pytest.mark.parametrize("count", [64, None])
-def test_when_nothing_is_labelled_half_the_photographs_loss_remains(capture, count):
+def test_when_nothing_is_labeled_half_the_photographs_loss_remains(capture, count):
     views, depths = capture
     state = fresh_state()
     step = bind(pseudo_step, num_rays=count, num_label_rays=count and 256)
@@ -153,10 +153,10 @@ def test_the_control_sees_the_same_photographs(capture):
     views, depths = capture
     state = fresh_state()
     step = bind(pseudo_step, num_rays=64, num_label_rays=256)
-    unlabelled, _ = step(state, views, depths, settings(rgb_tolerance=0.0))
+    unlabeled, _ = step(state, views, depths, settings(rgb_tolerance=0.0))
     control, _ = bind(train_step, num_rays=64)(state, views)
     half_way = (control.params - state.params) / 2
-    np.testing.assert_allclose(unlabelled.params - state.params, half_way, atol=1e-6)
+    np.testing.assert_allclose(unlabeled.params - state.params, half_way, atol=1e-6)
 
 
 @pytest.mark.parametrize("pooled", [False, True])
@@ -164,7 +164,7 @@ def test_a_share_of_nothing_is_the_control(capture, pooled):
     views, depths = capture
     state = fresh_state()
     step = bind(pseudo_step, num_rays=64, num_label_rays=256, pooled_loss=pooled)
-    arm, metrics = step(state, views, depths, settings(label_share=0.0, use_mask=0.0))
+    arm, metrics = step(state, views, depths, settings(label_loss_weight=0.0, use_mask=0.0))
     assert metrics["label_coverage"] > 0
     control, _ = bind(train_step, num_rays=64)(state, views)
     np.testing.assert_allclose(arm.params, control.params, atol=1e-6)
@@ -183,13 +183,13 @@ def test_the_rate_scales_what_a_step_with_labels_changes(capture):
 
 @pytest.mark.parametrize("count", [64, None])
 @pytest.mark.parametrize("share", [0.0, 0.25])
-def test_labelled_views_count_with_their_share(capture, count, share):
+def test_labeled_views_count_with_their_share(capture, count, share):
     views, _ = capture
     white = jnp.zeros(views.weight.shape).at[:, :, :5].set(1)
     labels = views.replace(rgb=jnp.where(white[..., None] > 0, 1.0, 0.3), weight=white)
     state = fresh_state()
-    step = bind(labelled_step, num_rays=count, num_label_rays=count and 4096)
-    after, metrics = step(state, views, labels, settings(label_share=share))
+    step = bind(labeled_step, num_rays=count, num_label_rays=count and 4096)
+    after, metrics = step(state, views, labels, settings(label_loss_weight=share))
     photographs = drawn(state, views, count).mean(axis=0)
     pull = (1 - share) * (state.params - photographs) + share * (state.params - 1)
     np.testing.assert_allclose(after.params, state.params - RATE * 2 * pull, atol=1e-6)
@@ -239,7 +239,7 @@ def test_depths_are_undefined_where_the_field_is_thin_or_out_of_range(capture):
         assert key is None
         return Rendering(jnp.zeros((*depth.shape, 3)), depth, alpha)
 
-    field = one_colour_field()._replace(render=render)
+    field = one_color_field()._replace(render=render)
     result = render_depths(field, None, (), views.cameras, near=2, far=4)
     expected = np.where((alpha >= 0.5) & (depth >= 2) & (depth <= 4), depth, 0)
     np.testing.assert_array_equal(result, np.stack([expected] * 3))

@@ -3,9 +3,10 @@ import numpy as np
 import pytest
 from tiny_capture import write_image, write_json
 
-from jaxcloseup.scenes import captures, load_scene
-from jaxcloseup.scenes.errors import DuplicateFileWarning
-from jaxcloseup.scenes.triangulation import triangulate
+from jaxcloseup.captures import loading
+from jaxcloseup.captures.triangulation import triangulate
+from jaxcloseup.scene import DuplicateFileWarning
+from jaxcloseup.scenes import load_scene
 
 
 WIDTH, HEIGHT, FOCAL = 240, 180, 200.0
@@ -27,9 +28,9 @@ def views():
     for i in range(4):
         rotation = cv2.Rodrigues(np.array([0.03 * i, -0.1 * i + 0.15, 0.05 * i]))[0]
         position = np.array([0.6 * i - 0.9, 0.1 * i, 0.2 * i])
-        centre = [[FOCAL, 0, LENS[2] - 0.5], [0, FOCAL, LENS[3] - 0.5], [0, 0, 1]]
+        center = [[FOCAL, 0, LENS[2] - 0.5], [0, FOCAL, LENS[3] - 0.5], [0, 0, 1]]
         towards = plane - np.array([[0, 0, 1.0]]) * position[:, None]
-        images.append(cv2.warpPerspective(texture, centre @ rotation.T @ towards, (WIDTH, HEIGHT)))
+        images.append(cv2.warpPerspective(texture, center @ rotation.T @ towards, (WIDTH, HEIGHT)))
         poses.append(np.column_stack([rotation, position]))
     return images, np.array(poses)
 
@@ -84,7 +85,7 @@ def test_a_capture_without_points_gets_some(tmp_path, views):
 
 def test_a_handful_of_points_is_none(tmp_path, views, monkeypatch):
     few = np.ones((99, 3), np.float32)
-    monkeypatch.setattr(captures, "triangulate", lambda *_: (few, few))
+    monkeypatch.setattr(loading, "triangulate", lambda *_: (few, few))
     write_image(tmp_path / "a.png", views[0][0])
     pose = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist(), "fl_x": FOCAL}
     with pytest.warns(DuplicateFileWarning):

@@ -17,7 +17,7 @@ warp = jax.jit(union_warp)
 
 @pytest.fixture(scope="module")
 def capture():
-    """Three cameras around random depths, some undefined, with random 8-bit colours."""
+    """Three cameras around random depths, some undefined, with random 8-bit colors."""
     keys = jax.random.split(jax.random.key(3), 5)
     rotations = euler_to_matrix(jax.random.uniform(keys[0], (VIEWS, 3), minval=-0.3, maxval=0.3))
     positions = jax.random.uniform(keys[1], (VIEWS, 3, 1), minval=-0.4, maxval=0.4)
@@ -41,7 +41,7 @@ def capture():
 
 def by_oracle(cameras, depths, rgb, weight, virtual):
     """Lift and project every pixel on its own, then draw them one after the other."""
-    colours, pixels, depth = [], [], []
+    colors, pixels, depth = [], [], []
     grid = np.stack(np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5), axis=-1)
     for view in range(VIEWS):
         there = np.asarray((depths[view] > 0) & (weight[view] > 0))
@@ -51,10 +51,10 @@ def by_oracle(cameras, depths, rgb, weight, virtual):
             cameras.camtoworld[view], cameras.intrinsics[view], grid[there], depths[view][there]
         )
         landed, z = reference.project(virtual.camtoworld, virtual.intrinsics, points)
-        colours.append(np.asarray(rgb[view])[there])
+        colors.append(np.asarray(rgb[view])[there])
         pixels.append(landed)
         depth.append(z)
-    return reference.forward_warp(*map(np.concatenate, (colours, pixels, depth)), (HEIGHT, WIDTH))
+    return reference.forward_warp(*map(np.concatenate, (colors, pixels, depth)), (HEIGHT, WIDTH))
 
 
 def test_every_pixel_matches_the_oracle(capture):

@@ -13,8 +13,8 @@ from browser import free_port, open_browser
 from tiny_runs import TINY
 
 from experiments import view as program
-from experiments.finished import load_run_scene, read_run, restore
-from experiments.loop import Programs, TrainingError
+from experiments.training.loop import Programs, TrainingError
+from experiments.training.stored_run import load_run_scene, read_run, restore
 
 
 HAS = "return document.body.innerText.includes(arguments[0])"
@@ -39,14 +39,15 @@ def viser():
 @pytest.fixture
 def serve(viser):
     """Serve a state at a free port; returns the page and its address."""
-    from experiments import serving, viewer
+    from experiments.viewing.page import Viewer
+    from experiments.viewing.server import serve
 
     servers = []
 
     def call(programs, state):
         port = free_port()
-        servers.append(serving.serve("127.0.0.1", port))
-        page = viewer.Viewer(servers[0], programs, state, stage="closeup", seed=0)
+        servers.append(serve("127.0.0.1", port))
+        page = Viewer(servers[0], programs, state, stage="closeup", seed=0)
         return page, f"http://127.0.0.1:{port}"
 
     with jax.numpy_dtype_promotion("standard"):
@@ -60,7 +61,7 @@ def test_a_closeup_is_chosen_and_rendered_in_a_browser(serve, kept, monkeypatch)
         assert depths.shape == programs.scene.train.weight.shape and shots.names == ["closeup"]
         return state.replace(params=state.params.replace(sh=state.params.sh - 1))
 
-    monkeypatch.setattr("experiments.viewer.fine_tune", darker)
+    monkeypatch.setattr("experiments.viewing.page.fine_tune", darker)
     with open_browser() as browser:
         record = read_run(kept)
         programs, state = restore(record, load_run_scene(record), "closeup")
@@ -111,9 +112,9 @@ def test_failures_are_said_on_the_page_which_goes_on(serve, kept, capsys):
 
 
 def test_nothing_is_ever_shared(viser):
-    from experiments import serving
+    from experiments.viewing.server import serve
 
-    server = serving.serve("127.0.0.1", free_port())
+    server = serve("127.0.0.1", free_port())
     assert server.request_share_url() is None
     assert server._share_tunnel is None
     server.stop()
@@ -143,7 +144,7 @@ def test_mistakes_are_one_sentence(run, viser):
 
 def test_without_viser_the_extra_is_named(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    for name in ("experiments.serving", "experiments.viewer"):
+    for name in ("experiments.viewing.server", "experiments.viewing.page"):
         monkeypatch.delitem(sys.modules, name, raising=False)
         monkeypatch.delattr(name, raising=False)
     with pytest.raises(SystemExit, match='install jaxcloseup with the extra "viewer"'):

@@ -26,7 +26,7 @@ def sources(key, count=300):
 
 
 @pytest.mark.parametrize("order", [0, 1])
-def test_reading_pixel_centres_gives_the_image(image, order):
+def test_reading_pixel_centers_gives_the_image(image, order):
     np.testing.assert_allclose(
         backward_warp(image, pixel_grid(HEIGHT, WIDTH), order=order), image, atol=1e-6
     )

@@ -26,7 +26,7 @@ def capture(tmp_path):
 
 
 @pytest.mark.parametrize("zoom", [2, 3, 4])
-def test_rays_of_all_pixels_meet_their_colours(capture, zoom):
+def test_rays_of_all_pixels_meet_their_colors(capture, zoom):
     """No part of a pixel is lost, whatever rests the sides leave."""
     scene = load_scene(capture, split="zoom", zoom=zoom)
     assert scene.names["test_far"] == ["00", "08", "16"] and len(scene.train) == 16
@@ -60,12 +60,12 @@ def test_zoom_comes_on_top_of_downscale(capture):
 
 
 def test_a_photograph_is_decoded_once_and_nobody_is_warned(capture, monkeypatch):
-    from jaxcloseup.scenes import photographs
+    from jaxcloseup.captures import photo_reading
 
-    read, decode = [], photographs.read_image
+    read, decode = [], photo_reading.read_image
     monkeypatch.setenv("XDG_CACHE_HOME", str(capture / "cache"))
     monkeypatch.setattr(
-        photographs,
+        photo_reading,
         "read_image",
         lambda path, *a, **k: read.append(path.name) or decode(path, *a, **k),
     )

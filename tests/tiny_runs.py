@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import plane
 
-from experiments.loop import Programs
-from experiments.manifest import about_scene, write_manifest
-from experiments.pipeline import config
-from experiments.presets import QUICK, QUICK_SURFELS
+from experiments.methods.presets import QUICK, QUICK_SURFELS
+from experiments.training.loop import Programs
+from experiments.training.manifest import about_scene, write_manifest
+from experiments.training.stages import config
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.scenes import load_scene
 from jaxcloseup.splats import RasterizeConfig

@@ -14,14 +14,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.audit import audit_labels, resolved_by_photographs
-from experiments.evaluation import exact_depths
-from experiments.pictures import label_pictures
-from experiments.presets import PRESETS, pseudo_settings
-from jaxcloseup.batch import camera_at, to_float
+from experiments.evaluation.audit import audit_labels, resolved_by_photographs
+from experiments.evaluation.scores import exact_depths
+from experiments.methods.presets import PRESETS, pseudo_settings
+from experiments.reporting.pictures import label_pictures
 from jaxcloseup.metrics import psnr
+from jaxcloseup.photographs import camera_at, to_float
+from jaxcloseup.procedural.loading import PROCEDURAL_SCENES
 from jaxcloseup.scenes import Scene, load_scene
-from jaxcloseup.scenes.procedural import PROCEDURAL_SCENES
 
 
 DOWNSCALE = 4

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import optax
 
 from experiments.benchmarks.timing import interleaved_medians
-from jaxcloseup.batch import Batch
 from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.photographs import Batch
 from jaxcloseup.rendered_loss import rendered_loss
 from jaxcloseup.volume.nerf import NerfConfig, nerf
 

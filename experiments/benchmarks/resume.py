@@ -19,7 +19,7 @@ COMMAND = (
     "-m",
     "experiments.run",
     "--scene=table",
-    "--baseline_steps=700",  # relocations, harmonics and regularisers begin before
+    "--baseline_steps=700",  # relocations, harmonics and regularizers begin before
     "--closeup_steps=20",
     "--save_every=50",
 )

@@ -17,10 +17,10 @@ import jax.numpy as jnp
 from jax import lax
 
 from experiments.benchmarks.timing import interleaved_medians
-from experiments.evaluation import exact_depths
-from jaxcloseup.batch import to_float
+from experiments.evaluation.scores import exact_depths
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points
 from jaxcloseup.numerics import safe_divide, safe_norm
+from jaxcloseup.photographs import to_float
 from jaxcloseup.scenes import load_scene
 from jaxcloseup.splats import RasterizeConfig, render_surfels, surfels_from_points
 from jaxcloseup.splats.kernel import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
@@ -147,7 +147,7 @@ def _wall(count, size):
 
 
 def _loss(render, surfels, camera):
-    """Every output counts, as when training with all regularisers."""
+    """Every output counts, as when training with all regularizers."""
     rgb, depth, normal, distortion = render(surfels, camera)
     loss = jnp.mean((rgb - 0.4) ** 2) + 0.05 * jnp.mean((depth - 3) ** 2)
     return loss + 0.05 * jnp.mean(normal[..., 2]) + 0.1 * jnp.mean(distortion)
@@ -162,8 +162,8 @@ def _render(surfels, camera, config):
 def _footprints(surfels, camera, config):
     discs, normals = to_camera(surfels, camera)
     offset = surfels.means - camera.position[None]
-    colours = sh_to_rgb(surfels.sh, offset / safe_norm(offset, keepdims=True))
-    payload = jnp.concatenate([colours, normals], axis=-1)
+    colors = sh_to_rgb(surfels.sh, offset / safe_norm(offset, keepdims=True))
+    payload = jnp.concatenate([colors, normals], axis=-1)
     opacity = jax.nn.sigmoid(surfels.opacity_logits)
     return project_discs(discs, opacity, payload, camera, near=config.near)
 

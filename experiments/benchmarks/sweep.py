@@ -4,19 +4,19 @@ import functools
 
 import jax
 
-from experiments.arms import make_arm
 from experiments.benchmarks.timing import interleaved_medians
-from experiments.loop import Programs
-from experiments.pipeline import rendered_depths
-from experiments.presets import PRESETS, initial_points, pseudo_settings
-from experiments.sweep_pipeline import stack_arms
+from experiments.methods.presets import PRESETS, initial_points, pseudo_settings
+from experiments.training.arms import make_arm
+from experiments.training.loop import Programs
+from experiments.training.stages import rendered_depths
+from experiments.training.sweep import stack_arms
 from jaxcloseup.geometry.union_warp import block_sources
 from jaxcloseup.scenes import load_scene
 from jaxcloseup.train import init_state
 
 
 ARMS = ("control", "labels", "mask", "diverse")
-GRID = ("rgb_tolerance=0.02", "depth_tolerance=0.005", "label_share=0.5", "magnification=2:4")
+GRID = ("rgb_tolerance=0.02", "depth_tolerance=0.005", "label_loss_weight=0.5", "magnification=2:4")
 BEGUN, STEPS = 100, 5  # steps before measuring, and in one measurement
 
 

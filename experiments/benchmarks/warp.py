@@ -84,8 +84,8 @@ def _depth(camera):
     down = directions[..., 2]
     ground = jnp.where(down < 0, -origins[..., 2] / jnp.where(down < 0, down, -1), jnp.inf)
 
-    def sphere(centre, radius, sign):
-        offset = origins - jnp.array(centre).reshape(1, 1, 3)
+    def sphere(center, radius, sign):
+        offset = origins - jnp.array(center).reshape(1, 1, 3)
         a = jnp.sum(directions**2, axis=-1)
         b = jnp.sum(offset * directions, axis=-1)
         c = jnp.sum(offset**2, axis=-1) - radius**2
@@ -111,11 +111,11 @@ def _numpy_loop(points, rgb, camera):
             u, v = fx * x / z + cx, fy * y / z + cy
         lands = (z > 0) & (u >= 0) & (u < WIDTH) & (v >= 0) & (v < HEIGHT)
         target = v[lands].astype(np.int64) * WIDTH + u[lands].astype(np.int64)
-        z, colours = z[lands], view_rgb.reshape(-1, 3)[lands]
+        z, colors = z[lands], view_rgb.reshape(-1, 3)[lands]
         nearest = depth.copy()
         np.minimum.at(nearest, target, z)
         wins = (z == nearest[target]) & (z < depth[target])
-        image[target[wins]], depth = colours[wins], nearest
+        image[target[wins]], depth = colors[wins], nearest
     return image.reshape(HEIGHT, WIDTH, 3), depth.reshape(HEIGHT, WIDTH)
 
 

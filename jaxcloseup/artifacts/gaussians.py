@@ -1,4 +1,4 @@
-"""Surfels as the 3-D Gaussians that viewers know: discs with a thickness, of one colour each."""
+"""Surfels as the 3-D Gaussians that viewers know: discs with a thickness, of one color each."""
 
 from typing import NamedTuple
 

@@ -1,6 +1,6 @@
-"""Pictures: PNG files, colour maps for depth, error, normals and support, panels side by side.
+"""Pictures: PNG files, color maps for depth, error, normals and support, panels side by side.
 
-Images are `[H, W, 3]`, red first, or `[H, W]` grey; floats in [0, 1] or uint8; NumPy or JAX arrays.
+Images are `[H, W, 3]`, red first, or `[H, W]` gray; floats in [0, 1] or uint8; NumPy or JAX arrays.
 """
 
 import base64
@@ -59,9 +59,9 @@ def colorize_depth(
     far: float | None = None,
     valid: Image | None = None,
 ) -> np.ndarray:
-    """Depth in false colours, uint8 `[H, W, 3]`: near is red, far is blue, nothing is black.
+    """Depth in false colors, uint8 `[H, W, 3]`: near is red, far is blue, nothing is black.
 
-    Colours follow inverse depth, so that what is near keeps most of them.
+    Colors follow inverse depth, so that what is near keeps most of them.
 
     Args:
       depth: `[H, W]` z-depth; what is not positive and finite is nothing.
@@ -83,18 +83,18 @@ def colorize_depth(
 
 
 def colorize_error(error: Image, *, highest: float = 0.25) -> np.ndarray:
-    """Absolute error in false colours, uint8 `[H, W, 3]`: black is none, bright yellow is much.
+    """Absolute error in false colors, uint8 `[H, W, 3]`: black is none, bright yellow is much.
 
     Args:
       error: `[H, W]`, or `[H, W, 3]` to be averaged over channels; signs do not matter.
-      highest: the error of the brightest colour, fixed so that pictures compare.
+      highest: the error of the brightest color, fixed so that pictures compare.
     """
     error = np.abs(np.asarray(error, np.float64))
     return _map((error.mean(-1) if error.ndim == 3 else error) / highest, cv2.COLORMAP_INFERNO)
 
 
 def colorize_normals(normal: Image) -> np.ndarray:
-    """Normals in false colours, uint8 `[H, W, 3]`: (n + 1) / 2; where there is none, black.
+    """Normals in false colors, uint8 `[H, W, 3]`: (n + 1) / 2; where there is none, black.
 
     Args:
       normal: `[H, W, 3]` of any length; those of length 0 are none.
@@ -108,7 +108,7 @@ def colorize_normals(normal: Image) -> np.ndarray:
 def colorize_support(count: Image, footprint: Image) -> np.ndarray:
     """Two panels, how sharply and by how many photographs pixels were seen, with legends below.
 
-    Pixels that nobody saw are magenta in both, the one colour that the maps do not have.
+    Pixels that nobody saw are magenta in both, the one color that the maps do not have.
 
     Args:
       count: `[H, W]` photographs that saw the pixel.
@@ -126,13 +126,13 @@ def colorize_support(count: Image, footprint: Image) -> np.ndarray:
         (-count, (-9, -5, -3, -2), "1"),
     ):
         step = np.searchsorted(np.array(steps) * (1 + 1e-4 * np.sign(steps)), values)
-        colours = _map(np.linspace(0.95, 0.1, len(steps) + 1), cv2.COLORMAP_VIRIDIS)
-        colours = np.concatenate([colours.reshape(-1, 3), [_UNSEEN]]).astype(np.uint8)
-        image = colours[np.where(unseen, len(steps) + 1, step)]
+        colors = _map(np.linspace(0.95, 0.1, len(steps) + 1), cv2.COLORMAP_VIRIDIS)
+        colors = np.concatenate([colors.reshape(-1, 3), [_UNSEEN]]).astype(np.uint8)
+        image = colors[np.where(unseen, len(steps) + 1, step)]
         factor = -(-_LEGEND_WIDTH // image.shape[1])
         image = image.repeat(factor, axis=0).repeat(factor, axis=1)
         texts = [f"<={s}" if s > 0 else f">={-s}" for s in steps] + [last, "unseen"]
-        panels.append(np.concatenate([image, _legend(colours, texts, image.shape[1])]))
+        panels.append(np.concatenate([image, _legend(colors, texts, image.shape[1])]))
     titles = ["finest photograph's pixel, in pixels here", "photographs that saw it"]
     return side_by_side(panels, labels=titles)
 
@@ -156,10 +156,10 @@ def side_by_side(
     return row
 
 
-def _map(unit: np.ndarray, colours: int) -> np.ndarray:
-    """Colours of values in [0, 1]; OpenCV's maps come blue first."""
+def _map(unit: np.ndarray, colors: int) -> np.ndarray:
+    """Colors of values in [0, 1]; OpenCV's maps come blue first."""
     levels = np.rint(np.clip(np.nan_to_num(unit), 0, 1) * 255).astype(np.uint8)
-    return cv2.applyColorMap(levels, colours)[..., ::-1]
+    return cv2.applyColorMap(levels, colors)[..., ::-1]
 
 
 def _label(text: str, width: int) -> np.ndarray:
@@ -172,13 +172,13 @@ def _label(text: str, width: int) -> np.ndarray:
     return cv2.putText(strip, text, (2, 17), font, scale, (0, 0, 0), 1, cv2.LINE_AA)
 
 
-def _legend(colours, texts, width):
-    """A strip of boxes of the colours, each with its text."""
+def _legend(colors, texts, width):
+    """A strip of boxes of the colors, each with its text."""
     edges = np.linspace(0, width, len(texts) + 1).astype(int)
     boxes = []
-    for colour, text, left, right in zip(colours, texts, edges, edges[1:], strict=False):
+    for color, text, left, right in zip(colors, texts, edges, edges[1:], strict=False):
         box = np.full((_LABEL_HEIGHT, right - left, 3), 255, np.uint8)
-        box[4:-4, 2:14] = colour
+        box[4:-4, 2:14] = color
         box[:, 14:] = _label(text, right - left - 14)
         boxes.append(box)
     return np.concatenate(boxes, axis=1)

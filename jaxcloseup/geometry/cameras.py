@@ -1,7 +1,7 @@
 """Pinhole cameras: pixels to rays to points, and back.
 
 The camera frame is OpenCV's (x right, y down, z forward) and poses are camera-to-world. Pixels are
-continuous (x, y) with the centre of the top-left pixel at (0.5, 0.5). Depth is z-depth in world
+continuous (x, y) with the center of the top-left pixel at (0.5, 0.5). Depth is z-depth in world
 units; ray directions have unit camera-z, so the parameter along a ray *is* the depth.
 
 Functions take one camera and any number of pixels or points `[...]`; batch cameras with `jax.vmap`.
@@ -38,12 +38,12 @@ class Camera:
 
     @property
     def position(self) -> jax.Array:
-        """`[..., 3]` centre of projection, world units."""
+        """`[..., 3]` center of projection, world units."""
         return self.camtoworld[..., 3]
 
 
 def pixel_grid(height: int, width: int) -> jax.Array:
-    """Centres of all pixels, `[height, width, 2]` as (x, y)."""
+    """Centers of all pixels, `[height, width, 2]` as (x, y)."""
     x, y = jnp.meshgrid(jnp.arange(0.5, width), jnp.arange(0.5, height))
     return jnp.stack([x, y], axis=-1)
 
@@ -60,8 +60,8 @@ def pixels_to_rays(camera: Camera, pixels: jax.Array) -> tuple[jax.Array, jax.Ar
     """
     _check_camera(camera)
     chex.assert_axis_dimension(pixels, -1, 2)
-    focal, centre = camera.intrinsics[:2], camera.intrinsics[2:]
-    xy = (pixels - _match(centre, pixels)) / _match(focal, pixels)
+    focal, center = camera.intrinsics[:2], camera.intrinsics[2:]
+    xy = (pixels - _match(center, pixels)) / _match(focal, pixels)
     in_camera = jnp.concatenate([xy, jnp.ones_like(xy[..., :1])], axis=-1)
     directions = matmul(in_camera, camera.rotation.T)
     return jnp.broadcast_to(camera.position, directions.shape), directions
@@ -91,8 +91,8 @@ def points_to_pixels(camera: Camera, points: jax.Array) -> tuple[jax.Array, jax.
     depth = in_camera[..., 2]
     in_front = depth > jnp.finfo(depth.dtype).eps
     xy = in_camera[..., :2] / jnp.where(in_front, depth, 1)[..., None]
-    focal, centre = camera.intrinsics[:2], camera.intrinsics[2:]
-    return xy * _match(focal, xy) + _match(centre, xy), depth
+    focal, center = camera.intrinsics[:2], camera.intrinsics[2:]
+    return xy * _match(focal, xy) + _match(center, xy), depth
 
 
 def _check_camera(camera: Camera) -> None:

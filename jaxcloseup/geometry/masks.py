@@ -33,7 +33,7 @@ def depth_consistent(
 
 
 def rgb_consistent(a: jax.Array, b: jax.Array, tolerance: jax.Array | float) -> jax.Array:
-    """Whether two colours `[..., 3]` differ by less than `tolerance` in every channel: `[...]`.
+    """Whether two colors `[..., 3]` differ by less than `tolerance` in every channel: `[...]`.
 
     The paper's mask M, |I' - I*| < epsilon.
     """

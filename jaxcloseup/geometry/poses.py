@@ -44,7 +44,7 @@ def closeup_position(
 
 
 def sample_anchor(key: jax.Array, depth: jax.Array, weight: jax.Array) -> jax.Array:
-    """Draw a pixel centre `[2]` with probability proportional to `weight`; `key` is consumed.
+    """Draw a pixel center `[2]` with probability proportional to `weight`; `key` is consumed.
 
     Args:
       key: random key.
@@ -52,7 +52,7 @@ def sample_anchor(key: jax.Array, depth: jax.Array, weight: jax.Array) -> jax.Ar
       weight: `[H, W]` not negative; pixels of weight 0 are never drawn.
 
     Returns:
-      (x, y) of a pixel centre; the top-left one if no pixel can be drawn.
+      (x, y) of a pixel center; the top-left one if no pixel can be drawn.
     """
     chex.assert_rank([depth, weight], 2)
     chex.assert_equal_shape([depth, weight])
@@ -67,7 +67,7 @@ def sample_anchor(key: jax.Array, depth: jax.Array, weight: jax.Array) -> jax.Ar
 def four_anchors(height: int, width: int) -> jax.Array:
     """Anchor weights `[height, width]` of the paper's ablation without diverse poses.
 
-    One at the centre of each quadrant, 0 elsewhere: the `weight` of `sample_closeup_camera`, with
+    One at the center of each quadrant, 0 elsewhere: the `weight` of `sample_closeup_camera`, with
     magnification (4, 4) and max_angle 0.
     """
     rows = jnp.array([height // 4, height // 4, 3 * height // 4, 3 * height // 4])
@@ -80,7 +80,7 @@ def perturb_rotation(
 ) -> jax.Array:
     """Turn a camera by a uniform offset of each Euler angle: e' = e + U(-eps, eps), `[3, 3]`.
 
-    The text prints the interval as centred on e; like the released script, it is centred on 0.
+    The text prints the interval as centered on e; like the released script, it is centered on 0.
     """
     chex.assert_shape(rotation, (3, 3))
     offset = jax.random.uniform(key, (3,), rotation.dtype, -1, 1) * max_angle

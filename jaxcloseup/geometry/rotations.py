@@ -45,7 +45,7 @@ def matrix_to_euler(rotation: jax.Array) -> jax.Array:
 
 
 def quaternion_to_matrix(wxyz: jax.Array) -> jax.Array:
-    """Rotation matrices `[..., 3, 3]` of quaternions `[..., 4]`, which are normalised here.
+    """Rotation matrices `[..., 3, 3]` of quaternions `[..., 4]`, which are normalized here.
 
     The zero quaternion gives the identity, with finite gradients.
     """

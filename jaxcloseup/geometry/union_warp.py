@@ -33,14 +33,14 @@ class SourceBlocks:
       depth: `[N, P]` z-depth in the pixel's own view, 0 where undefined.
       view: `[N]` int32 which view the block is of.
       corner: `[N, 2]` int32 (x, y) index of its top-left pixel.
-      centre: `[N, 3]` world centre of a sphere that holds the block's points.
+      center: `[N, 3]` world center of a sphere that holds the block's points.
       radius: `[N]` radius of that sphere; negative where no pixel has a depth.
     """
 
     depth: jax.Array
     view: jax.Array
     corner: jax.Array
-    centre: jax.Array
+    center: jax.Array
     radius: jax.Array
 
 
@@ -77,12 +77,12 @@ def block_sources(
         low = jnp.min(jnp.where(there, points, jnp.inf), axis=1)
         high = jnp.max(jnp.where(there, points, -jnp.inf), axis=1)
         empty = ~jnp.any(there, axis=1)
-        centre = jnp.where(empty, 0, (low + high) / 2)
-        distance = jnp.linalg.norm(points - centre[:, None], axis=-1)
+        center = jnp.where(empty, 0, (low + high) / 2)
+        distance = jnp.linalg.norm(points - center[:, None], axis=-1)
         radius = jnp.max(jnp.where(there[..., 0], distance, 0), axis=1)
-        return depth, centre, jnp.where(empty[:, 0], -1, radius)
+        return depth, center, jnp.where(empty[:, 0], -1, radius)
 
-    depth, centre, radius = jax.lax.map(lambda one: blocks_of_view(*one), (cameras, depths))
+    depth, center, radius = jax.lax.map(lambda one: blocks_of_view(*one), (cameras, depths))
     view, row, column = jnp.meshgrid(
         *(jnp.arange(size, dtype=jnp.int32) for size in (num_views, rows, columns)), indexing="ij"
     )
@@ -90,7 +90,7 @@ def block_sources(
         depth=depth.reshape(-1, BLOCK * BLOCK),
         view=view.reshape(-1),
         corner=jnp.stack([column, row], axis=-1).reshape(-1, 2) * BLOCK,
-        centre=centre.reshape(-1, 3),
+        center=center.reshape(-1, 3),
         radius=radius.reshape(-1),
     )
 
@@ -202,12 +202,12 @@ def _one_after_the_other(size, batched, *arguments):
 
 def _may_land(sources, camera):
     """Whether a block's sphere reaches into the frustum of the camera, `[N]`."""
-    x, y, z = matmul(sources.centre - camera.position[None], camera.rotation).T
+    x, y, z = matmul(sources.center - camera.position[None], camera.rotation).T
     fx, fy, cx, cy = camera.intrinsics
 
-    def inside(across, focal, centre):
+    def inside(across, focal, center):
         # Distance from the frustum's side: positive inside, so that a sphere may reach in.
-        return (focal * across + centre * z) / jnp.hypot(focal, centre) >= -sources.radius
+        return (focal * across + center * z) / jnp.hypot(focal, center) >= -sources.radius
 
     return (
         (sources.radius >= 0)

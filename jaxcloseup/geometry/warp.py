@@ -1,6 +1,6 @@
 """Moving pixels between views: backward (read where a point projects) and forward (z-buffer).
 
-Images are `[H, W, C]`; pixels are continuous (x, y) with the top-left centre at (0.5, 0.5).
+Images are `[H, W, C]`; pixels are continuous (x, y) with the top-left center at (0.5, 0.5).
 """
 
 from typing import NamedTuple

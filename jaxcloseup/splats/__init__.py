@@ -1,4 +1,4 @@
-"""Differentiable 2-D Gaussian splatting in plain JAX: discs, projection, a tile rasteriser."""
+"""Differentiable 2-D Gaussian splatting in plain JAX: discs, projection, a tile rasterizer."""
 
 from jaxcloseup.splats.rasterize import RasterizeConfig
 from jaxcloseup.splats.render import SurfelAux, render_surfels

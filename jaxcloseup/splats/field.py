@@ -15,10 +15,10 @@ from flax import struct
 
 from jaxcloseup.field import RadianceField, Rendering
 from jaxcloseup.geometry.cameras import Camera
-from jaxcloseup.metrics import fit_colours, ssim
+from jaxcloseup.metrics import fit_colors, ssim
 from jaxcloseup.numerics import matmul, safe_divide
-from jaxcloseup.splats.adaptive_density import (
-    AdaptiveDensityConfig,
+from jaxcloseup.splats.adaptive import (
+    AdaptiveConfig,
     ProbedSurfels,
     apply_probe,
     measure_pull,
@@ -26,7 +26,7 @@ from jaxcloseup.splats.adaptive_density import (
     reset_opacities,
     with_probe,
 )
-from jaxcloseup.splats.density_control import DensityConfig, relocate, wander
+from jaxcloseup.splats.mcmc import McmcConfig, relocate, wander
 from jaxcloseup.splats.rasterize import RasterizeConfig
 from jaxcloseup.splats.regularizers import (
     depth_to_normal,
@@ -37,7 +37,7 @@ from jaxcloseup.splats.render import SurfelAux, render_surfels
 from jaxcloseup.splats.surfels import Surfels, surfels_from_points
 
 
-_UNCHANGED_SHARE = 0.3  # of the loss of colours as they are, where images may change them
+_UNCHANGED_SHARE = 0.3  # of the loss of colors as they are, where images may change them
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,28 +46,28 @@ class SurfelConfig:
 
     Attributes:
       capacity: how many surfels there can be.
-      sh_degree: of the colour's spherical harmonics.
+      sh_degree: of the color's spherical harmonics.
       sh_every: steps after which one more degree is drawn.
       initial_opacity: of surfels at the initial points.
       depth: "median" or "expected": what the field calls depth, labels are made with, and normals
         are held against; arms of a sweep may have labels from the other.
-      background: grey level in [0, 1] behind the scene; None is black.
-      colour_ridge: in training each image may change its colours by an affine map, to which this
-        is the resistance, see `fit_colours`; None allows none. Rendered images have no such change:
-        a part of the loss holds their colours to the photographs' as they are.
+      background: gray level in [0, 1] behind the scene; None is black.
+      color_ridge: in training each image may change its colors by an affine map, to which this
+        is the resistance, see `fit_colors`; None allows none. Rendered images have no such change:
+        a part of the loss holds their colors to the photographs' as they are.
       ssim_weight: share of 1 - SSIM in the loss; the rest is the absolute difference.
       normal_weight: of the disagreement between normals and depth.
       distortion_weight: of the spread of light along a ray, for a mean depth of 1.
-      regularise_from: step from which these two count.
+      regularize_from: step from which these two count.
       opacity_weight: of the mean opacity.
       scale_weight: of the mean scale.
-      means_rate: learning rate of the means, first and at `decay_steps`.
-      decay_steps: see `means_rate`; it stays there.
-      late_rate: factor on all learning rates from `decay_steps` on.
-      sh_rate, opacity_rate, scale_rate, rotation_rate: Adam's; 1/20 of `sh_rate` for what depends
+      means_lr: learning rate of the means, first and at `decay_steps`.
+      decay_steps: see `means_lr`; it stays there.
+      late_lr_scale: factor on all learning rates from `decay_steps` on.
+      sh_lr, opacity_lr, scale_lr, rotation_lr: Adam's; 1/20 of `sh_lr` for what depends
         on the direction.
       density: when surfels move, appear and vanish, by either rule; None for never.
-      raster: static sizes of the rasteriser.
+      raster: static sizes of the rasterizer.
     """
 
     capacity: int = 200_000
@@ -76,23 +76,21 @@ class SurfelConfig:
     initial_opacity: float = 0.5
     depth: str = "median"
     background: float | None = None
-    colour_ridge: float | None = None
+    color_ridge: float | None = None
     ssim_weight: float = 0.2
     normal_weight: float = 0.05
     distortion_weight: float = 1.0
-    regularise_from: int = 3000
+    regularize_from: int = 3000
     opacity_weight: float = 0.01
     scale_weight: float = 0.01
-    means_rate: tuple[float, float] = (1.6e-4, 1.6e-6)
+    means_lr: tuple[float, float] = (1.6e-4, 1.6e-6)
     decay_steps: int = 30_000
-    late_rate: float = 1.0
-    sh_rate: float = 2.5e-3
-    opacity_rate: float = 5e-2
-    scale_rate: float = 5e-3
-    rotation_rate: float = 1e-3
-    density: DensityConfig | AdaptiveDensityConfig | None = dataclasses.field(
-        default_factory=DensityConfig
-    )
+    late_lr_scale: float = 1.0
+    sh_lr: float = 2.5e-3
+    opacity_lr: float = 5e-2
+    scale_lr: float = 5e-3
+    rotation_lr: float = 1e-3
+    density: McmcConfig | AdaptiveConfig | None = dataclasses.field(default_factory=McmcConfig)
     raster: RasterizeConfig = dataclasses.field(default_factory=RasterizeConfig)
 
 
@@ -103,13 +101,13 @@ class SurfelBuffers:
     Attributes:
       alive: `[N]` bool.
       degree: `[]` int32 degree of spherical harmonics that is drawn.
-      regularise: `[]` 1 once regularisers count, before that 0.
+      regularize: `[]` 1 once regularizers count, before that 0.
       expected: `[]` 1 where the expected depth is what the field calls depth, 0 where the median.
     """
 
     alive: jax.Array
     degree: jax.Array
-    regularise: jax.Array
+    regularize: jax.Array
     expected: jax.Array
 
 
@@ -118,8 +116,8 @@ class SurfelFieldAux(NamedTuple):
 
     Attributes:
       surfels: of `render_surfels`.
-      penalty: `[H, W]` the regularisers of each pixel.
-      prior: `[]` the regularisers of opacities and scales.
+      penalty: `[H, W]` the regularizers of each pixel.
+      prior: `[]` the regularizers of opacities and scales.
     """
 
     surfels: SurfelAux
@@ -151,7 +149,7 @@ def surfel_field(config: SurfelConfig, *, extent: float) -> RadianceField:
             sh_degree=config.sh_degree,
             opacity=config.initial_opacity,
         )
-        if isinstance(config.density, AdaptiveDensityConfig):
+        if isinstance(config.density, AdaptiveConfig):
             surfels = with_probe(surfels)
         expected = jnp.float32(config.depth == "expected")
         schedule = _schedule(config, jnp.zeros((), jnp.int32))
@@ -193,7 +191,7 @@ def surfel_field(config: SurfelConfig, *, extent: float) -> RadianceField:
         opacity = mean(jax.nn.sigmoid(params.opacity_logits))
         scale = mean(jnp.mean(jnp.exp(params.log_scales), axis=-1)) / extent
         prior = config.opacity_weight * opacity + config.scale_weight * scale
-        aux = SurfelFieldAux(image.aux, buffers.regularise * penalty, prior)
+        aux = SurfelFieldAux(image.aux, buffers.regularize * penalty, prior)
         depth = jnp.where(buffers.expected > 0, expected, median)
         return Rendering(image.rgb, depth, image.alpha, aux)
 
@@ -227,12 +225,12 @@ def surfel_optimizer(config: SurfelConfig, *, extent: float) -> optax.GradientTr
 
     def update(updates, state, params=None):
         del params
-        by_band = jnp.full(updates.sh.shape[1], config.sh_rate / 20).at[0].set(config.sh_rate)
+        by_band = jnp.full(updates.sh.shape[1], config.sh_lr / 20).at[0].set(config.sh_lr)
         rates = jax.tree.map(lambda leaf: 0.0, updates).replace(
-            means=means_rate(config, state.count) * extent,
-            log_scales=config.scale_rate,
-            quaternions=config.rotation_rate,
-            opacity_logits=config.opacity_rate,
+            means=means_lr(config, state.count) * extent,
+            log_scales=config.scale_lr,
+            quaternions=config.rotation_lr,
+            opacity_logits=config.opacity_lr,
             sh=by_band[None, :, None],
         )
         late = _late(config, state.count)
@@ -241,18 +239,18 @@ def surfel_optimizer(config: SurfelConfig, *, extent: float) -> optax.GradientTr
 
     rescale = optax.GradientTransformation(init, update)
     adam = optax.chain(optax.scale_by_adam(eps=1e-15), rescale)
-    if isinstance(config.density, AdaptiveDensityConfig):
+    if isinstance(config.density, AdaptiveConfig):
         return optax.chain(measure_pull(), adam)
     return adam
 
 
 def _late(config, step):
-    return jnp.where(step < config.decay_steps, 1, config.late_rate)
+    return jnp.where(step < config.decay_steps, 1, config.late_lr_scale)
 
 
-def means_rate(config: SurfelConfig, step: jax.Array) -> jax.Array:
+def means_lr(config: SurfelConfig, step: jax.Array) -> jax.Array:
     """Learning rate of the means at a step, in extents: from first to last along an exponential."""
-    first, last = config.means_rate
+    first, last = config.means_lr
     share = jnp.minimum(step.astype(jnp.float32) / config.decay_steps, 1)
     return first * (last / first) ** share
 
@@ -277,12 +275,12 @@ def _loss(rendering, target_rgb, weight, config):
 
     seen = rendering.rgb
     image = distance(seen)
-    if config.colour_ridge is not None:
+    if config.color_ridge is not None:
         data = jax.lax.stop_gradient(seen), target_rgb, weight
-        matrix, offset = fit_colours(*data, ridge=config.colour_ridge)
+        matrix, offset = fit_colors(*data, ridge=config.color_ridge)
         matrix = jnp.where(total > 0, matrix, jnp.eye(3, dtype=matrix.dtype))
         seen = matmul(seen, matrix[None]) + jnp.where(total > 0, offset, 0)[None, None]
-        # Colours that are free in every photograph would drift away from all of them.
+        # Colors that are free in every photograph would drift away from all of them.
         image = _UNCHANGED_SHARE * image + (1 - _UNCHANGED_SHARE) * distance(seen)
     prior = jnp.where(total > 0, rendering.aux.prior, 0)
     off = jnp.where(counts, jnp.clip(seen, 0, 1) - target_rgb, 0)
@@ -296,19 +294,19 @@ def _loss(rendering, target_rgb, weight, config):
 
 def _schedule(config, step):
     degree = jnp.minimum(step // config.sh_every, config.sh_degree).astype(jnp.int32)
-    return degree, (step >= config.regularise_from).astype(jnp.float32)
+    return degree, (step >= config.regularize_from).astype(jnp.float32)
 
 
 def _adapt(key, state, config, extent):
-    degree, regularise = _schedule(config, state.step)
-    buffers = state.buffers.replace(degree=degree, regularise=regularise)
+    degree, regularize = _schedule(config, state.step)
+    buffers = state.buffers.replace(degree=degree, regularize=regularize)
     state = state.replace(buffers=buffers)
     density = config.density
     if density is None:
         return state
     due = (state.step % density.every == 0) & (state.step > density.start)
     due &= state.step < density.stop
-    if isinstance(density, AdaptiveDensityConfig):
+    if isinstance(density, AdaptiveConfig):
         return _adapt_classically(key, state, density, due, extent)
     key_relocate, key_wander = jax.random.split(key)
 
@@ -317,7 +315,7 @@ def _adapt(key, state, config, extent):
         return _replace_surfels(state, surfels, alive, changed)
 
     state = jax.lax.cond(due, move, lambda state: state, state)
-    rate = _late(config, state.step) * means_rate(config, state.step) * extent
+    rate = _late(config, state.step) * means_lr(config, state.step) * extent
     surfels = wander(key_wander, state.params, state.buffers.alive, rate, density)
     return state.replace(params=surfels)
 

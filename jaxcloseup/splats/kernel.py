@@ -100,9 +100,9 @@ def _gather(table, lists: TileLists, tiles, position, chunk):
 
 
 def _pixels(tile: int, dtype) -> tuple[jax.Array, jax.Array]:
-    """Pixel centres `[P]` of a tile whose first corner is the origin."""
-    centres = jnp.arange(tile, dtype=dtype) + 0.5
-    return jnp.tile(centres, tile), jnp.repeat(centres, tile)
+    """Pixel centers `[P]` of a tile whose first corner is the origin."""
+    centers = jnp.arange(tile, dtype=dtype) + 0.5
+    return jnp.tile(centers, tile), jnp.repeat(centers, tile)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))

@@ -1,11 +1,11 @@
 """Surfels to planar homographies and exact boxes, for one camera.
 
-A disc with centre mu, unit tangents t_u, t_v, normal n = t_u x t_v and radii s_u, s_v meets the ray
+A disc with center mu, unit tangents t_u, t_v, normal n = t_u x t_v and radii s_u, s_v meets the ray
 r (r_z = 1) of a pixel at depth z with local coordinates (u, v). All of
 
     u / z = r.(t_v x mu) / (s_u n.mu),    v / z = r.(mu x t_u) / (s_v n.mu),    1 / z = r.n / n.mu
 
-are affine in the pixel: they are the rows of `Footprints`, taken about the projected centre, where
+are affine in the pixel: they are the rows of `Footprints`, taken about the projected center, where
 they are (0, 0, 1 / mu_z) without rounding.
 """
 
@@ -32,12 +32,12 @@ class Discs(NamedTuple):
     """Discs in one camera's frame, world units.
 
     Attributes:
-      centre: `[N, 3]`.
+      center: `[N, 3]`.
       axes: `[N, 3, 3]`, columns are the unit tangents t_u, t_v and the normal.
       scales: `[N, 2]` standard deviations along the tangents.
     """
 
-    centre: jax.Array
+    center: jax.Array
     axes: jax.Array
     scales: jax.Array
 
@@ -49,7 +49,7 @@ def to_camera(surfels: Surfels, camera: Camera) -> tuple[Discs, jax.Array]:
     normal = axes[..., 2]
     away = jnp.sum(offset * normal, axis=-1, keepdims=True) > 0
     discs = Discs(
-        centre=matmul(offset, camera.rotation),
+        center=matmul(offset, camera.rotation),
         axes=matmul(camera.rotation.T[None], axes),
         scales=jnp.exp(jnp.clip(surfels.log_scales, -MAX_LOG_SCALE, MAX_LOG_SCALE)),
     )
@@ -72,20 +72,20 @@ def project_discs(
         raise ValueError(f"near must be a positive depth, not {near}")
     focal, principal = camera.intrinsics[None, :2], camera.intrinsics[None, 2:]
     size = jnp.array([[camera.width, camera.height]], focal.dtype)
-    mu, depth = discs.centre, discs.centre[:, 2]
+    mu, depth = discs.center, discs.center[:, 2]
     ahead = depth > near
     inverse_depth = 1 / jnp.where(ahead, depth, 1)
-    centre = mu[:, :2] * inverse_depth[:, None] * focal + principal
+    center = mu[:, :2] * inverse_depth[:, None] * focal + principal
 
-    # A centre far outside the image, or behind the camera, is no good origin for numbers that are
+    # A center far outside the image, or behind the camera, is no good origin for numbers that are
     # needed within it. Any other pixel will do, if the low-pass about it stays out of sight.
     margin = jnp.maximum(size, 16)
-    within = jnp.all((centre > -margin) & (centre < size + margin), axis=-1, keepdims=True)
-    centred = ahead[:, None] & within
-    # In the image, for those behind the camera, it is a corner of pixels, never a pixel's centre.
+    within = jnp.all((center > -margin) & (center < size + margin), axis=-1, keepdims=True)
+    centered = ahead[:, None] & within
+    # In the image, for those behind the camera, it is a corner of pixels, never a pixel's center.
     corner = jnp.floor(size / 2)
-    elsewhere = jnp.where(ahead[:, None], jnp.clip(centre, -margin, size + margin), corner)
-    anchor = jnp.where(centred, centre, lax.stop_gradient(elsewhere))
+    elsewhere = jnp.where(ahead[:, None], jnp.clip(center, -margin, size + margin), corner)
+    anchor = jnp.where(centered, center, lax.stop_gradient(elsewhere))
 
     tangent_u, tangent_v, normal = (discs.axes[..., i] for i in range(3))
     facing = jnp.sum(normal * mu, axis=-1)
@@ -98,18 +98,18 @@ def project_discs(
     covectors = jnp.stack(covectors, axis=1) / jnp.where(edge_on, 1, facing)[:, None, None]
     ray = jnp.concatenate([(anchor - principal) / focal, jnp.ones_like(anchor[:, :1])], axis=-1)
     at_anchor = jnp.sum(covectors * ray[:, None], axis=-1)
-    at_centre = jnp.stack([jnp.zeros_like(depth), jnp.zeros_like(depth), inverse_depth], axis=-1)
-    constants = jnp.where(centred, at_centre, at_anchor)
+    at_center = jnp.stack([jnp.zeros_like(depth), jnp.zeros_like(depth), inverse_depth], axis=-1)
+    constants = jnp.where(centered, at_center, at_anchor)
     rows = jnp.concatenate([constants[..., None], covectors[..., :2] / focal[:, None]], axis=-1)
 
     # What is drawn where has no derivative, nor has a disc's extent in depth.
-    discs, opacity_now, centre = lax.stop_gradient((discs, opacity, centre))
+    discs, opacity_now, center = lax.stop_gradient((discs, opacity, center))
     cutoff = jnp.sqrt(2 * jnp.log(jnp.maximum(opacity_now / ALPHA_MIN, 1)))
     reach = cutoff * safe_norm(discs.axes[:, 2, :2] * discs.scales)
     drawn = ~edge_on & (opacity_now >= ALPHA_MIN) & (depth + reach >= near)
     nearest, farthest = (jnp.maximum(limit, near) for limit in (depth - reach, depth + reach))
     box = _disc_box(discs, cutoff, camera, near)
-    box = jnp.where(ahead[:, None], _unite(box, _low_pass_box(centre, cutoff)), box)
+    box = jnp.where(ahead[:, None], _unite(box, _low_pass_box(center, cutoff)), box)
     return Footprints(
         anchor=anchor,
         rows=rows,
@@ -132,7 +132,7 @@ def _disc_box(discs: Discs, cutoff: jax.Array, camera: Camera, near: float) -> j
     radii = (1.001 * cutoff)[:, None] * discs.scales
     # Coordinates of the rim are a cos + b sin + c, with a triple of [N] for each of x, y, z.
     circle = [
-        (axes[:, 0] * radii[:, 0], axes[:, 1] * radii[:, 1], discs.centre[:, i])
+        (axes[:, 0] * radii[:, 0], axes[:, 1] * radii[:, 1], discs.center[:, i])
         for i, axes in enumerate(jnp.moveaxis(discs.axes, 1, 0))
     ]
     depth = circle[2]
@@ -179,9 +179,9 @@ def _meet_circle(a, b, c):
     return points, discriminant >= 0
 
 
-def _low_pass_box(centre: jax.Array, cutoff: jax.Array) -> jax.Array:
+def _low_pass_box(center: jax.Array, cutoff: jax.Array) -> jax.Array:
     half = (1.001 * cutoff / jnp.sqrt(LOW_PASS) + 0.01)[:, None]
-    return jnp.concatenate([centre - half, centre + half], axis=-1)
+    return jnp.concatenate([center - half, center + half], axis=-1)
 
 
 def _unite(a: jax.Array, b: jax.Array) -> jax.Array:

@@ -21,7 +21,7 @@ from jaxcloseup.splats.tiling import tile_lists
 
 @dataclasses.dataclass(frozen=True)
 class RasterizeConfig:
-    """Static sizes of the rasteriser; none of them changes the image.
+    """Static sizes of the rasterizer; none of them changes the image.
 
     Attributes:
       capacity: how many (tile, splat) pairs fit. What does not fit is counted in `overflow`, the
@@ -48,13 +48,13 @@ class Footprints:
     rho = min(u^2 + v^2, low_pass |q - anchor|^2).
 
     Attributes:
-      anchor: `[N, 2]` reference pixel, the projected centre wherever the low-pass can be seen.
+      anchor: `[N, 2]` reference pixel, the projected center wherever the low-pass can be seen.
       rows: `[N, 3, 3]` affine functions: columns multiply 1, x - anchor_x, y - anchor_y.
       opacity: `[N]` in [0, 1]; 0 is never drawn.
       low_pass: `[N]` inverse variance of the screen-space floor; very large is none. No gradient.
       inverse_depth: `[N, 2]` range to which 1/z is held where the low-pass wins. The derivative
         there is that of the depth at the anchor.
-      payload: `[N, F]` what is composited: colours, normals, anything.
+      payload: `[N, F]` what is composited: colors, normals, anything.
       order: `[N]` z-depth, positive, by which splats are sorted. No gradient.
       box: `[N, 4]` bounds (x0, y0, x1, y1) in pixels of all that is not fainter than `ALPHA_MIN`;
         empty where x1 < x0. No gradient.

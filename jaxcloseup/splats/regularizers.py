@@ -35,7 +35,7 @@ def normal_inconsistency(normal: jax.Array, depth_normal: jax.Array, alpha: jax.
     """alpha (1 - <normal, depth_normal>) `[H, W]`, and 0 where there is no `depth_normal`.
 
     Args:
-      normal: `[H, W, 3]` composited normals, not normalised, as rendered.
+      normal: `[H, W, 3]` composited normals, not normalized, as rendered.
       depth_normal: `[H, W, 3]` of `depth_to_normal`.
       alpha: `[H, W]`, which weighs and gets no gradient.
     """

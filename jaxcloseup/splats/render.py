@@ -16,10 +16,10 @@ from jaxcloseup.splats.surfels import Surfels
 
 
 class SurfelAux(NamedTuple):
-    """What surfels render besides colour, expected depth and alpha.
+    """What surfels render besides color, expected depth and alpha.
 
     Attributes:
-      normal: `[H, W, 3]` sum of w_i n_i in the world's frame, towards the camera, not normalised.
+      normal: `[H, W, 3]` sum of w_i n_i in the world's frame, towards the camera, not normalized.
       median_depth: `[H, W]` z-depth at which half of the light is lost; 0 where nothing is hit.
       distortion: `[H, W]` sum over pairs i < j of w_i w_j (1/z_i - 1/z_j)^2.
       overflow: `[]` (tile, surfel) pairs that did not fit: if not 0 the image is wrong; render it
@@ -43,14 +43,14 @@ def render_surfels(
     """Render a whole image by 2-D Gaussian splatting (Huang et al. 2024).
 
     Differentiable in the surfels, the background and the camera's pose and intrinsics; batch over
-    cameras with `jax.vmap`. Depth is where rays meet the discs, not the depth of their centres.
+    cameras with `jax.vmap`. Depth is where rays meet the discs, not the depth of their centers.
 
     Args:
       surfels: `N` surfels.
       alive: `[N]` bool, False is not drawn.
       camera: one camera.
       config: static sizes.
-      background: `[3]` colour behind everything, black if None.
+      background: `[3]` color behind everything, black if None.
 
     Returns:
       A `Rendering` of `[H, W]` pixels whose `aux` is a `SurfelAux`.
@@ -67,9 +67,9 @@ def render_surfels(
     discs, normals = to_camera(surfels, camera)
     offset = surfels.means - camera.position[None]
     distance = safe_norm(offset, keepdims=True)
-    colours = sh_to_rgb(surfels.sh, offset / jnp.where(distance == 0, 1, distance))
+    colors = sh_to_rgb(surfels.sh, offset / jnp.where(distance == 0, 1, distance))
     opacity = jnp.where(alive, jax.nn.sigmoid(surfels.opacity_logits), 0)
-    payload = jnp.concatenate([colours, normals], axis=-1)
+    payload = jnp.concatenate([colors, normals], axis=-1)
     footprints = project_discs(discs, opacity, payload, camera, near=config.near)
     image = rasterize(footprints, config, height=camera.height, width=camera.width)
     rgb, normal = image.payload[..., :3], image.payload[..., 3:]

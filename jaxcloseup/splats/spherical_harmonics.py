@@ -1,4 +1,4 @@
-"""Real spherical harmonics to degree 3, the view-dependent colour of a splat."""
+"""Real spherical harmonics to degree 3, the view-dependent color of a splat."""
 
 import math
 
@@ -46,7 +46,7 @@ def sh_basis(directions: jax.Array, degree: int) -> jax.Array:
 
 
 def sh_to_rgb(sh: jax.Array, directions: jax.Array) -> jax.Array:
-    """Colours `[..., 3]` seen along unit `directions[..., 3]`: max(0, 1/2 + sum_k Y_k sh_k).
+    """Colors `[..., 3]` seen along unit `directions[..., 3]`: max(0, 1/2 + sum_k Y_k sh_k).
 
     Args:
       sh: `[..., (L + 1)^2, 3]` coefficients.

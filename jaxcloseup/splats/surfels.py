@@ -21,12 +21,12 @@ class Surfels:
     """`N` discs in world units.
 
     Attributes:
-      means: `[N, 3]` centres.
+      means: `[N, 3]` centers.
       log_scales: `[N, 2]` logarithms of the standard deviations along the two tangents.
       quaternions: `[N, 4]` (w, x, y, z), of any length; the rotation's columns are the two tangents
         and the normal.
       opacity_logits: `[N]`.
-      sh: `[N, (L + 1)^2, 3]` spherical harmonics of the colour.
+      sh: `[N, (L + 1)^2, 3]` spherical harmonics of the color.
     """
 
     means: jax.Array
@@ -50,9 +50,9 @@ def surfels_from_points(
     Args:
       key: for the rotations, and for choosing points where there are more than `capacity`.
       points: `[P, 3]` world points; those that are not finite are dropped.
-      rgb: `[P, 3]` colours in [0, 1].
+      rgb: `[P, 3]` colors in [0, 1].
       capacity: `N`; rows without a point are dead.
-      sh_degree: degree `L` of the colour's harmonics, 0 to 3; all but the constant start at 0.
+      sh_degree: degree `L` of the color's harmonics, 0 to 3; all but the constant start at 0.
       opacity: initial opacity.
 
     Returns:
@@ -68,7 +68,7 @@ def surfels_from_points(
         chosen = jnp.sort(chosen)
     alive = finite[chosen]
     points = jnp.where(alive[:, None], points[chosen], 0)
-    gaps = neighbour_distance(points, alive)
+    gaps = neighbor_distance(points, alive)
     constant = rgb_to_sh(rgb[chosen])[:, None]
     higher = jnp.zeros((points.shape[0], (sh_degree + 1) ** 2 - 1, 3), points.dtype)
     surfels = Surfels(
@@ -117,11 +117,11 @@ def _pad_rows(array: jax.Array, rows: int) -> jax.Array:
     return jnp.pad(array, ((0, rows - array.shape[0]), *((0, 0) for _ in array.shape[1:])))
 
 
-def neighbour_distance(points: jax.Array, valid: jax.Array, *, rows: int = 256) -> jax.Array:
+def neighbor_distance(points: jax.Array, valid: jax.Array, *, rows: int = 256) -> jax.Array:
     """Root mean square distance `[P]` to the three nearest other valid points of `points[P, 3]`.
 
     Exact, by comparing all pairs: a few seconds for 100k points. At least sqrt(1e-7), so that
-    duplicates keep a size; points with fewer than three neighbours take those they have.
+    duplicates keep a size; points with fewer than three neighbors take those they have.
     """
     count = points.shape[0]
     padded = jnp.pad(points, ((0, -count % rows), (0, 0)))

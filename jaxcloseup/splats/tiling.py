@@ -49,7 +49,7 @@ def tile_lists(
 
     Args:
       box: `[N, 4]` bounds (x0, y0, x1, y1) in pixels of what each splat touches; a splat is listed
-        in the tiles that hold a pixel *centre* within, and nowhere if x1 < x0 or y1 < y0.
+        in the tiles that hold a pixel *center* within, and nowhere if x1 < x0 or y1 < y0.
       order: `[N]` depth of each splat.
       height, width, tile, block, capacity: static sizes.
     """
@@ -95,7 +95,7 @@ def tile_lists(
 
 
 def _tile_range(box: jax.Array, size: jax.Array, tile: int) -> tuple[jax.Array, jax.Array]:
-    """First and last tile `[N, 2]` (x, y) with pixel centres in the box; last < first: none."""
+    """First and last tile `[N, 2]` (x, y) with pixel centers in the box; last < first: none."""
     # Clip before the cast: a box may reach to the horizon, and integers do not.
     edge = (size - 1).astype(box.dtype)[None]
     first = jnp.clip(jnp.ceil(box[:, :2] - 0.5), 0, edge + 1).astype(jnp.int32)

@@ -1,4 +1,4 @@
-"""Volume rendering: what a ray sees of the densities and colours sampled along it."""
+"""Volume rendering: what a ray sees of the densities and colors sampled along it."""
 
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ class Composite(NamedTuple):
 
     Attributes:
       weights: `[..., S]` the share of each sample, `w_i = T_i (1 - exp(-sigma_i delta_i))`.
-      rgb: `[..., 3]` weighted colours, nothing added behind them.
+      rgb: `[..., 3]` weighted colors, nothing added behind them.
       alpha: `[...]` sum of the weights.
       depth: `[...]` weighted mean z-depth; 0 where alpha is 0 (below 1e-10).
       expected_depth: `[...]` weighted sum of z-depths, which is depth times alpha.
@@ -40,7 +40,7 @@ def composite(
     """Integrate samples along rays by the quadrature of NeRF, eq. 3.
 
     Args:
-      rgb: `[..., S, 3]` colours of the samples.
+      rgb: `[..., S, 3]` colors of the samples.
       density: `[..., S]` non-negative, per world unit.
       depth: `[..., S]` ascending z-depths; each sample stands for the interval up to the next, the
         last one for all the rest of its ray.

@@ -35,7 +35,7 @@ def positional_encoding(x: jax.Array, num_octaves: int) -> jax.Array:
 
 
 def _cos_of_turns(turns: jax.Array) -> jax.Array:
-    """cos(2 pi turns) to 1e-7. On a CPU, where `jnp.cos` is not vectorised, 20 times its speed."""
+    """cos(2 pi turns) to 1e-7. On a CPU, where `jnp.cos` is not vectorized, 20 times its speed."""
     # As the sine of an angle in [-pi/2, pi/2], by its series up to the 11th power.
     angle = 2 * np.pi * (0.25 - jnp.abs(turns - jnp.round(turns)))
     square = angle * angle

@@ -16,8 +16,8 @@ from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_rays
 from jaxcloseup.numerics import safe_divide, safe_norm
 from jaxcloseup.volume.compositing import Composite, composite
 from jaxcloseup.volume.encodings import positional_encoding
-from jaxcloseup.volume.mlp import apply_network, init_network
-from jaxcloseup.volume.ray_sampling import importance, stratified
+from jaxcloseup.volume.networks import apply_network, init_network
+from jaxcloseup.volume.samplers import importance, stratified
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,7 +34,7 @@ class NerfConfig:
       num_coarse: stratified samples of the coarse network.
       num_fine: importance samples; the fine network sees these and the coarse ones.
       density_noise: standard deviation of noise on raw densities, where a key is given.
-      background: grey level in [0, 1] behind the scene; None adds nothing, which is black.
+      background: gray level in [0, 1] behind the scene; None adds nothing, which is black.
       chunk: rays rendered at once; None for as many as `rays_at_once` says.
       compute_dtype: "float32" or "bfloat16" for the operands of the network's products.
     """
@@ -69,7 +69,7 @@ class NerfAux(NamedTuple):
     """What else a NeRF renders.
 
     Attributes:
-      coarse_rgb: `[..., 3]` colours by the coarse network, for the loss.
+      coarse_rgb: `[..., 3]` colors by the coarse network, for the loss.
       median_depth: `[...]` z-depth at which half of the light is absorbed, 0 where none is.
       expected_depth: `[...]` weighted sum of z-depths, not divided by alpha.
     """
@@ -84,12 +84,12 @@ def nerf(
     *,
     near: float,
     far: float,
-    centre: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0),
     scale: float = 1.0,
 ) -> RadianceField:
     """A NeRF that samples rays between z-depths `near` and `far`, in world units.
 
-    The network sees `(position - centre) * scale`, which should lie roughly within [-1, 1].
+    The network sees `(position - center) * scale`, which should lie roughly within [-1, 1].
     Parameters are `{"coarse": ..., "fine": ...}`; there are no buffers.
 
     Raises:
@@ -124,7 +124,7 @@ def nerf(
             return _render_rays(
                 params,
                 key,
-                (origins - jnp.array([centre])) * scale,
+                (origins - jnp.array([center])) * scale,
                 directions * scale,
                 safe_norm(directions),
                 near,
@@ -143,15 +143,15 @@ def nerf(
 def loss(
     rendering: Rendering, target_rgb: jax.Array, weight: jax.Array
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Weighted mean squared error of the fine and of the coarse colours, summed.
+    """Weighted mean squared error of the fine and of the coarse colors, summed.
 
     Args:
       rendering: of pixels `[...]`.
-      target_rgb: `[..., 3]` the colours they should have.
+      target_rgb: `[..., 3]` the colors they should have.
       weight: `[...]` non-negative; all zero gives a zero loss.
 
     Returns:
-      The loss, and `{"psnr"}` of the fine colours (inf where nothing weighs).
+      The loss, and `{"psnr"}` of the fine colors (inf where nothing weighs).
     """
     chex.assert_equal_shape([rendering.rgb, rendering.aux.coarse_rgb, target_rgb])
     chex.assert_shape(weight, target_rgb.shape[:-1])

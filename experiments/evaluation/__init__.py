@@ -1,0 +1,1 @@
+"""How good renders, depths and labels are."""

@@ -1,0 +1,318 @@
+"""How good pseudo-labels are: against the truth on procedural scenes, against photographs on all.
+
+A label can at best be what its source photograph resolves, so it is compared with the true close-up
+blurred to the footprint that the source's pixels have there. On captures, training photographs are
+left out one by one, labeled from the others and compared with what they are.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcloseup.field import Rendering
+from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points, points_to_pixels
+from jaxcloseup.geometry.masks import depth_consistent, in_bounds
+from jaxcloseup.geometry.warp import backward_warp
+from jaxcloseup.photographs import Views, camera_at, to_float
+from jaxcloseup.pseudo import (
+    PseudoLabel,
+    PseudoSettings,
+    best_source,
+    make_label,
+    sample_virtual_camera,
+)
+from jaxcloseup.scenes import Scene
+from jaxcloseup.train import label_depth
+
+
+CURVE_POINTS = 20
+_SIGMAS = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
+
+
+def blur_to_footprint(image: np.ndarray, footprint: np.ndarray) -> np.ndarray:
+    """Blur an image as if it were photographed with pixels `footprint` times as large.
+
+    A photograph averages over its pixel (variance 1/12) and bilinear reading over its neighbors
+    (1/6), so the standard deviation is half a source pixel; what the image's own pixels average
+    already is taken off.
+
+    Args:
+      image: `[H, W, 3]`.
+      footprint: `[H, W]` side of a source pixel in pixels of the image.
+    """
+    sigma = np.sqrt(np.maximum(footprint**2 / 4 - 1 / 12, 0))
+    levels = [image] + [cv2.GaussianBlur(image, (0, 0), s) for s in _SIGMAS[1:]]
+    position = np.interp(sigma, _SIGMAS, np.arange(len(_SIGMAS)))
+    low = np.minimum(position.astype(int), len(_SIGMAS) - 2)
+    rows, columns = np.indices(sigma.shape)
+    stack, share = np.stack(levels), (position - low)[..., None]
+    return (1 - share) * stack[low, rows, columns] + share * stack[low + 1, rows, columns]
+
+
+def resolved_by_photographs(
+    scene: Scene, camera: Camera, exact_depths: jax.Array
+) -> tuple[np.ndarray, np.ndarray]:
+    """The true image of a camera as the training photograph nearest to each point resolves it.
+
+    What labels could be at best, with exact depth and every photograph at hand.
+
+    Args:
+      scene: with `surface`.
+      camera: of the image.
+      exact_depths: `[V, H, W]` of the training views.
+
+    Returns:
+      `[H, W, 3]` the blurred truth, and `[H, W]` whether any photograph sees the point.
+    """
+    truth = jax.jit(scene.surface)(camera)
+    pixels = pixel_grid(camera.height, camera.width)
+    finest = np.full(pixels.shape[:2], np.inf)
+    for index, depth in enumerate(exact_depths):
+        source = camera_at(scene.train.cameras, index)
+        visible, footprint = _seen_by(camera, pixels, truth.depth, source, depth)
+        finest = np.where(visible, np.minimum(finest, footprint), finest)
+    seen = np.isfinite(finest)
+    return blur_to_footprint(np.asarray(truth.rgb), np.where(seen, finest, 1)), seen
+
+
+def audit_labels(
+    key: jax.Array,
+    exact_depths: jax.Array,
+    *,
+    scene: Scene,
+    settings: PseudoSettings,
+    depths: jax.Array,
+    render_depth: Callable[[Camera], jax.Array],
+    count: int = 16,
+) -> dict[str, Any]:
+    """Label error and yield over random virtual close-ups of a procedural scene.
+
+    Args:
+      key: random key.
+      exact_depths: `[V, H, W]` exact depths of the training views, which decide what is visible.
+      scene: a scene with `surface`.
+      settings: of the labels.
+      depths: `[V, H, W]` the depths that labels are made with.
+      render_depth: `camera -> [H, W]`, the virtual depth that labels are made with.
+      count: virtual cameras.
+
+    Returns:
+      `error`, mean absolute difference of kept labels from the blurred truth; `kept`, share of the
+      pixels that the source view truly sees; `leaked`, share of kept pixels that it does not.
+      None beside a reason where there is nothing to divide by. `curve`: see `error_curve`, with
+      coverage as a share of all pixels.
+    """
+    sample = jax.jit(sample_virtual_camera)
+    label_image = jax.jit(_label_twice)
+    of_curve: list[tuple[np.ndarray, ...]] = []
+    pixels_total = 0
+    error = kept = kept_visible = visible_total = 0.0
+    for one in jax.random.split(key, count):
+        camera, index = sample(one, scene.train, depths, settings)
+        pixels = pixel_grid(camera.height, camera.width)
+        data = camera, pixels, render_depth(camera), index, scene.train, depths
+        label = label_image(*data, settings)
+        weight, of_any_color = np.asarray(label.weight)
+        truth = scene.surface(camera)
+        visible, footprint = _seen_by(
+            camera, pixels, truth.depth, camera_at(scene.train.cameras, index), exact_depths[index]
+        )
+        visible = np.asarray(visible, np.float32)
+        blurred = blur_to_footprint(np.asarray(truth.rgb), np.asarray(footprint))
+        difference = np.abs(label.rgb - blurred).mean(axis=-1)
+        error += float((weight * difference).sum())
+        kept += float(weight.sum())
+        kept_visible += float((weight * visible).sum())
+        visible_total += float(visible.sum())
+        inside = of_any_color > 0
+        score = np.abs(label.backward - label.forward).max(axis=-1)
+        columns = score, difference, 1 - visible
+        of_curve.append(tuple(column[inside] for column in columns))
+        pixels_total += inside.size
+    shares = {
+        "error": (error, kept),
+        "kept": (kept_visible, visible_total),
+        "leaked": (kept - kept_visible, kept),
+    }
+    result: dict[str, Any] = {}
+    for name, (part, whole) in shares.items():
+        result[name] = part / whole if whole else None
+        if not whole:
+            result[f"{name}_reason"] = "no label was kept" if name != "kept" else "nothing is seen"
+    score, scored_error, leaked = map(np.concatenate, zip(*of_curve, strict=True))
+    result["curve"] = error_curve(score, scored_error, pixels_total, {"leaked": leaked})
+    return result
+
+
+def error_curve(
+    score: np.ndarray,
+    error: np.ndarray,
+    total: int,
+    more: Mapping[str, np.ndarray] | None = None,
+) -> dict[str, list[float] | float] | None:
+    """Error of labels against how many are kept, those first that the mask trusts most.
+
+    The area under sparsification error (AUSE; Ilg et al., "Uncertainty Estimates and
+    Multi-Hypotheses Networks for Optical Flow", ECCV 2018) is 0 where the score sorts labels by
+    their true error, and one half where it says nothing and errors are uniform.
+
+    Args:
+      score: `[N]` of the labels, smaller is better.
+      error: `[N]` their true error.
+      total: pixels of all images, of which the labels cover a part.
+      more: `[N]` other quantities whose means are wanted for the same parts.
+
+    Returns:
+      Lists over parts of the labels, from few to all: `coverage`, their share of `total`; `error`,
+      their mean error; `oracle`, that of as many labels with the least error; those of `more`; and
+      the number `ause`. None without labels.
+    """
+    if not len(score):
+        return None
+    shares = np.arange(1, CURVE_POINTS + 1) / CURVE_POINTS
+    counts = np.maximum(1, np.round(shares * len(score)).astype(int))
+    by_score = np.argsort(score, kind="stable")
+
+    def means(values):
+        return (np.cumsum(values, dtype=np.float64)[counts - 1] / counts).tolist()
+
+    curve = {
+        "coverage": (counts / total).tolist(),
+        "error": means(error[by_score]),
+        "oracle": means(np.sort(error)),
+    }
+    for name, values in (more or {}).items():
+        curve[name] = means(values[by_score])
+    gap = np.subtract(curve["error"], curve["oracle"])
+    largest = curve["error"][-1]
+    return curve | {"ause": float(np.trapezoid(gap, shares) / largest) if largest else 0.0}
+
+
+def _label_twice(camera, pixels, depth, index, views, depths, settings):
+    """The label, of which `weight` `[2, H, W]` is as settings say and as it is of any color."""
+    ways = settings, _of_any_color(settings)
+
+    def label(use_mask, rgb_tolerance):
+        changed = settings.replace(use_mask=use_mask, rgb_tolerance=rgb_tolerance)
+        return make_label(camera, pixels, depth, index, views, depths, changed)
+
+    # What is not batched, the warps above all, is made once.
+    return jax.vmap(label, out_axes=PseudoLabel(None, 0, None, None))(
+        jnp.stack([way.use_mask for way in ways]), jnp.stack([way.rgb_tolerance for way in ways])
+    )
+
+
+def _of_any_color(settings: PseudoSettings) -> PseudoSettings:
+    """Settings that keep whatever both warps reach, so that their difference can be sorted by."""
+    return settings.replace(use_mask=jnp.float32(1), rgb_tolerance=jnp.float32(jnp.inf))
+
+
+def audit_left_out(
+    views: Views,
+    depths: jax.Array,
+    render: Callable[[Camera], Rendering],
+    candidates: Sequence[PseudoSettings],
+    *,
+    count: int = 8,
+) -> list[dict[str, float | None]]:
+    """Labels of left-out training photographs, and the model, against these photographs.
+
+    The model has seen them, so its error is the least that it can be: labels that win here win.
+
+    Args:
+      views: training photographs.
+      depths: `[V, H, W]` their rendered z-depth.
+      render: `camera -> Rendering` of the model.
+      candidates: settings to compare.
+      count: photographs to leave out, spread evenly.
+
+    Returns:
+      For each candidate `label_psnr` and `model_psnr` over the pixels that are labeled, None where
+      none is, and `coverage`, their share.
+    """
+    audit = jax.jit(_left_out)
+    sums = np.zeros((len(candidates), 4))
+    for index in _spread(views, count):
+        seen = render(camera_at(views.cameras, index))
+        for row, settings in enumerate(candidates):
+            sums[row] += audit(index, seen.rgb, label_depth(seen), views, depths, settings)
+    rows = []
+    for label, model, kept, total in sums:
+        of_label, of_model = (
+            float(-10 * np.log10(error / kept)) if kept and error else None
+            for error in (label, model)
+        )
+        rows.append({"label_psnr": of_label, "model_psnr": of_model, "coverage": kept / total})
+    return rows
+
+
+def left_out_curve(
+    views: Views,
+    depths: jax.Array,
+    render: Callable[[Camera], Rendering],
+    settings: PseudoSettings,
+    *,
+    count: int = 8,
+) -> dict[str, list[float] | float] | None:
+    """`error_curve` of labels of left-out training photographs, with the error of the `model`.
+
+    Needs no truth but the photographs. Where the labels' curve lies above the model's, a tolerance
+    that keeps so many of them teaches the model its own faults. Arguments as in `audit_left_out`.
+    """
+    label_of = jax.jit(_label_left_out)
+    found: list[tuple[np.ndarray, ...]] = []
+    total = 0
+    for index in _spread(views, count):
+        seen = render(camera_at(views.cameras, index))
+        data = index, label_depth(seen), views, depths, _of_any_color(settings)
+        label, truth, weight = label_of(*data)
+        inside = np.asarray(label.weight * weight) > 0
+        columns = (
+            np.abs(label.backward - label.forward).max(axis=-1),
+            np.abs(label.rgb - truth).mean(axis=-1),
+            np.abs(jnp.clip(seen.rgb, 0, 1) - truth).mean(axis=-1),
+        )
+        found.append(tuple(column[inside] for column in columns))
+        total += int(np.sum(np.asarray(weight) > 0))
+    score, error, model = map(np.concatenate, zip(*found, strict=True))
+    return error_curve(score, error, total, {"model": model})
+
+
+def _spread(views, count):
+    return np.unique(np.linspace(0, len(views) - 1, count).round().astype(int))
+
+
+def _label_left_out(index, depth, views, depths, settings):
+    """The label of a training photograph from the others, its colors and its weight."""
+    camera, weight = camera_at(views.cameras, index), views.weight[index]
+    others = views.replace(weight=views.weight.at[index].set(0))
+    source = best_source(camera, others, depths, depth=depth)
+    pixels = pixel_grid(camera.height, camera.width)
+    label = make_label(camera, pixels, depth, source, others, depths, settings)
+    return label, to_float(views.rgb[index]), weight
+
+
+def _left_out(index, rgb, depth, views, depths, settings):
+    """Sums over kept pixels: squared errors of label and model, kept pixels, all pixels."""
+    label, truth, weight = _label_left_out(index, depth, views, depths, settings)
+    kept = label.weight * weight
+
+    def error(image):
+        return jnp.sum(kept * jnp.mean((jnp.clip(image, 0, 1) - truth) ** 2, axis=-1))
+
+    return jnp.stack([error(label.rgb), error(rgb), jnp.sum(kept), jnp.sum(weight)])
+
+
+@jax.jit
+def _seen_by(camera, pixels, depth, source, source_depth):
+    """Whether the source sees each pixel's surface, and its pixel's size in pixels of `camera`."""
+    landed, landed_depth = points_to_pixels(source, pixels_to_points(camera, pixels, depth))
+    observed = backward_warp(source_depth[..., None], landed, order=0)[..., 0]
+    inside = in_bounds(landed, source.height, source.width)
+    visible = (depth > 0) & inside & depth_consistent(observed, landed_depth, 0.02)
+    magnification = landed_depth / jnp.where(depth > 0, depth, 1)
+    return visible, magnification * camera.intrinsics[0] / source.intrinsics[0]

@@ -1,0 +1,113 @@
+"""The zoom ladder: the same places seen from ever nearer, on scenes whose true look is known.
+
+From each held-out ordinary view one camera comes 1, 2, 4, 8 and 16 times nearer to one point that
+it sees, without turning, so that all that changes along the ladder is the magnification.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from experiments.evaluation.scores import Target
+from experiments.reporting.plots import Curve
+from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points
+from jaxcloseup.geometry.poses import closeup_position, sample_anchor
+from jaxcloseup.photographs import camera_at
+from jaxcloseup.scenes import Scene
+from jaxcloseup.support import count_seen
+
+
+MAGNIFICATIONS = (1, 2, 4, 8, 16)
+PREFIX = "zoom_"
+LEAST_SEEN = 3  # photographs that show a point which a ladder leads to
+
+
+def ladder_targets(scene: Scene, exact_depths: jax.Array) -> dict[str, list[Target]]:
+    """Held-out views for each magnification, by `zoom_<magnification>`.
+
+    Args:
+      scene: a scene with `surface` and ordinary held-out views.
+      exact_depths: `[V, H, W]` of the training views.
+
+    Returns:
+      For each magnification a target of each ordinary view; none at all of scenes without.
+    """
+    if scene.surface is None or scene.test_far is None:
+        return {}
+    surface, count = jax.jit(scene.surface), jax.jit(count_seen)
+    ladder: dict[str, list[Target]] = {f"{PREFIX}{m}": [] for m in MAGNIFICATIONS}
+    for i, name in enumerate(scene.names["test_far"]):
+        far = camera_at(scene.test_far.cameras, i)
+        pixels = pixel_grid(far.height, far.width)
+        anchor = None
+        for m in MAGNIFICATIONS:
+            camera = far if anchor is None else _nearer(far, anchor, m)
+            seen_surface = surface(camera)
+            seen = count(camera, pixels, seen_surface.depth, scene.train, exact_depths)
+            if anchor is None:
+                anchor = _anchor(jax.random.key(i), camera, seen_surface.depth, seen)
+            weight = jnp.ones(seen.shape, jnp.float32)
+            rgb = seen_surface.rgb.astype(jnp.float32)
+            target = Target(name, camera, rgb, weight, seen, seen_surface)
+            ladder[f"{PREFIX}{m}"].append(target)
+    return ladder
+
+
+def _anchor(key: jax.Array, camera: Camera, depth: jax.Array, seen: jax.Array) -> jax.Array:
+    """A point in the middle half of the view that several photographs show."""
+    height, width = depth.shape
+    middle = jnp.zeros((height, width), jnp.float32)
+    middle = middle.at[height // 4 : -(height // 4), width // 4 : -(width // 4)].set(1)
+    weight = jnp.where(seen >= LEAST_SEEN, middle, 0)
+    weight = jnp.where(jnp.any(weight > 0), weight, middle)
+    pixel = sample_anchor(key, depth, weight)
+    column, row = jnp.floor(pixel).astype(jnp.int32)
+    return pixels_to_points(camera, pixel, depth[row, column])
+
+
+def _nearer(camera: Camera, anchor: jax.Array, magnification: float) -> Camera:
+    position = closeup_position(anchor, camera.position, magnification)
+    return camera.replace(camtoworld=camera.camtoworld.at[:, 3].set(position))
+
+
+def zoom_curves(stages: Mapping[str, Mapping[str, Any]], metric: str = "psnr") -> list[Curve]:
+    """A metric against magnification for each stage that climbed the ladder.
+
+    Args:
+      stages: for each stage its splits, as `results.json` has them.
+      metric: its name.
+    """
+    curves = []
+    for stage, splits in stages.items():
+        rungs = [(m, splits[f"{PREFIX}{m}"][metric]) for m in rungs_of(splits)]
+        known = [(m, value) for m, value in rungs if value is not None]
+        if known:
+            curves.append(Curve(stage, *map(list, zip(*known, strict=True))))
+    return curves
+
+
+def gains_over(curves: Sequence[Curve], base: str) -> list[Curve]:
+    """Curves less that of the stage `base`, where both have points."""
+    named = {curve.name: dict(zip(curve.x, curve.y, strict=True)) for curve in curves}
+    below = named.get(base, {})
+    gains = []
+    for curve in curves:
+        known = [(x, y - below[x]) for x, y in zip(curve.x, curve.y, strict=True) if x in below]
+        if known:
+            gains.append(Curve(curve.name, *map(list, zip(*known, strict=True))))
+    return gains
+
+
+def ladder_in_short(splits: Mapping[str, Any]) -> str:
+    """PSNR at each magnification, in a line."""
+    rungs = ((m, splits[f"{PREFIX}{m}"]["psnr"]) for m in rungs_of(splits))
+    return "PSNR (dB) " + ", ".join(
+        f"{m}x nearer {'-' if value is None else f'{value:.2f}'}" for m, value in rungs
+    )
+
+
+def rungs_of(splits: Iterable[str]) -> list[int]:
+    """The magnifications among the names of splits, rising."""
+    return sorted(int(name.removeprefix(PREFIX)) for name in splits if name.startswith(PREFIX))

@@ -1,0 +1,259 @@
+"""Scoring a field on held-out views, full frame and where training photographs saw the surface."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.evaluation.surface_error import (
+    Landmarks,
+    find_landmarks,
+    point_depth_error,
+    surface_error,
+)
+from jaxcloseup.field import Rendering
+from jaxcloseup.geometry.cameras import Camera, pixel_grid
+from jaxcloseup.lpips import BACKBONES, SMALLEST, LpipsError, LpipsWeights, load_lpips, lpips
+from jaxcloseup.metrics import SSIM_TAPS, cc_psnr, psnr, quantize, ssim
+from jaxcloseup.photographs import Views, camera_at, to_float
+from jaxcloseup.scene import Surface
+from jaxcloseup.scenes import Scene
+from jaxcloseup.support import count_seen
+
+
+SEEN_BY = (1, 3)
+
+
+class Perceptual(NamedTuple):
+    """LPIPS networks by backbone, and for each that is missing the reason."""
+
+    networks: Mapping[str, LpipsWeights]
+    reasons: Mapping[str, str]
+
+
+def find_perceptual(folder: str | None = None) -> Perceptual:
+    """The LPIPS networks whose weights are found, in `folder` or where they usually are.
+
+    Raises:
+      ValueError: a folder is named and has none.
+    """
+    networks, reasons = {}, {}
+    for backbone in BACKBONES:
+        try:
+            networks[backbone] = load_lpips(backbone, folder)
+        except LpipsError as error:
+            reasons[backbone] = str(error)
+    if folder is not None and not networks:
+        raise ValueError(f"--lpips_weights={folder}: {reasons[BACKBONES[0]]}")
+    return Perceptual(networks, reasons)
+
+
+NO_PERCEPTUAL = Perceptual({}, dict.fromkeys(BACKBONES, "LPIPS was not asked for"))
+
+
+class Target(NamedTuple):
+    """A held-out view.
+
+    Attributes:
+      name: of its photograph.
+      camera: its camera.
+      rgb: `[H, W, 3]` the photograph, float.
+      weight: `[H, W]` 0 in padding.
+      seen: `[H, W]` how many training photographs saw the surface there.
+      surface: the exact one, or None where it is not known.
+      landmarks: points of the capture that it shows, where the surface is not known.
+    """
+
+    name: str
+    camera: Camera
+    rgb: jax.Array
+    weight: jax.Array
+    seen: jax.Array
+    surface: Surface | None = None
+    landmarks: Landmarks | None = None
+
+
+def exact_depths(scene: Scene, cameras: Camera) -> jax.Array:
+    """Exact z-depths `[V, H, W]` of stacked cameras on a procedural scene."""
+    depth = jax.jit(lambda camera: scene.surface(camera).depth)  # leaves the colors undrawn
+    count = cameras.intrinsics.shape[0]
+    return jnp.stack([depth(camera_at(cameras, i)) for i in range(count)])
+
+
+def make_targets(
+    scene: Scene, split: str, train_depths: jax.Array, render: Callable[[Camera], Rendering]
+) -> list[Target]:
+    """The held-out views of a split, with their coverage.
+
+    Depth, for the coverage, is exact on procedural scenes and rendered on captures: from the
+    baseline, so that every stage is scored on the same pixels.
+    """
+    views: Views = getattr(scene, split)
+    surface = jax.jit(scene.surface) if scene.surface else None
+    count = jax.jit(count_seen)
+    targets = []
+    for i, name in enumerate(scene.names[split]):
+        camera = camera_at(views.cameras, i)
+        exact = surface(camera) if surface else None
+        landmarks = None if exact else find_landmarks(camera, scene.points)
+        depth = exact.depth if exact else render(camera).depth
+        pixels = pixel_grid(camera.height, camera.width)
+        seen = count(camera, pixels, depth, scene.train, train_depths)
+        rgb = to_float(jnp.asarray(views.rgb[i]))
+        weight = jnp.asarray(views.weight[i])
+        targets.append(Target(name, camera, rgb, weight, seen, exact, landmarks))
+    return targets
+
+
+def targets_by_split(
+    scene: Scene,
+    train_depths: jax.Array,
+    exact: jax.Array | None,
+    render: Callable[[Camera], Rendering],
+) -> dict[str, list[Target]]:
+    """`make_targets` of all splits but the training one; with `exact` depths where there are."""
+    seen_from = train_depths if exact is None else exact
+    return {
+        split: make_targets(scene, split, seen_from, render)
+        for split in scene.names
+        if split != "train"
+    }
+
+
+def score(
+    rendering: Rendering, target: Target, perceptual: Perceptual = NO_PERCEPTUAL
+) -> dict[str, float | str | None]:
+    """Metrics of one view, on 8-bit colors; what cannot be computed is None beside its reason."""
+    rows, columns = _frame(np.asarray(target.weight))
+
+    def crop(array):
+        return array[rows, columns]
+
+    image, truth, weight = map(crop, (rendering.rgb, target.rgb, target.weight))
+    image, truth = _as_8_bits(image, truth)
+    seen = crop(target.seen)
+    values = {}
+    for least in SEEN_BY:
+        counted = np.where(seen >= least, weight, 0)
+        for key, value in _masked_metrics(image, truth, counted).items():
+            values[f"{key}_seen{least}"] = value
+        share = (counted > 0).sum() / max((np.asarray(weight) > 0).sum(), 1)
+        values[f"coverage_seen{least}"] = share
+    if target.surface is not None:
+        values |= surface_error(target.camera, rendering, target.surface)
+    if target.landmarks is not None:
+        values |= point_depth_error(rendering.depth, target.landmarks)
+    return score_image(image, truth, weight, perceptual, values)
+
+
+def score_image(
+    image: jax.Array,
+    truth: jax.Array,
+    weight: jax.Array,
+    perceptual: Perceptual = NO_PERCEPTUAL,
+    more: Mapping[str, jax.Array | float] | None = None,
+) -> dict[str, float | str | None]:
+    """Metrics of one image `[H, W, 3]`, on 8-bit colors.
+
+    Args:
+      image: what was rendered.
+      truth: what it should be.
+      weight: `[H, W]` of each pixel.
+      perceptual: networks of LPIPS, for which pixels without weight show the truth.
+      more: metrics that are known already.
+
+    Returns:
+      Each metric; what cannot be computed is None beside its reason, and equal images have an
+      infinite PSNR, which is None too.
+    """
+    image, truth = _as_8_bits(image, truth)
+    values = dict(_full_metrics(image, truth, weight)) | dict(more or {})
+    finite_image, smallest = np.isfinite(image).all(), min(truth.shape[:2])
+    result: dict[str, float | str | None] = {}
+    for key, value in values.items():
+        result[key] = float(value) if np.isfinite(value) else None
+        if result[key] is not None:
+            continue
+        if not finite_image:
+            reason = "the rendering is not finite"
+        elif np.isposinf(value):
+            reason = "equals the truth"
+        elif "ssim" in key and smallest < SSIM_TAPS:
+            reason = f"SSIM needs {SSIM_TAPS} pixels a side"
+        else:
+            reason = "no pixel of this view counts"
+        result[f"{key}_reason"] = reason
+    for backbone in BACKBONES:
+        key = f"lpips_{backbone}"
+        result[key], reason = None, perceptual.reasons.get(backbone)
+        if reason is None and not finite_image:
+            reason = "the rendering is not finite"
+        elif reason is None and smallest < SMALLEST[backbone]:
+            reason = f"LPIPS needs {SMALLEST[backbone]} pixels a side"
+        elif reason is None:
+            result[key] = float(_lpips(perceptual.networks[backbone], image, truth, weight))
+        if reason is not None:
+            result[f"{key}_reason"] = reason
+    return result
+
+
+def summarize(views: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Means over views of every metric that some view has, and the views themselves."""
+    keys = sorted({key for values in views.values() for key in values if "_reason" not in key})
+    summary: dict[str, Any] = {}
+    for key in keys:
+        known = [values[key] for values in views.values() if values.get(key) is not None]
+        summary[key] = float(np.mean(known)) if known else None
+        if not known:
+            reasons = (values.get(f"{key}_reason") for values in views.values())
+            summary[f"{key}_reason"] = next(filter(None, reasons))
+    return summary | {"views": {name: dict(values) for name, values in views.items()}}
+
+
+def evaluate(
+    render: Callable[[Camera], Rendering],
+    targets: Sequence[Target],
+    perceptual: Perceptual = NO_PERCEPTUAL,
+) -> tuple[dict[str, Any], dict[str, Rendering]]:
+    """Render and score every target; returns the summary and the renderings by name."""
+    renderings = {target.name: jax.device_get(render(target.camera)) for target in targets}
+    scores = {t.name: score(renderings[t.name], t, perceptual) for t in targets}
+    return summarize(scores), renderings
+
+
+def _as_8_bits(image, truth):
+    # Before what is compiled, where products may be fused and equal images differ by rounding.
+    return quantize(image), quantize(truth)
+
+
+@jax.jit
+def _full_metrics(image, truth, weight):
+    metrics = {"psnr": psnr, "cc_psnr": cc_psnr, "ssim": _ssim}
+    return {name: metric(image, truth, weight=weight) for name, metric in metrics.items()}
+
+
+@jax.jit
+def _masked_metrics(image, truth, weight):
+    return {
+        "psnr": psnr(image, truth, weight=weight),
+        "ssim": _ssim(image, truth, weight=weight),
+    }
+
+
+@jax.jit
+def _lpips(network, image, truth, weight):
+    return lpips(network, jnp.where(weight[..., None] > 0, image, truth), truth)
+
+
+def _ssim(image, truth, *, weight):
+    return ssim(image, truth, weight=weight) if min(truth.shape[:2]) >= SSIM_TAPS else jnp.nan
+
+
+def _frame(weight: np.ndarray) -> tuple[slice, slice]:
+    """The smallest rectangle that holds all weight: photographs are padded at two sides."""
+    rows, columns = np.nonzero(weight.any(axis=1))[0], np.nonzero(weight.any(axis=0))[0]
+    if not len(rows):
+        return slice(None), slice(None)
+    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)

@@ -1,0 +1,78 @@
+"""How far rendered surfaces are from the true one, or from a capture's own points."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcloseup.field import Rendering
+from jaxcloseup.geometry.cameras import Camera, points_to_pixels
+from jaxcloseup.geometry.masks import in_bounds
+from jaxcloseup.scene import Surface
+from jaxcloseup.splats.regularizers import depth_to_normal
+
+
+class Landmarks(NamedTuple):
+    """Points of a capture that a view shows.
+
+    Attributes:
+      row, column: `[P]` the pixels that hold them.
+      depth: `[P]` their z-depth.
+    """
+
+    row: np.ndarray
+    column: np.ndarray
+    depth: np.ndarray
+
+
+_CELLS = 24  # of the image's width, in each of which what is nearest hides the rest
+_THICKNESS = 0.05  # relative depth behind the nearest point that it does not hide
+
+
+def find_landmarks(camera: Camera, points: np.ndarray) -> Landmarks:
+    """Those of the points `[P, 3]` in front of a camera that no nearer one beside them hides."""
+    pixels, depth = points_to_pixels(camera, jnp.asarray(points))
+    shown = np.asarray(in_bounds(pixels, camera.height, camera.width) & (depth > 0))
+    pixels, depth = np.asarray(pixels)[shown], np.asarray(depth)[shown]
+    column, row = np.floor(pixels).astype(int).T
+    side = max(camera.width / _CELLS, 1)
+    cell = (row / side).astype(int) * (_CELLS + 1) + (column / side).astype(int)
+    nearest = np.full(cell.max(initial=0) + 1, np.inf)
+    np.minimum.at(nearest, cell, depth)
+    visible = depth <= (1 + _THICKNESS) * nearest[cell]
+    return Landmarks(row[visible], column[visible], depth[visible])
+
+
+def point_depth_error(depth: np.ndarray, landmarks: Landmarks) -> dict[str, float]:
+    """Relative error of rendered depth `[H, W]` at landmarks: median and 90th percentile."""
+    if not len(landmarks.depth):
+        return {"point_depth_error_median": np.nan, "point_depth_error_p90": np.nan}
+    rendered = np.asarray(depth)[landmarks.row, landmarks.column]
+    error = np.abs(rendered - landmarks.depth) / landmarks.depth
+    return {
+        "point_depth_error_median": float(np.median(error)),
+        "point_depth_error_p90": float(np.percentile(error, 90)),
+    }
+
+
+@jax.jit
+def surface_error(camera: Camera, rendering: Rendering, surface: Surface) -> dict[str, jax.Array]:
+    """Relative errors of depth and angles between normals, in degrees, against the exact surface.
+
+    Normals are the surfels' own, or those of a NeRF's rendered depth.
+    """
+    surfels = getattr(rendering.aux, "surfels", None)
+    normal = depth_to_normal(camera, rendering.depth) if surfels is None else surfels.normal
+    length = jnp.linalg.norm(normal, axis=-1)
+    cosine = jnp.sum(normal * surface.normal, axis=-1) / jnp.where(length > 0, length, 1)
+    hit = surface.depth > 0
+    angle = jnp.where(hit & (length > 0), jnp.rad2deg(jnp.arccos(jnp.clip(cosine, -1, 1))), jnp.nan)
+    error = jnp.abs(rendering.depth - surface.depth) / jnp.where(hit, surface.depth, 1)
+    error = jnp.where(hit, error, jnp.nan)
+    return {
+        "depth_error_median": jnp.nanmedian(error),
+        "depth_error_p90": jnp.nanpercentile(error, 90.0),
+        "normal_error_median": jnp.nanmedian(angle),
+        "normal_error_p90": jnp.nanpercentile(angle, 90.0),
+    }

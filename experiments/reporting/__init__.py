@@ -1,0 +1,1 @@
+"""What people read: tables, plots, pictures and the report's page."""

@@ -1,0 +1,108 @@
+"""The pictures of a run: renders, side-by-side comparisons, labels."""
+
+import pathlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from experiments.evaluation.scores import Target
+from experiments.reporting.report import SPLIT_TITLES, Picture
+from jaxcloseup.artifacts.images import colorize_depth, colorize_error, side_by_side, write_png
+from jaxcloseup.field import Rendering
+from jaxcloseup.geometry.cameras import Camera, pixel_grid
+from jaxcloseup.pseudo import PseudoSettings, best_source, make_label, sample_virtual_camera
+from jaxcloseup.scenes import Scene
+
+
+SHOWN_LABELS = 6
+
+
+def write_renders(folder: pathlib.Path, renderings: Mapping[str, Rendering], scene: Scene) -> None:
+    """Write `rgb/<name>.png` and `depth/<name>.png`, the depth in color over the scene's range."""
+    for name, rendering in renderings.items():
+        write_png(folder / "rgb" / f"{name}.png", rendering.rgb)
+        depth = colorize_depth(rendering.depth, near=scene.near, far=scene.far)
+        write_png(folder / "depth" / f"{name}.png", depth)
+
+
+def write_truth(folder: pathlib.Path, targets: Mapping[str, Sequence[Target]]) -> None:
+    """Write `<split>/rgb/<name>.png`, what renders are scored against, as anyone may again."""
+    for split, views in targets.items():
+        for target in views:
+            write_png(folder / split / "rgb" / f"{target.name}.png", target.rgb)
+
+
+def comparisons(
+    folder: pathlib.Path,
+    targets: Mapping[str, Sequence[Target]],
+    renderings: Mapping[tuple[str, str], Mapping[str, Rendering]],
+) -> list[Picture]:
+    """Write `<name>.png`: truth, every stage, error of the last; returns them for the report.
+
+    A name that an earlier split has taken is prefixed with its split; a split that no stage has
+    rendered, as where every arm of a sweep failed, has no pictures.
+    """
+    pictures, written = [], set()
+    for split, views in targets.items():
+        stages = [stage for stage, of_split in renderings if of_split == split]
+        for target in views if stages else ():
+            images = [renderings[stage, split][target.name].rgb for stage in stages]
+            truth = np.asarray(target.rgb)
+            error = colorize_error(np.abs(images[-1] - truth).mean(axis=-1))
+            panels = [truth, *images, error]
+            labels = ["truth", *stages, f"error of {stages[-1]}"]
+            image = side_by_side(map(enlarge, panels), labels=labels)
+            name = f"{split}_{target.name}" if target.name in written else target.name
+            written.add(name)
+            write_png(folder / f"{name}.png", image)
+            pictures.append(Picture(SPLIT_TITLES[split], target.name, image))
+    return pictures
+
+
+def enlarge(image: np.ndarray | jax.Array) -> np.ndarray:
+    """A small image with its pixels repeated, to be at least 240 wide."""
+    image = np.asarray(image)
+    factor = -(-240 // image.shape[1])
+    return image.repeat(factor, axis=0).repeat(factor, axis=1)
+
+
+def label_pictures(
+    key: jax.Array,
+    targets: Sequence[Target],
+    folder: pathlib.Path,
+    *,
+    scene: Scene,
+    settings: PseudoSettings,
+    depths: jax.Array,
+    render_depth: Callable[[Camera], jax.Array],
+) -> list[Picture]:
+    """Write pictures of labels: of random virtual views, and of the held-out close-ups."""
+    label_image = jax.jit(make_label)
+    sample = jax.jit(sample_virtual_camera)
+    shots: list[tuple[str, Camera, jax.Array, Any, Any]] = []
+    for i, one in enumerate(jax.random.split(key, SHOWN_LABELS)):
+        camera, index = sample(one, scene.train, depths, settings)
+        truth = scene.surface(camera).rgb if scene.surface else None
+        shots.append((f"virtual_{i}", camera, render_depth(camera), index, truth))
+    nearest = jax.jit(best_source)
+    for target in targets[:SHOWN_LABELS]:
+        depth = render_depth(target.camera)
+        index = nearest(target.camera, scene.train, depths, depth=depth)
+        shots.append((f"closeup_{target.name}", target.camera, depth, index, target.rgb))
+    pictures = []
+    for name, camera, depth, index, truth in shots:
+        pixels = pixel_grid(camera.height, camera.width)
+        label = label_image(camera, pixels, depth, index, scene.train, depths, settings)
+        kept = np.where(label.weight[..., None] > 0, label.rgb, 0)
+        panels = {"backward warp": label.backward, "forward warp": label.forward, "kept": kept}
+        panels["mask"] = np.repeat(np.asarray(label.weight)[..., None], 3, axis=-1)
+        panels["rendered depth"] = colorize_depth(depth, near=scene.near, far=scene.far)
+        if truth is not None:
+            panels["truth"] = np.asarray(truth)
+        image = side_by_side(map(enlarge, panels.values()), labels=list(panels))
+        write_png(folder / f"{name}.png", image)
+        source = scene.names["train"][int(index)]
+        pictures.append(Picture("Pseudo-labels", f"{name}, from {source}", image))
+    return pictures

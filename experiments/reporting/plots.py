@@ -1,0 +1,72 @@
+"""Line plots as SVG text, to stand inside a page."""
+
+import io
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import matplotlib
+
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+
+# Same data, same file: without names drawn at random and without a date. Text stays text.
+_STYLE = {"svg.hashsalt": "jaxcloseup", "svg.fonttype": "none", "font.size": 10}
+
+
+class Curve(NamedTuple):
+    """One line of a plot.
+
+    Attributes:
+      name: for the legend.
+      x, y: its points.
+      low, high: of an interval at each point, if there is one.
+    """
+
+    name: str
+    x: Sequence[float]
+    y: Sequence[float]
+    low: Sequence[float] | None = None
+    high: Sequence[float] | None = None
+
+
+def line_plot(
+    curves: Sequence[Curve],
+    *,
+    x: str,
+    y: str,
+    title: str,
+    doubling: bool = False,
+    level: float | None = None,
+) -> str:
+    """An `<svg>` element.
+
+    Args:
+      curves: one line each, told apart by color and by mark.
+      x, y: names of the axes, with units.
+      title: of the plot.
+      doubling: x on a scale of doublings, with a tick at each point.
+      level: where a thin horizontal line is drawn.
+    """
+    with plt.style.context(["tableau-colorblind10", _STYLE]):
+        figure, axes = plt.subplots(figsize=(6.5, 3.6), layout="constrained")
+        for curve, marker in zip(curves, "os^Dvx*P" * len(curves), strict=False):
+            (line,) = axes.plot(curve.x, curve.y, marker=marker, label=curve.name, markersize=4)
+            if curve.low is not None:
+                axes.fill_between(
+                    curve.x, curve.low, curve.high, color=line.get_color(), alpha=0.15, linewidth=0
+                )
+        if level is not None:
+            axes.axhline(level, color="black", linewidth=0.6)
+        if doubling:
+            ticks = sorted({value for curve in curves for value in curve.x})
+            axes.set_xscale("log", base=2)
+            axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+        axes.set(xlabel=x, ylabel=y, title=title)
+        axes.grid(alpha=0.3)
+        axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
+        text = io.StringIO()
+        figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
+        plt.close(figure)
+    return text.getvalue()[text.getvalue().index("<svg") :]

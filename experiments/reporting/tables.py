@@ -1,0 +1,268 @@
+"""Tables of a sweep: means over seeds and scenes, and intervals of differences from control.
+
+An interval says how the mean difference of these trained models varies with the views that happen
+to be looked at; how it varies with the seed is for the standard deviation.
+"""
+
+import csv
+import html
+import io
+import itertools
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from experiments.evaluation.ladder import MAGNIFICATIONS, PREFIX
+from experiments.reporting.plots import Curve, line_plot
+from experiments.reporting.report import SPLIT_TITLES, STYLE, Picture, figures, write_json
+from jaxcloseup.files import write_file
+
+
+RESAMPLES = 4000
+
+
+class Row(NamedTuple):
+    """One arm on one kind of views.
+
+    Attributes:
+      arm: its name.
+      split: of the views.
+      psnr: mean over scenes, seeds and views, dB.
+      spread: standard deviation over seeds of the mean over scenes and views, of those seeds that
+        have all of them; None of one seed.
+      ssim: mean.
+      lpips: mean, with VGG.
+      gain: mean difference of PSNR from control, or None without one.
+      low, high: its 95 % interval; None of a single view.
+      count: images, of all scenes, seeds and views, that the means are over.
+      skipped: steps that were not finite, of all seeds and scenes.
+    """
+
+    arm: str
+    split: str
+    psnr: float
+    spread: float | None
+    ssim: float | None
+    lpips: float | None
+    gain: float | None
+    low: float | None
+    high: float | None
+    count: int
+    skipped: int
+
+
+def paired_bootstrap(
+    differences: Sequence[np.ndarray], *, resamples: int = RESAMPLES, share: float = 0.95
+) -> tuple[float, float] | tuple[None, None]:
+    """Interval of the mean of paired differences, by resampling groups of them.
+
+    Args:
+      differences: of each group, which is drawn as a whole: the seeds of a view, for these resemble
+        each other.
+      resamples: how often.
+      share: of the resampled means that lie within.
+    """
+    means = np.array([np.mean(group) for group in differences])
+    if len(means) < 2:
+        return None, None
+    chosen = np.random.default_rng(0).integers(0, len(means), (resamples, len(means)))
+    low, high = np.quantile(means[chosen].mean(axis=1), [(1 - share) / 2, (1 + share) / 2])
+    return float(low), float(high)
+
+
+def rows(scenes: Mapping[str, Mapping[str, Any]]) -> list[Row]:
+    """A row for each split and arm.
+
+    Args:
+      scenes: for each scene the metrics that `run_sweep` returns.
+    """
+    table = []
+    arms = _arms(scenes)
+    for split in SPLIT_TITLES:
+        for arm in arms:
+            psnr = _by_view(scenes, arm, split, "psnr")
+            if not psnr:
+                continue
+            by_seed: dict[str, list[float]] = {}
+            for (_, seed, _), value in psnr.items():
+                by_seed.setdefault(seed, []).append(value)
+            most = max(map(len, by_seed.values()))
+            seeds = [float(np.mean(values)) for values in by_seed.values() if len(values) == most]
+            skipped = sum(
+                result["skipped"]
+                for of_scene in scenes.values()
+                for result in of_scene.get(arm, {}).values()
+            )
+            table.append(
+                Row(
+                    arm,
+                    split,
+                    float(np.mean(list(psnr.values()))),
+                    float(np.std(seeds, ddof=1)) if len(seeds) > 1 else None,
+                    *(_mean(scenes, arm, split, metric) for metric in ("ssim", "lpips_vgg")),
+                    *(gain_over_control(scenes, arm, split) or (None, None, None)),
+                    len(psnr),
+                    skipped,
+                )
+            )
+    return table
+
+
+def gain_over_control(
+    scenes: Mapping[str, Mapping[str, Any]], arm: str, split: str
+) -> tuple[float, float | None, float | None] | None:
+    """Mean difference of an arm's PSNR from control, and its interval; None if there is none."""
+    if arm == "control":
+        return None
+    control = _by_view(scenes, "control", split, "psnr")
+    pairs: dict[tuple[str, str], list[float]] = {}
+    for (scene, seed, view), value in _by_view(scenes, arm, split, "psnr").items():
+        if (scene, seed, view) in control:
+            pairs.setdefault((scene, view), []).append(value - control[scene, seed, view])
+    if not pairs:
+        return None
+    groups = [np.array(group) for group in pairs.values()]
+    return float(np.mean([group.mean() for group in groups])), *paired_bootstrap(groups)
+
+
+def gain_curves(scenes: Mapping[str, Mapping[str, Any]]) -> list[Curve]:
+    """For each arm the gain over control against magnification, with its interval."""
+    curves = []
+    for arm in _arms(scenes):
+        found = {}
+        for m in MAGNIFICATIONS:
+            gain = gain_over_control(scenes, arm, f"{PREFIX}{m}")
+            if gain is not None:
+                found[m] = gain
+        if found:
+            gains, lows, highs = map(list, zip(*found.values(), strict=True))
+            known = (lows, highs) if None not in lows else ()
+            curves.append(Curve(arm, list(found), gains, *known))
+    return curves
+
+
+def print_sweep(scenes: Mapping[str, Mapping[str, Any]]) -> None:
+    """Print a table for each kind of views."""
+    header, *body = _cells(rows(scenes))
+    for title, lines in itertools.groupby(body, key=lambda line: line[0]):
+        table = Table(*header[1:], title=title)
+        for line in lines:
+            table.add_row(*line[1:])
+        Console().print(table)
+
+
+def write_sweep(
+    folder: pathlib.Path,
+    scenes: Mapping[str, Any],
+    about: Mapping[str, Any],
+    pictures: Sequence[Picture] = (),
+) -> None:
+    """Write sweep.json, table.md, table.csv and report.html.
+
+    Args:
+      folder: where.
+      scenes: for each scene the metrics that `run_sweep` returns.
+      about: how they were made.
+      pictures: for the report.
+    """
+    found = rows(scenes)
+    write_json(folder / "sweep.json", {"scenes": scenes, **about})
+    header, *body = _cells(found)
+    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
+    lines += ["| " + " | ".join(line) + " |" for line in body]
+    write_file(folder / "table.md", "\n".join([*lines, ""]).encode())
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(Row._fields)
+    writer.writerows(found)
+    write_file(folder / "table.csv", text.getvalue().encode())
+    title = f"Sweep: {about['method']}, preset {about['preset']}, {', '.join(scenes)}"
+    parts = [
+        "<!doctype html><html lang=en><meta charset=utf-8>",
+        "<meta name=viewport content='width=device-width'>",
+        f"<title>{html.escape(title)}</title><style>{STYLE}</style><h1>{html.escape(title)}</h1>",
+        "<p>Means over scenes, seeds and views, and the standard deviation over seeds. The gain is "
+        "the difference from <i>control</i>, further steps without labels, on the same views, with "
+        "its 95 % interval over views drawn again. All take as many steps, but for "
+        "<i>baseline</i>, which takes none, and <i>test_time</i>, which has its own number.</p>",
+        "<div class=wide><table><tr>",
+        *(f"<th>{html.escape(cell)}" for cell in header),
+        *("<tr>" + "".join(f"<td>{html.escape(cell)}" for cell in line) for line in body),
+        "</table></div>",
+    ]
+    curves = gain_curves(scenes)
+    if curves:
+        parts += [
+            "<h2>Against magnification</h2><p>Gain over control, of cameras that come nearer and "
+            "nearer to points of the ordinary views; shaded is the 95 % interval.</p>",
+            "<div class=plots>",
+            line_plot(
+                curves,
+                x="times nearer",
+                y="PSNR above control (dB)",
+                title="Gain",
+                doubling=True,
+                level=0,
+            ),
+            "</div>",
+        ]
+    parts += [*figures(pictures), "</html>"]
+    write_file(folder / "report.html", "\n".join(parts).encode())
+
+
+def _arms(scenes):
+    return list(dict.fromkeys(arm for of_scene in scenes.values() for arm in of_scene))
+
+
+def _mean(scenes, arm, split, metric):
+    values = list(_by_view(scenes, arm, split, metric).values())
+    return float(np.mean(values)) if values else None
+
+
+def _by_view(scenes, arm, split, metric):
+    """A metric by (scene, seed, view), where it is known."""
+    return {
+        (scene, seed, view): values[metric]
+        for scene, of_scene in scenes.items()
+        for seed, result in of_scene.get(arm, {}).items()
+        for view, values in result["splits"].get(split, {"views": {}})["views"].items()
+        if values.get(metric) is not None
+    }
+
+
+def _cells(found):
+    def number(value, pattern="{:.2f}"):
+        return "-" if value is None else pattern.format(value)
+
+    body = [
+        [
+            SPLIT_TITLES[row.split],
+            row.arm,
+            number(row.psnr),
+            number(row.spread),
+            number(row.ssim, "{:.4f}"),
+            number(row.lpips, "{:.4f}"),
+            number(row.gain, "{:+.3f}"),
+            "-" if row.low is None else f"{row.low:+.3f} to {row.high:+.3f}",
+            str(row.count),
+            str(row.skipped),
+        ]
+        for row in found
+    ]
+    header = [
+        "views",
+        "arm",
+        "PSNR (dB)",
+        "s.d.",
+        "SSIM",
+        "LPIPS",
+        "gain (dB)",
+        "95 %",
+        "n",
+        "skipped",
+    ]
+    return [header, *body]

@@ -1,0 +1,1 @@
+"""How a scene is trained: the stages of a run, the arms of a sweep, and what both keep."""

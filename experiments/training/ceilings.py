@@ -1,0 +1,78 @@
+"""Views that are labeled once, before the first step: the wanted ones, and ceilings of labels."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from experiments.evaluation.audit import resolved_by_photographs
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.geometry.union_warp import block_sources
+from jaxcloseup.photographs import Views, camera_at
+from jaxcloseup.pseudo import PseudoSettings, label_views, sample_virtual_camera
+from jaxcloseup.scenes import Scene
+
+
+CEILING_VIEWS = 64
+
+
+def true_close_ups(
+    key: jax.Array,
+    scene: Scene,
+    depths: jax.Array,
+    exact: jax.Array,
+    settings: PseudoSettings,
+    *,
+    blurred: bool,
+) -> Views:
+    """Random virtual close-ups with their true pixels, where a training view sees the surface.
+
+    The ceiling of what labels can do: no photograph holds so much detail, unless `blurred` leaves
+    of it what the nearest one resolves.
+    """
+    sample, surface = jax.jit(sample_virtual_camera), jax.jit(scene.surface)
+    images = []
+    for one in jax.random.split(key, CEILING_VIEWS):
+        camera, _ = sample(one, scene.train, depths, settings)
+        resolved, seen = resolved_by_photographs(scene, camera, exact)
+        rgb = resolved if blurred else surface(camera).rgb
+        images.append(Views(camera, jnp.asarray(rgb, jnp.float32), jnp.asarray(seen, jnp.float32)))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *images)
+
+
+def labels_of_less_error(
+    key: jax.Array,
+    scene: Scene,
+    depths: jax.Array,
+    exact: jax.Array,
+    render_depths: Callable[[Camera], jax.Array],
+    settings: PseudoSettings,
+    *,
+    share: float,
+) -> Views:
+    """Random virtual close-ups with labels whose depth has a share of its error left.
+
+    What better geometry would bring: 1 is depth as it was trained, 0 the exact one.
+
+    Args:
+      key: random key.
+      scene: with `surface`.
+      depths: `[V, H, W]` trained depths of the training views; 0 where undefined.
+      exact: `[V, H, W]` exact ones.
+      render_depths: stacked cameras `[Q]` to their trained depths `[Q, H, W]`.
+      settings: of poses and labels.
+      share: of the error.
+    """
+
+    def mix(trained, true):
+        return jnp.where((trained > 0) & (true > 0), true + share * (trained - true), 0)
+
+    sample, surface = jax.jit(sample_virtual_camera), jax.jit(scene.surface)
+    keys = jax.random.split(key, CEILING_VIEWS)
+    cameras = [sample(one, scene.train, depths, settings)[0] for one in keys]
+    cameras = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
+    true = jnp.stack([surface(camera_at(cameras, i)).depth for i in range(CEILING_VIEWS)])
+    targets, mixed = mix(render_depths(cameras), true), mix(depths, exact)
+    sources = jax.jit(block_sources)(scene.train.cameras, mixed, scene.train.weight)
+    data = cameras, targets, scene.train, mixed, settings
+    return jax.jit(label_views)(*data, sources=sources)

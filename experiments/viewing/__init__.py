@@ -1,0 +1,1 @@
+"""Looking at a stored run: cameras, frames, and the viewer's page."""

@@ -1,0 +1,320 @@
+"""Cameras to render: of a capture's views, of a file, on an orbit, on a dolly towards the surface.
+
+Poses are camera-to-world in the scene's own world: for a capture that of its `transforms*.json`.
+"""
+
+import math
+import pathlib
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcloseup.captures.json_fields import number, read_object, rigid_transform
+from jaxcloseup.geometry.cameras import Camera, pixels_to_points
+from jaxcloseup.geometry.poses import closeup_position
+from jaxcloseup.photographs import Views, camera_at
+from jaxcloseup.scenes import Scene, SceneError
+
+
+OPENGL = np.diag([1.0, -1, -1])  # y and z change sign between OpenGL's frame and OpenCV's
+_RIGID = 1e-3
+
+
+class CameraError(Exception):
+    """Cameras that cannot be had. The message is one sentence that says what to do."""
+
+
+class Shots(NamedTuple):
+    """What to render.
+
+    Attributes:
+      cameras: stacked `[Q]`.
+      names: one for each, for files.
+      fps: frames a second that the file asks for, or None.
+    """
+
+    cameras: Camera
+    names: list[str]
+    fps: float | None = None
+
+
+def view_shots(scene: Scene, split: str) -> Shots:
+    """The cameras of a split of the scene, by their photographs' names."""
+    views: Views | None = getattr(scene, split, None) if split in scene.names else None
+    if views is None:
+        raise CameraError(
+            f"--views={split}: {scene.name} has no such views: choose " + ", ".join(scene.names)
+        )
+    return Shots(views.cameras, list(scene.names[split]))
+
+
+def read_camera_path(path: pathlib.Path) -> Shots:
+    """The cameras of a `camera_path.json`, nerfstudio's, in the world of the scene.
+
+    Read are `render_height`, `render_width`, `fps` or `seconds`, and for each entry of
+    `camera_path` its `camera_to_world` (16 numbers by rows, OpenGL) and `fov` (vertical, degrees;
+    else the file's `default_fov`). Pixels are square, so `aspect` says nothing new and is not read.
+
+    Raises:
+      CameraError: names the file, the entry and the field.
+    """
+    try:
+        fields = read_object(path, "a camera_path")
+    except SceneError as error:
+        raise CameraError(str(error)) from None
+    kind = fields.get("camera_type", "perspective")
+    if kind != "perspective":
+        raise CameraError(f"{path}: camera_type is {kind!r}: only perspective can be rendered")
+    height, width = (_size(path, fields, key) for key in ("render_height", "render_width"))
+    entries = fields.get("camera_path")
+    if not isinstance(entries, list) or not entries:
+        raise CameraError(f"{path}: camera_path must be a list of one camera or more")
+    poses, focals = [], []
+    for i, entry in enumerate(entries):
+        label = f"{path}: camera_path[{i}]"
+        if not isinstance(entry, dict):
+            raise CameraError(f"{label} must be an object with camera_to_world and fov")
+        poses.append(_pose(label, entry))
+        fov = _number(label, {"fov": fields.get("default_fov"), **entry}, "fov")
+        if not 0 < fov < 180:
+            raise CameraError(f"{label}: fov must be between 0 and 180 degrees, not {fov:g}")
+        focals.append(height / 2 / math.tan(math.radians(fov) / 2))
+    fps = None
+    if fields.get("fps") is not None:
+        fps = _number(str(path), fields, "fps")
+    elif fields.get("seconds") is not None:
+        fps = len(entries) / max(_number(str(path), fields, "seconds"), 1e-9)
+    if fps is not None and not 0 < fps <= 1000:
+        raise CameraError(f"{path}: fps and seconds must be positive, and give 1000 fps at most")
+    intrinsics = [[f, f, width / 2, height / 2] for f in focals]
+    return Shots(_stack(poses, intrinsics, height, width), _numbered(len(poses)), fps)
+
+
+def read_camera_transform(path: pathlib.Path) -> tuple[np.ndarray, float]:
+    """The `transform` `[3, 4]`, float64, and the `scale` of a `dataparser_transforms.json`.
+
+    Raises:
+      SceneError: names the file and the field.
+    """
+    fields = read_object(path, "a transform and a scale")
+    transform = rigid_transform(str(path), "transform", fields.get("transform"))
+    return transform, number(str(path), "scale", fields.get("scale"), above=0)
+
+
+def to_capture(shots: Shots, transform: np.ndarray, scale: float, scene: Scene) -> Shots:
+    """Cameras of nerfstudio's world in that of the scene.
+
+    nerfstudio moves a point x of the capture's original world, which is the scene's world before
+    the `applied_transform` of its `transforms.json`, to scale * transform (x, 1). Of the scale that
+    it records the `applied_scale` is a part; its cameras do not have it.
+
+    Args:
+      shots: cameras that nerfstudio shows.
+      transform: `[3, 4]`.
+      scale: of positions.
+      scene: that nerfstudio was given.
+
+    Raises:
+      SceneError: the `applied_transform` does not go with the transform.
+    """
+    last = [0.0, 0, 0, 1]
+    applied = scene.metadata.get("applied_transform")
+    back = np.linalg.inv(np.vstack([transform, last]))
+    back = (np.eye(3, 4) if applied is None else applied) @ back
+    back = rigid_transform(scene.name, "applied_transform after --camera_transform", back)
+    scale /= scene.metadata.get("applied_scale", 1.0)
+    poses = np.asarray(shots.cameras.camtoworld, np.float64) / [1, 1, 1, scale]
+    poses = back[:, :3] @ poses + back[:, 3:] * [0, 0, 0, 1]
+    camtoworld = jnp.asarray(poses, jnp.float32)
+    return shots._replace(cameras=shots.cameras.replace(camtoworld=camtoworld))
+
+
+def orbit(scene: Scene, frames: int, *, up: Sequence[float] | None = None) -> Shots:
+    """Cameras on a circle around what the training cameras look at, all looking there.
+
+    The circle has the training cameras' median height over that point and their median distance
+    from the vertical through it; lens and size are those of the first training view.
+
+    Args:
+      scene: of the training cameras.
+      frames: how many.
+      up: direction `[3]` of the vertical, in the world; by default the cameras' mean one.
+    """
+    cameras = scene.train.cameras
+    positions, rotations = (np.asarray(a, np.float64) for a in (cameras.position, cameras.rotation))
+    forward = rotations[..., 2]
+    center = looked_at(positions, forward, near=scene.near, far=scene.far)
+    up = _unit(-rotations[..., 1].mean(axis=0) if up is None else np.asarray(up, np.float64))
+    offset = positions - center
+    height = np.median(offset @ up)
+    flat = offset - (offset @ up)[:, None] * up
+    radius = np.median(np.linalg.norm(flat, axis=1))
+    # Two axes across `up`; the first frame is as near to the first training view as can be.
+    start = flat[0] if np.linalg.norm(flat[0]) > 1e-6 else np.cross(up, forward[0])
+    east = _unit(start)
+    north = np.cross(up, east)
+    poses = []
+    for angle in np.arange(frames) * (2 * np.pi / frames):
+        position = radius * (np.cos(angle) * east + np.sin(angle) * north) + height * up
+        poses.append(look(center + position, center, up))
+    intrinsics = np.tile(np.asarray(cameras.intrinsics[0]), (frames, 1))
+    return Shots(_stack(poses, intrinsics, cameras.height, cameras.width), _numbered(frames))
+
+
+def looked_at(positions: np.ndarray, forward: np.ndarray, *, near: float, far: float) -> np.ndarray:
+    """The point `[3]` nearest to all lines of sight, or, where that is no point that they see, the
+    mean of what lies half-way (in inverse depth) between `near` and `far`.
+
+    Args:
+      positions: `[V, 3]` of the cameras.
+      forward: `[V, 3]` their viewing directions, of unit length.
+      near: least depth.
+      far: largest depth.
+    """
+    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
+    matrix, vector = across.sum(0), np.einsum("vij,vj->i", across, positions)
+    point = np.linalg.lstsq(matrix, vector, rcond=1e-6)[0]
+    depth = np.sum((point - positions) * forward, axis=1)
+    if near <= np.median(depth) <= far:
+        return point
+    middle = 2 / (1 / near + 1 / far)
+    return np.mean(positions + middle * forward, axis=0)
+
+
+def find_view(scene: Scene, name: str) -> int:
+    """The index of a training view by its name, with or without the ending of its file."""
+    names = scene.names["train"]
+    for wanted in (name, pathlib.Path(name).stem):
+        if wanted in names:
+            return names.index(wanted)
+    some = ", ".join(names[:3]) + (f" ... {names[-1]}" if len(names) > 3 else "")
+    raise CameraError(f"--from={name} is no training view of {scene.name}: there are {some}")
+
+
+def check_pixel(camera: Camera, pixel: tuple[float, float]) -> tuple[int, int]:
+    """Row and column of a pixel (x, y) of a camera."""
+    x, y = pixel
+    if not (0 <= x < camera.width and 0 <= y < camera.height):
+        raise CameraError(
+            f"--pixel={x:g},{y:g} is outside of the view, which was trained with "
+            f"{camera.width} x {camera.height} pixels"
+        )
+    return int(y), int(x)
+
+
+def dolly(
+    camera: Camera,
+    pixel: tuple[float, float],
+    depth: float,
+    *,
+    magnification: float,
+    frames: int,
+) -> Shots:
+    """Cameras from a view towards the surface at a pixel, without turning.
+
+    The last one is `magnification` times nearer to the surface; the apparent size grows by the same
+    factor from frame to frame. A single frame is the last one.
+
+    Args:
+      camera: of the view.
+      pixel: (x, y) of it.
+      depth: z-depth of the surface there.
+      magnification: at least 1.
+      frames: how many.
+    """
+    anchor = pixels_to_points(camera, jnp.asarray(pixel, jnp.float32), jnp.float32(depth))
+    powers = np.linspace(0, 1, frames) if frames > 1 else np.ones(1)
+    poses = []
+    for power in powers:
+        position = closeup_position(anchor, camera.position, magnification**power)
+        poses.append(np.column_stack([camera.rotation, position]))
+    intrinsics = np.tile(np.asarray(camera.intrinsics), (frames, 1))
+    return Shots(_stack(poses, intrinsics, camera.height, camera.width), _numbered(frames))
+
+
+def resized(camera: Camera, width: int | None, height: int | None) -> Camera:
+    """A camera, or stacked ones, with images of another size; of None the aspect is kept."""
+    if width is None and height is None:
+        return camera
+    if width is None:
+        width = max(1, round(height * camera.width / camera.height))
+    if height is None:
+        height = max(1, round(width * camera.height / camera.width))
+    x, y = width / camera.width, height / camera.height
+    scale = jnp.array([x, y, x, y], jnp.float32)
+    scale = scale.reshape((1,) * (camera.intrinsics.ndim - 1) + (4,))
+    return camera.replace(intrinsics=camera.intrinsics * scale, height=height, width=width)
+
+
+def one_by_one(shots: Shots) -> list[tuple[str, Camera]]:
+    """Names and single cameras."""
+    return [(name, camera_at(shots.cameras, i)) for i, name in enumerate(shots.names)]
+
+
+def _numbered(count: int) -> list[str]:
+    return [f"{i:04d}" for i in range(count)]
+
+
+def _stack(poses: Any, intrinsics: Any, height: int, width: int) -> Camera:
+    return Camera(
+        jnp.asarray(np.stack(poses), jnp.float32),
+        jnp.asarray(intrinsics, jnp.float32),
+        height,
+        width,
+    )
+
+
+def look(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Pose `[3, 4]` at a position `[3]`, looking at a target, in OpenCV's frame."""
+    forward = _unit(target - position)
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-6:  # straight up or down: any right will do
+        right = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
+    right = _unit(right)
+    return np.column_stack([right, np.cross(forward, right), forward, position])
+
+
+def _unit(vector):
+    return vector / max(np.linalg.norm(vector), 1e-12)
+
+
+def _pose(label, entry):
+    if "camera_to_world" not in entry:
+        raise CameraError(f"{label}: no camera_to_world: give 16 numbers, by rows")
+    try:
+        matrix = np.array(entry["camera_to_world"], np.float64)
+    except (TypeError, ValueError):
+        matrix = np.zeros(())
+    if matrix.size != 16 or not np.isfinite(matrix).all():
+        raise CameraError(f"{label}: camera_to_world must be 16 finite numbers, by rows")
+    matrix = matrix.reshape(4, 4)
+    if not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
+        raise CameraError(
+            f"{label}: camera_to_world must end in the row 0, 0, 0, 1: it may be transposed"
+        )
+    rotation = matrix[:3, :3]
+    error = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if error > _RIGID or np.linalg.det(rotation) < 0:
+        raise CameraError(
+            f"{label}: camera_to_world is not a rotation and a position: leave out scales and "
+            "reflections"
+        )
+    return np.column_stack([rotation @ OPENGL, matrix[:3, 3]])
+
+
+def _number(label, fields, key):
+    value = fields.get(key)
+    if value is None:
+        raise CameraError(f"{label}: no {key}: give it")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise CameraError(f"{label}: {key} must be a finite number, not {value!r}")
+    return float(value)
+
+
+def _size(path, fields, key):
+    value = _number(str(path), fields, key)
+    if value < 1 or value != int(value):
+        raise CameraError(f"{path}: {key} must be a whole number of pixels, not {value:g}")
+    return int(value)

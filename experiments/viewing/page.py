@@ -1,0 +1,285 @@
+"""The page of `experiments.view`: a run's scene, its photographs, and buttons. Needs Viser."""
+
+import functools
+import queue
+import time
+import traceback
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+from viser.transforms import SO3
+
+from experiments.training.loop import Programs, TrainingError
+from experiments.training.stages import training_depths
+from experiments.viewing.camera_paths import Shots, looked_at
+from experiments.viewing.frames import fine_tune, pictures
+from experiments.viewing.picking import (
+    closeup_camera,
+    rank_views,
+    ray_camera,
+    seen_camera,
+    vertical_fov,
+)
+from experiments.viewing.server import Server
+from jaxcloseup.artifacts.gaussians import as_gaussians
+from jaxcloseup.artifacts.images import encode_png, to_uint8
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.photographs import camera_at
+from jaxcloseup.splats import Surfels
+from jaxcloseup.train import TrainState, label_depth
+
+
+_HELP = """Click on the scene for a close-up of what is there, on a camera to go to it.
+A picture is rendered for the red camera, or else from where you are."""
+_BUSY = "There is still work to do: wait for it, and try again."
+_THUMBNAIL = 80  # pixels wide
+_SHOWN = 360  # what is narrower is drawn larger
+
+
+class ViewError(Exception):
+    """Something cannot be done here. The message is one sentence that says what to do."""
+
+
+class Viewer:
+    """What the page shows, and what its buttons do.
+
+    Viser calls back in threads of its own. Such a call leaves its work in a queue of one, which the
+    main thread empties: so nothing is computed twice at a time, and the page never waits.
+    """
+
+    def __init__(
+        self, server: Server, programs: Programs, state: TrainState, *, stage: str, seed: int
+    ) -> None:
+        """Fill the page.
+
+        Args:
+          server: Viser's.
+          programs: of the run.
+          state: what is shown, and what every fine-tuning starts from.
+          stage: its name.
+          seed: of the run.
+        """
+        self._server, self._programs, self._state = server, programs, state
+        self._scene, self._stage, self._seed = programs.scene, stage, seed
+        self._jobs: queue.Queue = queue.Queue(maxsize=1)
+        self._depths: jax.Array | None = None
+        self._camera: Camera | None = None  # of the close-up
+        self._aim: tuple[Camera, np.ndarray] | None = None  # its photograph's, and the point
+        self._picture: np.ndarray | None = None
+        self._visited = -np.inf  # when, seconds
+        cameras = self._scene.train.cameras
+        positions, rotations = (np.asarray(a) for a in (cameras.position, cameras.rotation))
+        near, far = self._scene.near, self._scene.far
+        center = looked_at(positions, rotations[..., 2], near=near, far=far)
+        self._distance = float(np.median(np.linalg.norm(positions - center, axis=1)))
+        gaps = np.linalg.norm(positions[:, None] - positions, axis=-1)
+        gap = np.median(np.sort(gaps)[:, 1]) if len(gaps) > 1 else np.inf
+        self._size = float(min(0.2 * gap, 0.04 * self._distance)) or 0.01 * self._distance
+        server.scene.set_up_direction(-rotations[..., 1].mean(axis=0))
+        self._add_scene()
+        self._cameras = server.scene.add_frame("/cameras", show_axes=False)
+        self._frustums = [self._add_photograph(i) for i in range(len(positions))]
+        self._add_controls()
+        server.on_client_connect(lambda client: self._visit(client, 0))
+        server.scene.on_click()(self._on_click)
+
+    def work(self, timeout: float | None = None) -> None:
+        """Wait for something to do, and do it.
+
+        Raises:
+          queue.Empty: there was nothing to do for `timeout` seconds.
+        """
+        what, job = self._jobs.get(timeout=timeout)
+        self._say(f"{what} ...")
+        start = time.perf_counter()
+        try:
+            self._say(f"{job()} ({time.perf_counter() - start:.1f} s)")
+        except (ViewError, TrainingError) as error:
+            self._say(str(error))
+        except Exception as error:  # whoever looks has more to lose than this picture
+            traceback.print_exc()
+            self._say(f"{what} failed ({type(error).__name__}): the terminal says more.")
+
+    def _add_scene(self):
+        scene, params = self._server.scene, self._state.params
+        if isinstance(params, Surfels):
+            found = as_gaussians(params, self._state.buffers.alive)
+            # Viser keeps covariances in 16 bits: the largest radius is 100 in the units it gets.
+            variances = np.trace(found.covariances, axis1=1, axis2=2)
+            unit = np.sqrt(variances.max(initial=1e-18)) / 100
+            scene.add_gaussian_splats(
+                "/surfels",
+                found.means / unit,
+                found.covariances / unit**2,
+                found.rgb,
+                found.opacities[:, None],
+                scale=unit,
+            )
+            # As the run's own renderer has it.
+            background = self._programs.preset.field.background or 0.0
+            scene.set_background_image(to_uint8(np.full((1, 1), background)))
+        elif len(self._scene.points):
+            size = 0.003 * self._distance
+            points, rgb = self._scene.points, to_uint8(self._scene.rgb[None])[0]
+            scene.add_point_cloud("/points", points, rgb, point_size=size)
+
+    def _add_photograph(self, index):
+        views = self._scene.train
+        photograph = to_uint8(views.rgb[index])
+        height = max(1, round(_THUMBNAIL * photograph.shape[0] / photograph.shape[1]))
+        photograph = cv2.resize(photograph, (_THUMBNAIL, height), interpolation=cv2.INTER_AREA)
+        name = f"/cameras/{self._scene.names['train'][index]}"
+        frustum = self._add_frustum(name, camera_at(views.cameras, index), photograph)
+        frustum.on_click(lambda event: self._visit(event.client, index))
+        return frustum
+
+    def _add_frustum(self, name, camera, image=None):
+        return self._server.scene.add_camera_frustum(
+            name,
+            vertical_fov(camera),
+            camera.width / camera.height,
+            scale=self._size,
+            thickness=1.5,
+            thickness_units="screen",
+            color=(150, 150, 150) if image is not None else (220, 0, 0),
+            image=image,
+            wxyz=_quaternion(camera),
+            position=np.asarray(camera.position),
+        )
+
+    def _add_controls(self):
+        gui = self._server.gui
+        gui.set_panel_label(f"{self._scene.name}, {self._stage}")
+        gui.add_markdown(_HELP)
+        self._nearer = gui.add_slider("times nearer", 1, 16, 0.5, 4)
+        self._nearer.on_update(lambda event: self._place(event.client))
+        shown = gui.add_checkbox("training cameras", initial_value=True)
+        shown.on_update(lambda _: setattr(self._cameras, "visible", shown.value))
+        buttons = {
+            "Camera here": self._on_here,
+            "Render": functools.partial(self._on_render, tuned=False),
+            "Fine-tune for it, and render": functools.partial(self._on_render, tuned=True),
+            "Download PNG": self._on_download,
+        }
+        for name, call in buttons.items():
+            gui.add_button(name).on_click(call)
+        self._status = gui.add_markdown("")
+        black = np.zeros((1, 1, 3), np.uint8)
+        self._image = gui.add_image(black, label="rendered", format="png", visible=False)
+        self._support = gui.add_image(black, label="support", format="png", visible=False)
+
+    def _say(self, sentence):
+        self._status.content = sentence
+        print(sentence, flush=True)
+
+    def _later(self, what, job):
+        try:
+            self._jobs.put_nowait((what, job))
+        except queue.Full:
+            self._status.content = _BUSY
+
+    def _visit(self, client, index):
+        """Bring a visitor to a training camera, whose photograph would hide the scene."""
+        self._visited = time.monotonic()
+        for i, frustum in enumerate(self._frustums):
+            frustum.visible = i != index
+        _bring(client, camera_at(self._scene.train.cameras, index), self._distance)
+
+    def _on_click(self, event):
+        # A click on a training camera is told a second time, as one on the scene.
+        if time.monotonic() - self._visited > 0.5:
+            ray = np.array(event.ray_origin), np.array(event.ray_direction)
+            self._later("looking there", lambda: self._aim_at(event.client, *ray))
+
+    def _on_here(self, event):
+        self._aim, self._camera = None, self._seen_by(event.client)
+        self._show_camera()
+
+    def _on_render(self, event, *, tuned):
+        camera = self._camera if self._camera is not None else self._seen_by(event.client)
+        what = "fine-tuning for this camera" if tuned else "rendering"
+        self._later(what, lambda: self._render(camera, tuned))
+
+    def _on_download(self, event):
+        if self._picture is None:
+            self._status.content = "There is no picture yet: render one."
+        else:
+            name = f"{self._scene.name}_{self._stage}.png"
+            event.client.send_file_download(name, encode_png(self._picture), save_immediately=True)
+
+    def _aim_at(self, client, origin, direction):
+        """Put the close-up's camera in front of the surface along a ray."""
+        views = self._scene.train
+        focal = float(np.median(np.asarray(views.cameras.intrinsics)[:, 1]))
+        ray = ray_camera(origin, direction, focal)
+        seen = label_depth(self._programs.render(self._state, ray), near=0, far=np.inf)
+        depth = float(seen[1, 1])
+        if depth <= 0:
+            raise ViewError("There is no surface: click where the scene is.")
+        point = np.asarray(ray.position) + depth * np.asarray(ray.rotation)[:, 2]
+        data = (jnp.asarray(a, jnp.float32) for a in (point, direction))
+        ranks = np.asarray(rank_views(views, self._training_depths(), *data))
+        if not ranks.any():
+            raise ViewError("No photograph shows what is there: click somewhere else.")
+        best = int(ranks.argmax())
+        self._aim = camera_at(views.cameras, best), point
+        self._place(client)
+        shown = f"{np.count_nonzero(ranks)} of {len(ranks)} photographs show that"
+        return f"{shown}; the camera came nearer from {self._scene.names['train'][best]}"
+
+    def _place(self, client):
+        """The close-up's camera as far from the point as the slider says."""
+        aim = self._aim  # once: another thread may forget it meanwhile
+        if aim is None:
+            return
+        source, point = aim
+        self._camera = closeup_camera(source, point, self._nearer.value)
+        self._show_camera()
+        if client is not None:
+            _bring(client, self._camera, np.linalg.norm(point - np.asarray(self._camera.position)))
+
+    def _show_camera(self):
+        self._add_frustum("/closeup", self._camera)
+
+    def _render(self, camera, tuned):
+        depths, state = self._training_depths(), self._state
+        if tuned:
+            shots = Shots(jax.tree.map(lambda leaf: leaf[None], camera), ["closeup"])
+            state = fine_tune(self._programs, state, depths, shots, most=None)
+        images = pictures(self._programs, state, camera, depths=depths)
+        self._picture = picture = to_uint8(images["rgb"])
+        factor = -(-_SHOWN // picture.shape[1])
+        self._image.image = picture.repeat(factor, axis=0).repeat(factor, axis=1)
+        self._support.image = images["support"]
+        self._image.visible = self._support.visible = True
+        if tuned and state is self._state:
+            return "No labels are let in for this camera, so nothing was fine-tuned; rendered"
+        return "Fine-tuned and rendered" if tuned else "Rendered"
+
+    def _training_depths(self):
+        if self._depths is None:
+            self._depths = training_depths(self._programs, self._state, self._seed)
+        return self._depths
+
+    def _seen_by(self, client):
+        """The camera of a visitor, of the photographs' size."""
+        rotation = SO3(client.camera.wxyz).as_matrix()
+        like = self._scene.train.cameras
+        return seen_camera(rotation, client.camera.position, client.camera.fov, like)
+
+
+def _bring(client, camera, distance):
+    """Give a visitor a camera's pose and field of view, to turn about what is so far ahead."""
+    position, forward = np.asarray(camera.position), np.asarray(camera.rotation)[:, 2]
+    with client.atomic():
+        client.camera.position = position
+        client.camera.look_at = position + distance * forward
+        client.camera.wxyz = _quaternion(camera)
+        client.camera.fov = vertical_fov(camera)
+        client.camera.near, client.camera.far = distance / 100, 1000 * distance
+
+
+def _quaternion(camera):
+    return SO3.from_matrix(np.asarray(camera.rotation, np.float64)).wxyz

@@ -1,0 +1,1 @@
+"""Captures from disk: formats, lenses, masks, splits, and a cache of reduced photographs."""

@@ -1,0 +1,129 @@
+"""COLMAP's sparse models, read with pycolmap.
+
+COLMAP's cameras look along z with y down and its pixel centers are at +0.5, as here; its poses are
+world-to-camera.
+"""
+
+import collections
+import pathlib
+from typing import Any
+
+import numpy as np
+
+from jaxcloseup.captures.colmap_files import check_files
+from jaxcloseup.captures.distortion import read_distortion
+from jaxcloseup.captures.frames import Frame, check_photographs
+from jaxcloseup.captures.json_fields import number
+from jaxcloseup.scene import SceneError
+
+
+_FIELDS = {"f": "fl_x", "fx": "fl_x", "fy": "fl_y", "k": "k1"}  # others are called alike
+
+
+def holds_model(folder: pathlib.Path) -> bool:
+    """Whether a COLMAP model, whole or not, lies in a folder."""
+    return any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))
+
+
+def read_colmap(
+    model: pathlib.Path, photographs: pathlib.Path
+) -> tuple[pathlib.Path, list[Frame], tuple[np.ndarray, np.ndarray]]:
+    """A sparse model, binary or text, with or without the rigs and frames of COLMAP 3.12.
+
+    Args:
+      model: the folder of cameras, images and points3D; binary wins where both are.
+      photographs: the folder in which the images are.
+
+    Returns:
+      The file that lists the images; the images that have a pose, by name; and the points `[P, 3]`
+      with their colors `[P, 3]` in [0, 1], float32, by number.
+
+    Raises:
+      SceneError: names the file and what in it, and says what to do.
+    """
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise SceneError(
+            f"{model} is a COLMAP model, and pycolmap, which reads it, is not installed: "
+            "pip install 'jaxcloseup[colmap]'."
+        ) from error
+    suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"
+
+    def count_parameters(name: int | str) -> int:
+        name = int(name) if suffix == ".bin" else str(name)
+        kinds = pycolmap.CameraModelId
+        kind = kinds(name) if suffix == ".bin" else kinds.__members__[name]
+        return len(pycolmap.Camera.create_from_model_id(1, kind, 1.0, 1, 1).params)
+
+    check_files(model, suffix, count_parameters)
+    reconstruction = pycolmap.Reconstruction()
+    read = reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text
+    try:
+        read(str(model))
+    except Exception as error:  # pycolmap raises what its checks in C++ happen to throw
+        reason = " ".join(str(error).split())
+        raise SceneError(
+            f"{model}: its files do not belong together ({reason}): export the model again."
+        ) from error
+
+    source, cameras = model / f"images{suffix}", model / f"cameras{suffix}"
+    lenses = {i: _lens(cameras, camera) for i, camera in reconstruction.cameras.items()}
+    images = [image for image in reconstruction.images.values() if image.has_pose]
+    images.sort(key=lambda image: image.name)
+    _check_names(source, [image.name for image in images])
+    numbers = sorted(reconstruction.points3D)
+    rows = {point: row for row, point in enumerate(numbers)}
+    frames = []
+    for image in images:
+        world_to_camera = image.cam_from_world().matrix()
+        rotation = world_to_camera[:, :3].T
+        lens, size = lenses[image.camera_id]
+        seen = {point.point3D_id for point in image.get_observation_points2D()}
+        frames.append(
+            Frame(
+                source=source,
+                listed=image.name,
+                file=photographs / image.name,
+                mask=None,
+                camtoworld=np.column_stack([rotation, -rotation @ world_to_camera[:, 3]]),
+                size=size,
+                lens=(lens, {}),
+                distortion=read_distortion(f"{cameras}: camera {image.camera_id}", lens),
+                seen=np.array(sorted(rows[point] for point in seen), np.int64),
+            )
+        )
+    check_photographs(source, frames)
+    points = [reconstruction.points3D[i] for i in numbers]
+    xyz = np.array([point.xyz for point in points], np.float32).reshape(-1, 3)
+    rgb = np.array([point.color for point in points], np.float32).reshape(-1, 3) / 255
+    return source, frames, (xyz, rgb)
+
+
+def _lens(file: pathlib.Path, camera: Any) -> tuple[dict[str, Any], tuple[int, int]]:
+    """A camera as the fields of `transforms.json`, and its (width, height)."""
+    label = f"{file}: camera {camera.camera_id}"
+    size = (
+        int(number(label, "width", camera.width, above=0)),
+        int(number(label, "height", camera.height, above=0)),
+    )
+    names = [name.strip() for name in camera.params_info.split(",")]
+    values = dict(zip(names, map(float, camera.params), strict=True))
+    for name, value in values.items():
+        number(label, name, value, above=0 if name in ("f", "fx", "fy") else -np.inf)
+    lens = {_FIELDS.get(name, name): value for name, value in values.items()}
+    return {"camera_model": camera.model_name, **lens}, size
+
+
+def _check_names(source: pathlib.Path, names: list[str]) -> None:
+    if not names:
+        raise SceneError(
+            f"{source} has no image with a pose: solve the cameras again with photographs that "
+            "overlap more."
+        )
+    twice = [name for name, count in collections.Counter(names).items() if count > 1]
+    if twice:
+        raise SceneError(
+            f"{source} lists {twice[0]!r} more than once ({len(twice)} such names): delete all but "
+            "one of each from the model."
+        )

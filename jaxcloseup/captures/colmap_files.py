@@ -1,0 +1,189 @@
+"""Checks of COLMAP's files before its own reader sees them.
+
+That reader fills what a truncated file lacks with whatever is in memory, and its complaints about
+text name no file. Formats: https://colmap.github.io/format.html
+"""
+
+import math
+import pathlib
+import struct
+from collections.abc import Callable
+
+from jaxcloseup.scene import SceneError
+
+
+NAMES = ("cameras", "images", "points3D")
+
+
+def check_files(
+    folder: pathlib.Path, suffix: str, count_parameters: Callable[[int | str], int]
+) -> None:
+    """Walk through a model's cameras, images and points, and complain of what cannot be right.
+
+    Args:
+      folder: holds the model.
+      suffix: ".bin" or ".txt".
+      count_parameters: of a camera model, by its number or its name; a ValueError for others.
+
+    Raises:
+      SceneError: names the file, and the line or record in it.
+    """
+    missing = [name + suffix for name in NAMES if not (folder / (name + suffix)).is_file()]
+    if missing:
+        raise SceneError(f"{folder}: {', '.join(missing)} is missing: copy the whole model again.")
+    for name in NAMES:
+        path = folder / (name + suffix)
+        try:
+            data = path.read_bytes()
+        except OSError as error:
+            raise SceneError(
+                f"{path} cannot be read ({error.strerror}): restore the file."
+            ) from error
+        if suffix == ".bin":
+            _check_binary(path, data, count_parameters)
+        else:
+            _check_text(path, data, count_parameters)
+    for path in (folder / "rigs.bin", folder / "frames.bin"):  # of COLMAP 3.12, and optional
+        if suffix == ".bin" and path.is_file():
+            _check_binary(path, path.read_bytes(), count_parameters)
+
+
+def _check_binary(path, data, count_parameters):
+    walk = _WALKS[path.stem]
+    if not data:
+        raise SceneError(f"{path} is empty: copy or export it again.")
+    count, end = int.from_bytes(data[:8], "little"), 8
+    for record in range(count if len(data) >= 8 else 1):
+        try:
+            end = walk(path, data, end, count_parameters)
+        except struct.error:
+            end = len(data) + 1
+        if end > len(data):
+            raise SceneError(
+                f"{path} is truncated, it ends in record {record + 1} of {count}: copy or export "
+                "it again."
+            )
+    if end != len(data):
+        raise SceneError(
+            f"{path} has {len(data) - end} bytes after its {count} records: copy or export it "
+            "again."
+        )
+
+
+def _walk_camera(path, data, at, count_parameters):
+    camera, model, _, _ = struct.unpack_from("<IiQQ", data, at)
+    return at + 24 + 8 * _parameters(path, f"camera {camera}", model, count_parameters)
+
+
+def _walk_image(path, data, at, _):
+    (image,) = struct.unpack_from("<I", data, at)
+    pose = struct.unpack_from("<7d", data, at + 4)
+    end = data.find(b"\0", at + 64)
+    if end < 0:
+        raise struct.error
+    name = data[at + 64 : end].decode("utf-8", "replace")
+    _check_pose(f"{path}: image {image} ({name})", pose)
+    (observations,) = struct.unpack_from("<Q", data, end + 1)
+    return end + 9 + 24 * observations
+
+
+def _walk_point(path, data, at, _):
+    point, *position = struct.unpack_from("<Q3d", data, at)
+    if not all(map(math.isfinite, position)):
+        raise SceneError(
+            f"{path}: point {point} has a position that is not finite: export the model again."
+        )
+    (track,) = struct.unpack_from("<Q", data, at + 43)
+    return at + 51 + 8 * track
+
+
+def _walk_rig(path, data, at, _):
+    _, sensors = struct.unpack_from("<II", data, at)
+    at += 8 + 8 * min(sensors, 1)  # the first is the origin, the others have a pose or none
+    for _ in range(sensors - 1):
+        *_, has_pose = struct.unpack_from("<iIB", data, at)
+        at += 9 + 56 * has_pose
+    return at
+
+
+def _walk_frame(path, data, at, _):
+    frame, _, *pose, photographs = struct.unpack_from("<II7dI", data, at)
+    _check_pose(f"{path}: frame {frame}", pose)
+    return at + 68 + 16 * photographs
+
+
+_WALKS = {
+    **{"cameras": _walk_camera, "images": _walk_image, "points3D": _walk_point},
+    **{"rigs": _walk_rig, "frames": _walk_frame},
+}
+
+
+def _check_text(path, data, count_parameters):
+    try:
+        lines = data.decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise SceneError(f"{path}: not UTF-8 text: export it again as UTF-8.") from error
+    numbered = [(i, line.split()) for i, line in enumerate(lines, 1) if line[:1] != "#"]
+    if path.stem == "images":
+        while numbered and not numbered[0][1]:
+            numbered.pop(0)
+        # A line without points is empty, and the last one may be left out.
+        for number, words in numbered[1::2]:
+            if len(words) % 3:
+                raise SceneError(
+                    f"{path}: line {number} holds {len(words)} numbers and not x, y and a point's "
+                    "number over and over: export it again."
+                )
+        numbered = numbered[::2]
+    least = {"cameras": 4, "images": 10, "points3D": 8}[path.stem]
+    for number, words in numbered:
+        if not words:
+            continue
+        label = f"{path}: line {number}"
+        if len(words) < least:
+            raise SceneError(f"{label} ends after {len(words)} fields: export it again.")
+        try:
+            if path.stem == "images":
+                _check_pose(f"{path}: image {words[0]} ({words[9]})", [*map(float, words[1:8])])
+            elif path.stem == "points3D":
+                _check_finite(label, [*map(float, words[:8])])
+            else:
+                _check_finite(label, [float(words[2]), float(words[3]), *map(float, words[4:])])
+        except ValueError as error:
+            if isinstance(error, SceneError):
+                raise
+            raise SceneError(f"{label} holds a word for a number: export it again.") from error
+        if path.stem == "cameras":
+            expected = _parameters(path, f"camera {words[0]}", words[1], count_parameters)
+            if len(words) != 4 + expected:
+                raise SceneError(
+                    f"{label}: {words[1]} has {expected} parameters, got {len(words) - 4}: export "
+                    "it again."
+                )
+
+
+def _parameters(path, camera, model, count_parameters):
+    try:
+        return count_parameters(model)
+    except (ValueError, KeyError) as error:
+        raise SceneError(
+            f"{path}: {camera} has the unknown camera model {model}: undistort the photographs "
+            "with COLMAP's image_undistorter first, or copy the file again."
+        ) from error
+
+
+def _check_pose(label, pose):
+    if not all(map(math.isfinite, pose)):
+        raise SceneError(
+            f"{label}: its pose is not finite: delete the image from the model or solve it again."
+        )
+    if not any(pose[:4]):
+        raise SceneError(
+            f"{label}: its rotation is 0, 0, 0, 0: delete the image from the model or solve it "
+            "again."
+        )
+
+
+def _check_finite(label, values):
+    if not all(map(math.isfinite, values)):
+        raise SceneError(f"{label} holds a value that is not finite: export the model again.")

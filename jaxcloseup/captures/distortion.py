@@ -1,0 +1,141 @@
+"""Lenses that bend: photographs resampled to those of a pinhole camera.
+
+Formulas are OpenCV's, which COLMAP, nerfstudio and instant-ngp share. Intrinsics are ours (the
+center of the top-left pixel is (0.5, 0.5)); OpenCV's centers are at whole numbers, so that half a
+pixel is taken off on the way in and no coordinate comes out.
+"""
+
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from jaxcloseup.captures.json_fields import number
+from jaxcloseup.scene import SceneError
+
+
+# The coefficients of each model, by the names that files give them; others must be 0.
+_RADIAL_TANGENTIAL = ("k1", "k2", "p1", "p2", "k3")
+_PERSPECTIVE = {
+    **dict.fromkeys(("PINHOLE", "SIMPLE_PINHOLE", "OPENCV"), _RADIAL_TANGENTIAL),
+    **dict.fromkeys(("SIMPLE_RADIAL", "RADIAL"), _RADIAL_TANGENTIAL),
+    "FULL_OPENCV": (*_RADIAL_TANGENTIAL, "k4", "k5", "k6"),
+}
+_FISHEYE = {"FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+_FISHEYE |= {"OPENCV_FISHEYE"}
+COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+
+
+class Distortion(NamedTuple):
+    """How a lens bends, as a hashable record.
+
+    Attributes:
+      fisheye: whether the angle off the axis, rather than its tangent, grows along the image.
+      coefficients: in OpenCV's order: k1, k2, p1, p2, k3, k4, k5, k6; of a fisheye k1, k2, k3, k4.
+    """
+
+    fisheye: bool
+    coefficients: tuple[float, ...]
+
+
+class Remap(NamedTuple):
+    """Where each pixel `[H, W]` of the pinhole photograph is found in the distorted one.
+
+    Attributes:
+      x: columns, float32, with OpenCV's integer centers.
+      y: rows.
+      inside: whether the distorted photograph shows it.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    inside: np.ndarray
+
+
+def read_distortion(label: str, lens: dict[str, Any]) -> Distortion | None:
+    """The distortion that a lens's fields describe, or None for a pinhole.
+
+    Args:
+      label: how messages name it.
+      lens: `camera_model`, `is_fisheye` and coefficients, each of them optional.
+
+    Raises:
+      SceneError: a model or a coefficient that is not known here.
+    """
+    model = lens.get("camera_model", "OPENCV")
+    name = str(model).upper()
+    given = {key: number(label, key, lens[key]) for key in COEFFICIENTS if key in lens}
+    if name not in _PERSPECTIVE and name not in _FISHEYE:
+        raise SceneError(
+            f"{label}: lens distortion (camera_model {model!r}) is not supported: undistort the "
+            "photographs to a pinhole camera first."
+        )
+    fisheye = name in _FISHEYE or bool(lens.get("is_fisheye"))
+    known = ("k1", "k2", "k3", "k4") if fisheye else _PERSPECTIVE[name]
+    strange = [key for key, value in given.items() if value and key not in known]
+    if strange:
+        # Programs do not agree on what k4 multiplies: r^8, or r^2 in a denominator.
+        kind = "OPENCV_FISHEYE" if fisheye else name
+        hint = "take FULL_OPENCV if OpenCV's rational model is meant, or " if not fisheye else ""
+        raise SceneError(
+            f"{label}: lens distortion (non-zero {', '.join(strange)}) is not supported with "
+            f"{kind}: {hint}undistort the photographs to a pinhole camera first."
+        )
+    if not fisheye and not any(given.values()):
+        return None
+    order = known if fisheye else (*_RADIAL_TANGENTIAL, "k4", "k5", "k6")
+    return Distortion(fisheye, tuple(given.get(key, 0.0) for key in order))
+
+
+def undistortion(
+    distortion: Distortion, intrinsics: tuple[float, float, float, float], width: int, height: int
+) -> Remap:
+    """The map from a pinhole photograph, of the same size and intrinsics, to the distorted one.
+
+    Args:
+      distortion: of the lens.
+      intrinsics: fx, fy, cx, cy in pixels, of both photographs.
+      width: in pixels.
+      height: in pixels.
+    """
+    fx, fy, cx, cy = intrinsics
+    matrix = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
+    coefficients = np.array(distortion.coefficients)
+    make = cv2.fisheye.initUndistortRectifyMap if distortion.fisheye else None
+    make = make or cv2.initUndistortRectifyMap
+    x, y = make(matrix, coefficients, np.eye(3), matrix, (width, height), cv2.CV_32FC1)
+    inside = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
+    across = (np.arange(width) + 0.5 - cx) / fx
+    down = (np.arange(height) + 0.5 - cy) / fy
+    radius = np.hypot(across[None, :], down[:, None])
+    return Remap(x, y, inside & (radius < _fold(distortion, float(radius.max()))))
+
+
+def undistort(image: np.ndarray, mask: np.ndarray, remap: Remap) -> tuple[np.ndarray, np.ndarray]:
+    """A photograph `[H, W, 3]` and its mask `[H, W]`, both uint8, as a pinhole camera takes them.
+
+    What the photograph does not show has mask 0, and the colors of its border.
+    """
+    # Cubic: the detail that a bilinear average takes away is what close-ups are made of.
+    image = cv2.remap(image, remap.x, remap.y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    mask = cv2.remap(mask, remap.x, remap.y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return image, np.where(remap.inside, mask, 0).astype(np.uint8)
+
+
+def _fold(distortion: Distortion, most: float) -> float:
+    """The radius from which on the radial polynomial turns back, or infinity.
+
+    Beyond it, directions that the lens never saw would land on the photograph again.
+    """
+    radius = np.linspace(0, most, 4096)
+    if distortion.fisheye:
+        angle = np.arctan(radius)
+        k1, k2, k3, k4 = distortion.coefficients
+        bent = angle * (1 + k1 * angle**2 + k2 * angle**4 + k3 * angle**6 + k4 * angle**8)
+    else:
+        k1, k2, _, _, k3, k4, k5, k6 = distortion.coefficients
+        square = radius**2
+        above, below = np.polyval([k3, k2, k1, 1], square), np.polyval([k6, k5, k4, 1], square)
+        bent = radius * above / np.where(below > 0, below, -1)  # past a pole counts as turned
+    back = np.flatnonzero(np.diff(bent) <= 0)
+    return float(radius[back[0]]) if len(back) else np.inf

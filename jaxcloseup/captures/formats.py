@@ -1,0 +1,184 @@
+"""What kind of capture a folder holds, and what it lists."""
+
+import pathlib
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxcloseup.captures.colmap import holds_model, read_colmap
+from jaxcloseup.captures.frames import Frame
+from jaxcloseup.captures.llff import read_llff
+from jaxcloseup.captures.masks import attach_masks
+from jaxcloseup.captures.points import read_ply_points
+from jaxcloseup.captures.reduced import attach_reduced
+from jaxcloseup.captures.splits import divide, listed_split, split_of_file, warn_duplicates
+from jaxcloseup.captures.transforms import read_transforms
+from jaxcloseup.scene import SceneError
+
+
+FORMATS = ("transforms", "colmap", "llff")
+_FILES = {
+    "train": ("transforms_train.json",),
+    "test": ("transforms_test.json",),
+    "test_far": ("transforms_test_far.json", "transforms_val.json"),
+}
+_SEPARATE, _SINGLE, _LLFF = "transforms_train.json", "transforms.json", "poses_bounds.npy"
+_MODELS = ("sparse/0", "sparse", "colmap/sparse/0")
+
+
+class Listing(NamedTuple):
+    """What a folder lists.
+
+    Attributes:
+      format: one of `FORMATS`.
+      folder: of the capture.
+      file: the file that speaks for the whole capture.
+      fields: its fields.
+      frames: for each split present the photographs, `train` first.
+      points: `[P, 3]` float32, possibly none.
+      rgb: `[P, 3]` their colors in [0, 1].
+      notes: sentences on what was read and how it was divided.
+      times_nearer: as `splits.Division` has it.
+    """
+
+    format: str
+    folder: pathlib.Path
+    file: pathlib.Path
+    fields: dict[str, Any]
+    frames: dict[str, list[Frame]]
+    points: np.ndarray
+    rgb: np.ndarray
+    notes: tuple[str, ...]
+    times_nearer: tuple[float, ...] | None
+
+
+class _Content(NamedTuple):
+    """A folder's photographs, and how its files divide them, if they do."""
+
+    file: pathlib.Path
+    fields: dict[str, Any]
+    frames: list[Frame]
+    given: dict[str, list[Frame]] | None
+    points: tuple[np.ndarray, np.ndarray]
+
+
+def read_listing(
+    path: pathlib.Path, *, format: str | None = None, split: str, zoom: int = 1, downscale: int = 1
+) -> Listing:
+    """The photographs of a folder by split; `load_scene` documents the arguments.
+
+    Raises:
+      SceneError: no known file in the folder, or something wrong in one.
+    """
+    found = [(kind, name) for kind, name in _detect(path) if format in (None, kind)]
+    if not found:
+        wanted = f" in the format {format}" if format else ""
+        raise SceneError(
+            f"{path} holds no capture{wanted}: neither {_SEPARATE} nor {_SINGLE}, nor a COLMAP "
+            f"model in {', '.join(_MODELS)} or in itself, nor {_LLFF} is there."
+        )
+    (kind, name), *others = found
+    folder = _folder_of_model(path) if name == "." else path
+    content = {"transforms": _read_transforms, "colmap": _read_model, "llff": _read_llff}[kind](
+        folder, path / name
+    )
+    called = folder.resolve().name
+    rejected = " or ".join(_describe(*other, path) for other in others)
+    note = f"{called}: reading {_describe(kind, name, path)}" + (
+        f" and not {rejected}" if rejected else ""
+    )
+    given = content.given or (split_of_file(folder, content.frames) if split == "given" else None)
+    points, rgb = content.points
+    division = divide(called, content.frames, given, split, points, zoom)
+    if split != "zoom":  # whose close-ups are what training photographs do not show
+        warn_duplicates(folder, division.frames)
+    frames, masked = attach_masks(folder, division.frames)
+    frames, reduced = attach_reduced(called, frames, downscale)
+    keep = _seen_in_training(frames, len(points))
+    notes = [note, *division.notes, *masked, *reduced]
+    if not keep.all():
+        notes.append(
+            f"{called}: {np.sum(~keep)} of {len(keep)} points, which fewer than two training "
+            "photographs see, are left out"
+        )
+    return Listing(
+        format=kind,
+        folder=folder,
+        file=content.file,
+        fields=content.fields,
+        frames=frames,
+        points=points[keep],
+        rgb=rgb[keep],
+        notes=tuple(notes),
+        times_nearer=division.times_nearer,
+    )
+
+
+def _detect(path: pathlib.Path) -> list[tuple[str, str]]:
+    """Formats and what speaks for them in a folder, in order of precedence."""
+    files = [("transforms", _SEPARATE), ("transforms", _SINGLE)]
+    found = [(kind, name) for kind, name in files if (path / name).is_file()]
+    found += [("colmap", name) for name in (*_MODELS, ".") if holds_model(path / name)]
+    return found + [("llff", _LLFF)] * (path / _LLFF).is_file()
+
+
+def _describe(kind: str, name: str, path: pathlib.Path) -> str:
+    if kind != "colmap":
+        return name
+    return f"the COLMAP model in {path.resolve().name if name == '.' else name}"
+
+
+def _folder_of_model(model: pathlib.Path) -> pathlib.Path:
+    """The capture to which a model's folder belongs: the next one around it with photographs."""
+    around = model.resolve()
+    candidates = (around, *around.parents)[:4]
+    return next((folder for folder in candidates if (folder / "images").is_dir()), model)
+
+
+def _read_transforms(folder: pathlib.Path, file: pathlib.Path) -> _Content:
+    if file.name == _SINGLE:
+        fields, frames = read_transforms(file)
+        given = listed_split(file, fields, frames)
+    else:
+        present = {
+            split: next((folder / name for name in names if (folder / name).is_file()), None)
+            for split, names in _FILES.items()
+        }
+        read = {split: read_transforms(path) for split, path in present.items() if path}
+        fields = read["train"][0]
+        given = {split: frames for split, (_, frames) in read.items()}
+        frames = [frame for members in given.values() for frame in members]
+    return _Content(file, fields, frames, given, _read_ply(file, fields))
+
+
+def _read_model(folder: pathlib.Path, model: pathlib.Path) -> _Content:
+    file, frames, points = read_colmap(model, folder / "images")
+    return _Content(file, {}, frames, None, points)
+
+
+def _read_llff(folder: pathlib.Path, file: pathlib.Path) -> _Content:
+    fields, frames = read_llff(file, folder / "images")
+    return _Content(file, fields, frames, None, _read_ply(file, fields))
+
+
+def _read_ply(file: pathlib.Path, fields: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    folder, named = file.parent, fields.get("ply_file_path")
+    if named and not (folder / str(named)).is_file():
+        raise SceneError(
+            f"{file}: ply_file_path {named!r} does not exist: restore it or drop the field."
+        )
+    ply = folder / str(named or "points3d.ply")
+    if ply.is_file():
+        return read_ply_points(ply)
+    return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
+
+
+def _seen_in_training(splits: dict[str, list[Frame]], count: int) -> np.ndarray:
+    """Whether two training photographs see each point, `[P]`, or True where files do not say.
+
+    A point that only held-out photographs see would tell training what is in them.
+    """
+    seen = [frame.seen for frame in splits["train"]]
+    if len(splits) == 1 or any(rows is None for rows in seen):
+        return np.ones(count, bool)
+    return np.bincount(np.concatenate(seen), minlength=count) >= 2

@@ -1,0 +1,75 @@
+"""LLFF's `poses_bounds.npy`, with the photographs in `images/`.
+
+Each row holds a 3 x 5 matrix and two depths. The matrix's columns are the camera's axes (down,
+right, backward) and its position in the world, then height, width and focal length in pixels; the
+depths bound what the camera sees.
+"""
+
+import pathlib
+from typing import Any
+
+import numpy as np
+
+from jaxcloseup.captures.frames import Frame
+from jaxcloseup.captures.json_fields import number, rigid_transform, side
+from jaxcloseup.captures.masks import list_photographs
+from jaxcloseup.scene import SceneError
+
+
+def read_llff(file: pathlib.Path, photographs: pathlib.Path) -> tuple[dict[str, Any], list[Frame]]:
+    """`near` and `far` of all photographs together, and the frames.
+
+    Rows belong to the photographs sorted by name. Near is 0.9 of the least bound, as in NeRF's own
+    loader, and far the greatest.
+
+    Raises:
+      SceneError: names the file and the row, and says what to do.
+    """
+    try:
+        rows = np.load(file, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise SceneError(
+            f"{file} is not a whole NumPy file of numbers: copy or export it again."
+        ) from error
+    if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
+        shape = " x ".join(map(str, getattr(rows, "shape", ()))) or "nothing"
+        raise SceneError(
+            f"{file} holds {shape}: it must be N x 17, a row for each photograph; export it again."
+        )
+    if rows.dtype.kind not in "fiu":
+        raise SceneError(f"{file} holds {rows.dtype} values and not numbers: export it again.")
+    files = list_photographs(photographs)
+    if len(files) != len(rows):
+        raise SceneError(
+            f"{file} has {len(rows)} poses and {photographs} {len(files)} photographs: restore "
+            "those that are missing, or take out those without a pose."
+        )
+    frames = [_frame(file, path, row) for path, row in zip(files, rows, strict=True)]
+    near, far = 0.9 * float(rows[:, 15].min()), float(rows[:, 16].max())
+    return {"near": near, "far": far}, frames
+
+
+def _frame(file: pathlib.Path, photograph: pathlib.Path, row: np.ndarray) -> Frame:
+    label = f"{file}: row of {photograph.name}"
+    height, width, focal = row[4:15:5].tolist()
+    size = side(label, "width", width), side(label, "height", height)
+    focal = number(label, "focal length", focal, above=0)
+    near, far = (
+        number(label, name, value, above=0)
+        for name, value in zip(("near bound", "far bound"), row[15:].tolist(), strict=True)
+    )
+    if near >= far:
+        raise SceneError(
+            f"{label}: near bound {near:.4g} is not less than far bound {far:.4g}: correct them."
+        )
+    down, right, backward, position = row[:15].reshape(3, 5)[:, :4].T.astype(np.float64)
+    pose = np.column_stack([right, down, -backward, position])
+    return Frame(
+        source=file,
+        listed=photograph.name,
+        file=photograph,
+        mask=None,
+        camtoworld=rigid_transform(label, "pose", pose),
+        size=size,
+        lens=({"fl_x": focal}, {}),
+    )

@@ -1,0 +1,178 @@
+"""Load a capture: photographs, cameras, points and depth range of one folder."""
+
+import logging
+import pathlib
+import warnings
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcloseup.captures.bounds import near_far_from_cameras, near_far_from_points
+from jaxcloseup.captures.checks import check_weights, warn_sizes
+from jaxcloseup.captures.formats import Listing, read_listing
+from jaxcloseup.captures.images import pad_images
+from jaxcloseup.captures.json_fields import affine_transform, number
+from jaxcloseup.captures.photo_reading import Photo, Reading, read_photos
+from jaxcloseup.captures.splits import unique_names
+from jaxcloseup.captures.triangulation import triangulate
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.photographs import Views
+from jaxcloseup.scene import NearFarWarning, Scene, SceneError
+
+
+_LEAST_POINTS = 100  # triangulated; fewer tell too little of where a scene is
+
+_log = logging.getLogger(__name__)
+
+
+def load_capture(
+    path: pathlib.Path, reading: Reading, *, format: str | None = None, split: str = "given"
+) -> Scene:
+    """Load the capture in a folder, as `jaxcloseup.scenes.load_scene` describes.
+
+    Raises:
+      SceneError: one sentence that names the file and the field and says what to do.
+    """
+    try:
+        if not path.is_dir():
+            raise SceneError(f"{path} is not a folder: give the one that holds the capture.")
+        listing = read_listing(
+            path, format=format, split=split, zoom=reading.zoom, downscale=reading.downscale
+        )
+    except OSError as error:  # of folders; what reads a file says more
+        raise SceneError(
+            f"{error.filename or path!s:.200} cannot be read ({error.strerror}): permit reading "
+            "it, or correct its name where a file lists it."
+        ) from error
+    for note in listing.notes:
+        _log.info(note)
+    scene = _load(listing, reading)
+    scene.metadata.update(path=path, split=split)
+    return scene
+
+
+def _load(listing: Listing, reading: Reading) -> Scene:
+    transform = listing.fields.get("applied_transform")
+    if transform is not None:
+        transform = affine_transform(str(listing.file), "applied_transform", transform)
+        if np.linalg.matrix_rank(transform[:, :3]) < 3:
+            raise SceneError(
+                f"{listing.file}: applied_transform flattens space, so that nothing leads back: "
+                "correct it."
+            )
+    scale = listing.fields.get("applied_scale", 1.0)
+    scale = number(str(listing.file), "applied_scale", scale, above=0)
+
+    parts = read_photos(listing.frames, reading)
+    photos = [photo for members in parts.values() for photo in members]
+    check_weights(listing.folder, listing.frames, photos, reading)
+    warn_sizes(listing.file.parent, photos)
+    intrinsics = np.stack([photo.intrinsics(reading.half_pixel) for photo in photos])
+    camtoworld = np.stack([photo.frame.camtoworld for photo in photos])
+    sizes = np.array([photo.size for photo in photos])
+    if not len(listing.points):
+        listing = _with_points(listing, parts["train"], camtoworld, intrinsics)
+    near, far = _near_far(listing, camtoworld, intrinsics, sizes)
+
+    width, height = sizes.max(0).tolist()
+    ends = np.cumsum([len(members) for members in parts.values()])[:-1]
+    rows = dict(zip(parts, np.split(np.arange(len(photos)), ends), strict=True))
+    views = {
+        split: Views(
+            cameras=Camera(
+                camtoworld=jnp.asarray(camtoworld[rows[split]], jnp.float32),
+                intrinsics=jnp.asarray(intrinsics[rows[split]], jnp.float32),
+                height=height,
+                width=width,
+            ),
+            rgb=jnp.asarray(pad_images([photo.rgb for photo in part], height, width)),
+            weight=jnp.asarray(pad_images([photo.mask for photo in part], height, width)) / 255,
+        )
+        for split, part in parts.items()
+    }
+    files = {split: [photo.frame.file for photo in part] for split, part in parts.items()}
+    names = {split: unique_names(paths) for split, paths in files.items()}
+    metadata = {
+        "downscale": reading.downscale,
+        "files": files,
+        "sizes": {split: [photo.size for photo in part] for split, part in parts.items()},
+        "applied_transform": transform,
+        "applied_scale": scale,
+        "format": listing.format,
+        "notes": listing.notes,
+    }
+    if listing.times_nearer is not None:
+        metadata["times_nearer"] = listing.times_nearer
+    if reading.zoom > 1:
+        metadata["corners"] = [photo.corner for photo in parts["test"]]
+        names["test"] = [f"{name}_zoom{reading.zoom}" for name in names["test"]]
+    return Scene(
+        name=listing.folder.resolve().name,
+        train=views["train"],
+        test=views.get("test"),
+        test_far=views.get("test_far"),
+        points=listing.points,
+        rgb=listing.rgb,
+        near=near,
+        far=far,
+        names=names,
+        metadata=metadata,
+    )
+
+
+def _with_points(
+    listing: Listing, photos: Sequence[Photo], camtoworld: np.ndarray, intrinsics: np.ndarray
+) -> Listing:
+    """A listing without points, with those that its training photographs agree on.
+
+    `photos` are these, and the first of the poses and intrinsics are theirs.
+    """
+    count = len(photos)  # held-out photographs tell nothing of what they show
+    if count < 2:
+        return listing
+    points, rgb = triangulate(
+        [photo.rgb for photo in photos],
+        [photo.mask for photo in photos],
+        camtoworld[:count],
+        intrinsics[:count],
+    )
+    if len(points) < _LEAST_POINTS:
+        return listing
+    note = (
+        f"{listing.folder.resolve().name} comes without points: {len(points)} were triangulated "
+        f"from features of its {count} training photographs"
+    )
+    _log.info(note)
+    return listing._replace(points=points, rgb=rgb, notes=(*listing.notes, note))
+
+
+def _near_far(
+    listing: Listing,
+    camtoworld: np.ndarray,
+    intrinsics: np.ndarray,
+    sizes: np.ndarray,
+) -> tuple[float, float]:
+    label = str(listing.file)
+    given = {
+        key: number(label, key, listing.fields[key], above=0)
+        for key in ("near", "far")
+        if listing.fields.get(key) is not None
+    }
+    near, far = given.get("near"), given.get("far")
+    if near is None or far is None:
+        estimate = near_far_from_points(listing.points, camtoworld, intrinsics, sizes)
+        source = "points" if estimate else "poses"
+        low, high = estimate or near_far_from_cameras(camtoworld)
+        near, far = near or low, far or high
+        absent = " and ".join(key for key in ("near", "far") if key not in given)
+        if source == "poses" or listing.format != "colmap":  # no field of COLMAP's could be given
+            warnings.warn(
+                f"{label}: no {absent}; from the {source}, near {near:.4g} and far {far:.4g} are "
+                "used: give both in world units if they do not hold the scene.",
+                NearFarWarning,
+                stacklevel=2,
+            )
+    if near >= far:
+        raise SceneError(f"{label}: near {near:.4g} is not less than far {far:.4g}: correct them.")
+    return near, far

@@ -1,0 +1,47 @@
+"""Initial points from PLY files."""
+
+import pathlib
+import warnings
+
+import numpy as np
+
+from jaxcloseup.ply import PlyError, read_vertices
+from jaxcloseup.scene import PointsWarning, SceneError
+
+
+def read_ply_points(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
+    """Positions `[P, 3]` and colors `[P, 3]` in [0, 1], float32, of a PLY file's vertices.
+
+    Any property order and any further properties are fine. Integer colors are scaled by their
+    type's range, floats above 1 by 255; a file without red, green, blue gives mid gray. Points that
+    are not finite are dropped with a warning.
+
+    Raises:
+      SceneError: not a PLY file, cut short, or vertices without x, y, z.
+    """
+    try:
+        vertices = read_vertices(path)
+    except PlyError as error:
+        raise SceneError(str(error)) from error
+    points = np.stack([vertices[axis] for axis in "xyz"], -1).astype(np.float32)
+    rgb = _colors(vertices)
+    finite = np.isfinite(points).all(-1) & np.isfinite(rgb).all(-1)
+    if not finite.all():
+        count, dropped = len(vertices), (~finite).sum()
+        warnings.warn(
+            f"{path}: {dropped} of {count} points are not finite and were dropped.",
+            PointsWarning,
+            stacklevel=2,
+        )
+    return points[finite], rgb[finite]
+
+
+def _colors(vertices: np.ndarray) -> np.ndarray:
+    names = ["red", "green", "blue"]
+    if not set(names) <= set(vertices.dtype.names):
+        return np.full((len(vertices), 3), 0.5, np.float32)
+    rgb = np.stack([vertices[name] for name in names], -1)
+    if rgb.dtype.kind in "iu":
+        return rgb.astype(np.float32) / np.iinfo(rgb.dtype).max
+    # Floats are meant to lie in [0, 1], but some programs write bytes' values as floats.
+    return rgb.astype(np.float32) / (255 if (rgb > 1).any() else 1)

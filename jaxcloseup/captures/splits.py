@@ -1,0 +1,247 @@
+"""Which photographs of a capture are trained on and which are held out."""
+
+import collections
+import json
+import pathlib
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxcloseup.captures.bounds import depths_in_view
+from jaxcloseup.captures.frames import Frame, frame_intrinsics
+from jaxcloseup.captures.images import read_image
+from jaxcloseup.scene import DuplicateFileWarning, SceneError, UnknownKeyWarning
+
+
+TEST_EVERY = 8
+CLOSEST_SHARE = 0.1
+SPLITS = ("given", "every8", "closest", "zoom")
+_LISTS = {"train": "train_filenames", "test": "test_filenames", "test_far": "val_filenames"}
+_SPLIT_FILE_KEYS = {"train", "test", "test_far", "unused"}
+
+
+class Division(NamedTuple):
+    """The photographs of a capture by split.
+
+    Attributes:
+      frames: for each split present the photographs, `train` first.
+      notes: sentences on how they were divided.
+      times_nearer: of `closest`, how many times nearer each photograph of `test` is than the median
+        one of `train`; of `zoom`, how many times finer each close-up is; else None.
+    """
+
+    frames: dict[str, list[Frame]]
+    notes: tuple[str, ...] = ()
+    times_nearer: tuple[float, ...] | None = None
+
+
+def listed_split(
+    file: pathlib.Path, fields: dict[str, Any], frames: Sequence[Frame]
+) -> dict[str, list[Frame]] | None:
+    """The splits that the fields of a single `transforms.json` list, if they do."""
+    lists = {key: (split, fields[key]) for split, key in _LISTS.items() if fields.get(key)}
+    by_path = {pathlib.PurePath(frame.listed): frame for frame in frames}
+    chosen = _choose(file, lists, lambda name: by_path.get(pathlib.PurePath(name)), "file_path")
+    return _with_train(file, chosen, frames) if chosen else None
+
+
+def split_of_file(folder: pathlib.Path, frames: Sequence[Frame]) -> dict[str, list[Frame]] | None:
+    """The splits of a folder's `split.json`, if there is one.
+
+    It is an object with lists `train`, `test`, `test_far` and `unused` of names of photographs;
+    one that is in none of them is not used either, unless there is no `train`.
+    """
+    file = folder / "split.json"
+    if not file.is_file():
+        return None
+    try:
+        fields = json.loads(file.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise SceneError(
+            f"{file} is not readable as JSON ({error}): correct or drop it."
+        ) from error
+    if not isinstance(fields, dict):
+        raise SceneError(f"{file} is not an object with lists train and test: correct or drop it.")
+    if unknown := sorted(set(fields) - _SPLIT_FILE_KEYS):
+        warnings.warn(
+            f"{file}: these fields are not read: {', '.join(unknown)}.",
+            UnknownKeyWarning,
+            stacklevel=2,
+        )
+    # A name that photographs of several folders have says nothing by itself.
+    bases = collections.Counter(frame.file.name for frame in frames)
+    by_name = {frame.file.name: frame for frame in frames if bases[frame.file.name] == 1}
+    by_name |= {frame.listed: frame for frame in frames}
+    lists = {key: (key, fields[key]) for key in fields if key in _SPLIT_FILE_KEYS and fields[key]}
+    chosen = _choose(file, lists, by_name.get, "name")
+    splits = _with_train(file, chosen, frames)
+    return {key: splits[key] for key in _LISTS if key in splits}
+
+
+def divide(
+    name: str,
+    frames: Sequence[Frame],
+    given: dict[str, list[Frame]] | None,
+    split: str,
+    points: np.ndarray,
+    zoom: int = 1,
+) -> Division:
+    """The photographs as `split` says.
+
+    Args:
+      name: of the capture, for notes.
+      frames: all of them.
+      given: as the capture's files divide them, or None where none does.
+      split: one of `SPLITS`. `given` takes every 8th where nothing is; `load_scene` has the rest.
+      points: `[P, 3]` of the world; `closest` needs some.
+      zoom: of `zoom`, how many times finer its close-ups are.
+    """
+    if split == "given" and given:
+        return Division(given)
+    frames = sorted({frame.file: frame for frame in frames}.values(), key=lambda f: f.listed)
+    if split == "closest":
+        return _closest(name, frames, points)
+    if split == "zoom":
+        return _zoom(name, frames, zoom)
+    parts = _every_eighth(frames)
+    reason = " lists no splits" if split == "given" else ""
+    return Division(
+        parts,
+        (
+            f"{name}{reason}: every {TEST_EVERY}th of its {len(frames)} photographs by name, "
+            f"{len(parts.get('test_far', ()))} in all, is test_far",
+        ),
+    )
+
+
+def unique_names(files: Sequence[pathlib.Path]) -> list[str]:
+    """A name for each file: its stem; where stems clash, its folder's name before it and so on."""
+    stems = [file.stem for file in files]
+    names = []
+    for file, stem in zip(files, stems, strict=True):
+        name = base = stem if stems.count(stem) == 1 else f"{file.parent.name}_{stem}"
+        repeat = 1
+        while name in names:
+            repeat += 1
+            name = f"{base}_{repeat}"
+        names.append(name)
+    return names
+
+
+def warn_duplicates(folder: pathlib.Path, splits: dict[str, list[Frame]]) -> None:
+    """Warn of photographs that are listed more than once."""
+    seen: dict[pathlib.Path, str] = {}
+    repeated = []
+    for split, members in splits.items():
+        for frame in members:
+            if frame.file in seen:
+                repeated.append(f"{frame.listed} ({seen[frame.file]} and {split})")
+            seen.setdefault(frame.file, split)
+    if repeated:
+        more = ", ..." if len(repeated) > 3 else ""
+        warnings.warn(
+            f"{folder} lists {len(repeated)} photographs again: "
+            f"{', '.join(repeated[:3])}{more}; a score on a photograph that was trained on says "
+            "nothing about new views.",
+            DuplicateFileWarning,
+            stacklevel=2,
+        )
+
+
+def _every_eighth(frames: Sequence[Frame]) -> dict[str, list[Frame]]:
+    if len(frames) == 1:
+        return {"train": list(frames)}
+    return {
+        "train": [frame for i, frame in enumerate(frames) if i % TEST_EVERY],
+        "test_far": [frame for i, frame in enumerate(frames) if i % TEST_EVERY == 0],
+    }
+
+
+def _closest(name: str, frames: Sequence[Frame], points: np.ndarray) -> Division:
+    if len(frames) < 2:
+        raise SceneError(f"{name}: split closest needs 2 photographs and there is 1: add some.")
+    sizes = [_size_of_pixel(frame, points) for frame in frames]
+    if not np.isfinite(sizes).any():
+        raise SceneError(
+            f"{name}: split closest needs points that the photographs see, and there are none: "
+            "load the COLMAP model, or give ply_file_path."
+        )
+    nearest = np.argsort(sizes, kind="stable")[: max(1, round(CLOSEST_SHARE * len(frames)))]
+    held_out = sorted(nearest.tolist())
+    rest = [frame for i, frame in enumerate(frames) if i not in held_out]
+    parts = _every_eighth(rest)
+    parts = {"train": parts["train"], "test": [frames[i] for i in held_out], **parts}
+    of_file = {frame.file: size for frame, size in zip(frames, sizes, strict=True)}
+    median = np.median([of_file[frame.file] for frame in parts["train"]])
+    ratios = tuple(float(median / sizes[i]) for i in held_out)
+    note = (
+        f"{name}: the {len(held_out)} nearest of {len(frames)} photographs are test, "
+        f"{min(ratios):.2f} to {max(ratios):.2f} times nearer (median {np.median(ratios):.2f}) "
+        f"than the median of {len(parts['train'])} training photographs; "
+        f"{len(parts.get('test_far', ()))} others are test_far"
+    )
+    return Division(parts, (note,), ratios)
+
+
+def _zoom(name: str, frames: Sequence[Frame], zoom: int) -> Division:
+    parts = _every_eighth(frames)
+    train, test = parts["train"], parts["train"][::TEST_EVERY]
+    note = (
+        f"{name}: its {len(train)} training photographs are reduced {zoom} times more, and the "
+        f"part with most detail of every {TEST_EVERY}th of them, not reduced, {len(test)} in all, "
+        f"is test: {zoom} times as fine, from the same places; "
+        f"{len(parts.get('test_far', ()))} others are test_far"
+    )
+    return Division({"train": train, "test": test, **parts}, (note,), (float(zoom),) * len(test))
+
+
+def _size_of_pixel(frame: Frame, points: np.ndarray) -> float:
+    """How much of the world a pixel of the original size covers, or infinity if nothing is seen."""
+    size = frame.size or read_image(frame.file).shape[1::-1]
+    intrinsics = frame_intrinsics(frame, *size)
+    if frame.seen is None:
+        depths = depths_in_view(points, frame.camtoworld, intrinsics, size)
+    else:
+        depths = (points[frame.seen] - frame.camtoworld[:, 3]) @ frame.camtoworld[:, 2]
+        depths = depths[depths > 0]
+    return (
+        float(np.median(depths) / np.sqrt(intrinsics[0] * intrinsics[1])) if len(depths) else np.inf
+    )
+
+
+def _choose(
+    file: pathlib.Path,
+    lists: dict[str, tuple[str, Any]],
+    find: Callable[[str], Frame | None],
+    field: str,
+) -> dict[str, list[Frame]]:
+    splits = {}
+    for key, (split, names) in lists.items():
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise SceneError(f"{file}: {key} must be a list of the frames' {field}: correct it.")
+        unlisted = [name for name in names if find(name) is None]
+        if unlisted:
+            raise SceneError(
+                f"{file}: {key} names {unlisted[0]!r}, which no frame has as its {field} "
+                f"({len(unlisted)} of {len(names)} such names): correct it."
+            )
+        splits[split] = [find(name) for name in names]
+    return splits
+
+
+def _with_train(
+    file: pathlib.Path, splits: dict[str, list[Frame]], frames: Sequence[Frame]
+) -> dict[str, list[Frame]]:
+    if "train" in splits:
+        return splits
+    held_out = {frame.file for members in splits.values() for frame in members}
+    train = [frame for frame in frames if frame.file not in held_out]
+    if not train:
+        raise SceneError(f"{file}: every frame is held out: leave some for {_train_key(file)}.")
+    return {"train": train, **splits}
+
+
+def _train_key(file: pathlib.Path) -> str:
+    return "train" if file.name == "split.json" else _LISTS["train"]

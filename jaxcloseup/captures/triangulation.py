@@ -1,0 +1,139 @@
+"""Points for captures that come with poses and without points.
+
+SIFT features are matched between neighboring photographs and each match is triangulated with the
+known poses. What reprojects badly, or was seen along nearly the same ray twice, is dropped.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+
+_LONGEST_SIDE = 1600  # in pixels; larger photographs are searched at this size
+_MOST_FEATURES = 2000  # of a photograph: matching costs their square
+_NEIGHBORS = 4
+_WIDEST_VIEWS = np.cos(np.radians(60))  # between optical axes; SIFT finds little beyond 40 degrees
+_RATIO = 0.8  # of the best match's distance to the second best, as in Lowe's paper (2004)
+_MOST_ERROR = 2.0  # in pixels
+_LEAST_ANGLE = np.radians(1.5)  # between rays; below it depth is a guess
+
+
+class _Features(NamedTuple):
+    """Of one photograph: pixels `[F, 2]` at its own size, descriptors `[F, 128]` and colors.
+
+    The last two are uint8, which is what SIFT's descriptors are: there may be many photographs.
+    """
+
+    pixels: np.ndarray
+    descriptors: np.ndarray
+    rgb: np.ndarray
+
+
+def triangulate(
+    images: Sequence[np.ndarray],
+    masks: Sequence[np.ndarray],
+    camtoworld: np.ndarray,
+    intrinsics: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points that two neighboring photographs agree on. A point may come once for each pair.
+
+    Args:
+      images: `[H, W, 3]` uint8 each, of pinhole cameras; sizes may differ.
+      masks: `[H, W]` uint8 each; features lie where they are 128 or more.
+      camtoworld: `[V, 3, 4]` OpenCV poses.
+      intrinsics: `[V, 4]` fx, fy, cx, cy in pixels.
+
+    Returns:
+      World points `[P, 3]` and colors `[P, 3]` in [0, 1], float32; possibly none.
+    """
+    found = [_find_features(image, mask) for image, mask in zip(images, masks, strict=True)]
+    points, colors = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    for i, j in _neighbors(camtoworld):
+        first, second = _match(found[i].descriptors, found[j].descriptors)
+        pixels = found[i].pixels[first], found[j].pixels[second]
+        world, good = _intersect(pixels, camtoworld[[i, j]], intrinsics[[i, j]])
+        points.append(world[good])
+        colors.append(found[i].rgb[first][good])
+    return (
+        np.concatenate(points).astype(np.float32),
+        np.concatenate(colors).astype(np.float32) / 255,
+    )
+
+
+def _find_features(image: np.ndarray, mask: np.ndarray) -> _Features:
+    height, width = image.shape[:2]
+    scale = min(1.0, _LONGEST_SIDE / max(height, width))
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if scale < 1 else image
+    usable = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) if scale < 1 else mask
+    # Without precise upscaling OpenCV's keypoints are a quarter of a pixel off.
+    sift = cv2.SIFT_create(nfeatures=_MOST_FEATURES, enable_precise_upscale=True)
+    gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+    keypoints, descriptors = sift.detectAndCompute(gray, np.uint8(255) * (usable >= 128))
+    if not keypoints:
+        return _Features(np.zeros((0, 2)), np.zeros((0, 128), np.uint8), np.zeros((0, 3)))
+    # OpenCV's centers are at whole numbers, ours half a pixel further.
+    pixels = (np.array([point.pt for point in keypoints]) + 0.5) / size * [width, height]
+    column, row = np.clip(pixels.astype(int), 0, [width - 1, height - 1]).T
+    return _Features(pixels, descriptors.astype(np.uint8), image[row, column])
+
+
+def _neighbors(camtoworld: np.ndarray) -> Iterator[tuple[int, int]]:
+    """Pairs of views, each once: the nearest ones to each that look about the same way."""
+    axes, positions = camtoworld[:, :, 2], camtoworld[:, :, 3]
+    away = np.linalg.norm(positions[:, None] - positions, axis=-1)
+    # Turning on the spot shows no depth, and a view is not its own neighbor.
+    fit = (axes @ axes.T > _WIDEST_VIEWS) & (away > 1e-6 * away.max())
+    order = np.argsort(np.where(fit, away, np.inf), axis=1, kind="stable")[:, :_NEIGHBORS]
+    pairs = {
+        (min(i, j), max(i, j)) for i, row in enumerate(order.tolist()) for j in row if fit[i, j]
+    }
+    yield from sorted(pairs)
+
+
+def _match(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Indices into `a` and `b` of descriptors that are each other's clearly best match."""
+    if len(a) < 2 or len(b) < 2:
+        return np.zeros(0, int), np.zeros(0, int)
+    similar = _unit(a) @ _unit(b).T
+    first, best = np.arange(len(a)), similar.argmax(1)
+    mutual = similar.argmax(0)[best] == first
+    highest = similar[first, best]
+    similar[first, best] = -1
+    nearest, second = (np.sqrt(np.maximum(2 - 2 * s, 0)) for s in (highest, similar.max(1)))
+    keep = mutual & (nearest < _RATIO * second)
+    return first[keep], best[keep]
+
+
+def _unit(descriptors: np.ndarray) -> np.ndarray:
+    lengths = np.linalg.norm(descriptors.astype(np.float32), axis=1, keepdims=True)
+    return descriptors / np.maximum(lengths, 1)
+
+
+def _intersect(
+    pixels: tuple[np.ndarray, np.ndarray], camtoworld: np.ndarray, intrinsics: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where pairs of pixels `[M, 2]` of two cameras meet: `[M, 3]`, and whether they do, `[M]`."""
+    if not len(pixels[0]):
+        return np.zeros((0, 3)), np.zeros(0, bool)
+    # Relative to the first camera and in units of the baseline, so that far worlds stay exact.
+    origin = camtoworld[0, :, 3]
+    unit = np.linalg.norm(camtoworld[1, :, 3] - origin)
+    rotations = camtoworld[:, :, :3]
+    positions = (camtoworld[:, :, 3] - origin) / unit
+    normalized = [(p - k[2:]) / k[:2] for p, k in zip(pixels, intrinsics, strict=True)]
+    matrices = [np.column_stack([r.T, -r.T @ c]) for r, c in zip(rotations, positions, strict=True)]
+    homogeneous = cv2.triangulatePoints(*matrices, *(x.T.astype(np.float64) for x in normalized)).T
+    scale = homogeneous[:, 3:]
+    local = homogeneous[:, :3] / np.where(np.abs(scale) < 1e-12, 1e-12, scale)
+    good = np.isfinite(local).all(-1)
+    for x, k, r, c in zip(normalized, intrinsics, rotations, positions, strict=True):
+        camera = (local - c) @ r
+        depth = np.where(camera[:, 2] > 1e-6, camera[:, 2], 1e-6)
+        error = np.linalg.norm((camera[:, :2] / depth[:, None] - x) * k[:2], axis=-1)
+        good &= (camera[:, 2] > 1e-6) & (error < _MOST_ERROR)
+    a, b = local - positions[0], local - positions[1]
+    angle = np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, -1))
+    return local * unit + origin, good & (angle > _LEAST_ANGLE)

@@ -1,0 +1,79 @@
+"""Photographs with their cameras, and the random pixels of them that a training step sees."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxcloseup.geometry.cameras import Camera
+
+
+@struct.dataclass
+class Views:
+    """Photographs of one capture, padded to one static size.
+
+    Attributes:
+      cameras: stacked cameras, `[V]` on every leaf.
+      rgb: `[V, H, W, 3]`, uint8 or float in [0, 1].
+      weight: `[V, H, W]` in [0, 1]; 0 is padding or masked out.
+    """
+
+    cameras: Camera
+    rgb: jax.Array
+    weight: jax.Array
+
+    def __len__(self) -> int:
+        """How many photographs there are."""
+        return self.rgb.shape[0]
+
+
+class Batch(NamedTuple):
+    """Pixels to render and the colors they should have.
+
+    Attributes:
+      cameras: one stacked camera for each pixel `[B]`, or one camera when `pixels` is None.
+      pixels: `[B, 2]` pixel centers, or None for the whole image.
+      rgb: `[B, 3]` or `[H, W, 3]` float colors in [0, 1].
+      weight: `[B]` or `[H, W]`, 0 where the color must not count.
+    """
+
+    cameras: Camera
+    pixels: jax.Array | None
+    rgb: jax.Array
+    weight: jax.Array
+
+
+def to_float(rgb: jax.Array) -> jax.Array:
+    """Colors as float32 in [0, 1], from uint8 or from float."""
+    if rgb.dtype == jnp.uint8:
+        return rgb.astype(jnp.float32) / 255
+    return rgb
+
+
+def camera_at(cameras: Camera, index: jax.Array | int) -> Camera:
+    """One camera (or, for an index array, several) out of stacked cameras."""
+    return jax.tree.map(lambda leaf: leaf[index], cameras)
+
+
+def sample_pixels(key: jax.Array, views: Views, count: int) -> Batch:
+    """`count` pixels drawn uniformly, with replacement, from all photographs; `key` is consumed."""
+    num_views, height, width = views.weight.shape
+    key_view, key_y, key_x = jax.random.split(key, 3)
+    view = jax.random.randint(key_view, (count,), 0, num_views)
+    y = jax.random.randint(key_y, (count,), 0, height)
+    x = jax.random.randint(key_x, (count,), 0, width)
+    return Batch(
+        cameras=camera_at(views.cameras, view),
+        pixels=jnp.stack([x, y], axis=-1).astype(jnp.float32) + 0.5,
+        rgb=to_float(views.rgb[view, y, x]),
+        weight=views.weight[view, y, x],
+    )
+
+
+def sample_image(key: jax.Array, views: Views) -> Batch:
+    """One whole photograph, drawn uniformly; `key` is consumed."""
+    view = jax.random.randint(key, (), 0, len(views))
+    return Batch(
+        camera_at(views.cameras, view), None, to_float(views.rgb[view]), views.weight[view]
+    )

@@ -1,0 +1,289 @@
+"""Exact ray casting of solids: planes, boxes, spheres and cylinders.
+
+Every solid is an affine image of a unit one: the square |x|, |y| <= 1 at z = 0, the cube
+[-1, 1]^3, the unit sphere, and the cylinder of |z| <= 1 whose radius is 1 + taper z. Rays are moved
+into that frame, so bricks, slats, plates, ellipsoids and flower pots need no code of their own.
+
+A point on a solid has a *face* (an integer, counted through all solids) and a *chart* coordinate
+(two numbers in [0, 1]^2 on that face), which is where textures and baked light are looked up.
+
+`cast_ray` takes one ray, to be batched with `jax.vmap`; `cast_rays` serves host code.
+"""
+
+import concurrent.futures
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+
+PLANE, BOX, SPHERE, CYLINDER = range(4)
+FACES_OF = (1, 6, 1, 3)  # a box: -x +x -y +y -z +z; a cylinder: side, bottom, top
+
+
+@struct.dataclass
+class Solids:
+    """Solids sorted by kind, and padding behind them.
+
+    Attributes:
+      to_local: `[N, 3, 4]` affine map from the world to the unit solid.
+      bound: `[N, 3, 4]` half axes (columns) and center of a box around it, in the world.
+      taper: `[N]` growth of a cylinder's radius with local z, in (-1, 1).
+      kind: `[N]` int32: PLANE, BOX, SPHERE or CYLINDER.
+      first_face: `[N]` int32, the first of its faces.
+      bounds: `[5]` int32; solids of kind k are bounds[k] <= i < bounds[k + 1].
+    """
+
+    to_local: jax.Array
+    bound: jax.Array
+    taper: jax.Array
+    kind: jax.Array
+    first_face: jax.Array
+    bounds: jax.Array
+
+
+class Hit(NamedTuple):
+    """Where a ray first meets a solid.
+
+    Attributes:
+      depth: ray parameter (z-depth, for camera rays); inf where nothing is met.
+      normal: `[3]` unit world normal on the ray's side; 0 where nothing is met.
+      face: int32 face; 0 where nothing is met.
+      chart: `[2]` position on the face, in [0, 1].
+    """
+
+    depth: jax.Array
+    normal: jax.Array
+    face: jax.Array
+    chart: jax.Array
+
+
+def make_solids(
+    kind: np.ndarray, to_world: np.ndarray, taper: np.ndarray, *, pad_to: int = 1
+) -> Solids:
+    """Solids from affine maps `to_world[N, 3, 4]` of unit solids, already sorted by `kind[N]`.
+
+    The number of solids is padded to a multiple of `pad_to`, so that scenes of similar size share
+    one compilation; padding is never met and costs no time.
+    """
+    kind = np.asarray(kind, np.int32)
+    if np.any(np.diff(kind) < 0):
+        raise ValueError("solids must be sorted by kind: planes, boxes, spheres, cylinders")
+    padding = -len(kind) % pad_to
+    linear = np.linalg.inv(np.asarray(to_world, np.float64)[:, :, :3])
+    offset = -linear @ np.asarray(to_world, np.float64)[:, :, 3:]
+    to_local = np.concatenate([linear, offset], axis=-1).astype(np.float32)
+    faces = np.take(FACES_OF, kind)
+    bound = np.array(to_world, np.float32)
+    bound[:, :, :2] *= 1 + np.abs(np.asarray(taper, np.float32))[:, None, None]
+    bound[:, :, 2] *= (kind != PLANE)[:, None]
+    return Solids(
+        to_local=jnp.asarray(np.pad(to_local, [(0, padding), (0, 0), (0, 0)])),
+        bound=jnp.asarray(np.pad(bound, [(0, padding), (0, 0), (0, 0)])),
+        taper=jnp.asarray(np.pad(np.asarray(taper, np.float32), (0, padding))),
+        kind=jnp.asarray(np.pad(kind, (0, padding))),
+        first_face=jnp.asarray(np.pad(np.cumsum(faces) - faces, (0, padding)), jnp.int32),
+        bounds=jnp.asarray(np.searchsorted(kind, np.arange(5)), jnp.int32),
+    )
+
+
+def cast_ray(
+    solids: Solids, origin: jax.Array, direction: jax.Array, *, nearest: float = 1e-4
+) -> Hit:
+    """The first crossing of a ray `origin[3] + depth * direction[3]` with depth > `nearest`."""
+    chex.assert_shape([origin, direction], (3,))
+    ray = (*origin, *direction)
+
+    def closer(crossings: Callable, index: jax.Array, best: tuple) -> tuple:
+        depth = _first_crossing(
+            crossings, solids.to_local[index], solids.taper[index], ray, nearest
+        )
+        is_closer = depth < best[0]
+        return jnp.where(is_closer, depth, best[0]), jnp.where(is_closer, index, best[1])
+
+    best = (jnp.float32(jnp.inf), jnp.int32(-1))
+    for kind, crossings in enumerate((_plane, _box, _sphere, _cylinder)):
+
+        def body(index: jax.Array, best: tuple, crossings: Callable = crossings) -> tuple:
+            return closer(crossings, index, best)
+
+        best = jax.lax.fori_loop(solids.bounds[kind], solids.bounds[kind + 1], body, best)
+    return _describe(solids, origin, direction, *best)
+
+
+def keep_solids(solids: Solids, wanted: jax.Array) -> Solids:
+    """Only the solids with `wanted[N]`, so that a bundle of rays need not try the others."""
+    index = jnp.arange(wanted.shape[0])
+    kind = jnp.where(wanted & (index < solids.bounds[-1]), solids.kind, 4)
+    order = jnp.argsort(kind, stable=True)
+    kept = jax.tree.map(lambda leaf: leaf[order], solids.replace(bounds=index))
+    return kept.replace(bounds=jnp.searchsorted(kind[order], jnp.arange(5)).astype(jnp.int32))
+
+
+def in_pyramid(solids: Solids, apex: jax.Array, corners: jax.Array) -> jax.Array:
+    """Which solids `[N]` may be met by rays from `apex[3]` between four directions `[4, 3]`.
+
+    The corners go round; a solid is left out only where its box lies beyond one side.
+    """
+    sides = jnp.cross(corners, jnp.roll(corners, -1, axis=0))
+    sides = sides * jnp.sign(jnp.sum(sides * corners.sum(0)[None], axis=-1, keepdims=True))
+    towards = jnp.sum(sides[:, None] * (solids.bound[:, :, 3] - apex[None])[None], axis=-1)
+    reach = jnp.abs(jnp.sum(sides[:, None, :, None] * solids.bound[None, :, :, :3], axis=2)).sum(-1)
+    return jnp.all(towards + reach > -1e-5 * jnp.abs(towards), axis=0)
+
+
+def cast_rays(
+    solids: Solids,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    *,
+    wanted: np.ndarray | None = None,
+) -> Hit:
+    """First hits of many rays `[..., 3]` as NumPy arrays `[...]`, trying `wanted[N]` solids only.
+
+    Rays are cast 4096 at a time, whatever their number: one compilation answers every question.
+    """
+    shape = np.broadcast_shapes(origins.shape, directions.shape)[:-1]
+    count, chunk = int(np.prod(shape)), 4096
+    rays = [np.broadcast_to(r, (*shape, 3)).reshape(-1, 3) for r in (origins, directions)]
+    rays = [np.pad(r, [(0, -count % chunk), (0, 0)], mode="edge").astype(np.float32) for r in rays]
+    wanted = np.ones(solids.kind.shape, bool) if wanted is None else wanted
+    parts = [
+        jax.device_get(_cast(solids, wanted, *(r[i : i + chunk] for r in rays)))
+        for i in range(0, len(rays[0]), chunk)
+    ]
+    return jax.tree.map(
+        lambda *leaf: np.concatenate(leaf)[:count].reshape(shape + leaf[0].shape[1:]), *parts
+    )
+
+
+def map_in_threads(fn: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
+    """`fn` of each item, two at a time, since XLA keeps to one core in loops as small as ours."""
+    first = fn(items[0])  # alone: threads would each compile what they share
+    with concurrent.futures.ThreadPoolExecutor(2) as pool:
+        return [first, *pool.map(fn, items[1:])]
+
+
+@jax.jit
+def _cast(solids: Solids, wanted: jax.Array, origins: jax.Array, directions: jax.Array) -> Hit:
+    kept = keep_solids(solids, wanted)
+    return jax.vmap(lambda origin, direction: cast_ray(kept, origin, direction))(
+        origins, directions
+    )
+
+
+def _apply(affine: jax.Array, x: jax.Array, y: jax.Array, z: jax.Array, w: float) -> list:
+    """An affine map, written out: no accelerator rounds it as it would a small matrix product."""
+    return [row[0] * x + row[1] * y + row[2] * z + row[3] * w for row in affine]
+
+
+def _first_crossing(
+    crossings: Callable, to_local: jax.Array, taper: jax.Array, ray: tuple, nearest: float
+) -> jax.Array:
+    """Smallest ray parameter above `nearest` at which one solid is crossed, or inf."""
+    o, d = _apply(to_local, *ray[:3], 1.0), _apply(to_local, *ray[3:], 0.0)
+    # Start from the ray's closest approach to the center: from afar, a thin rail would otherwise
+    # drown in the rounding of b^2 - 4ac.
+    start = -_dot(o, d) / _dot(d, d)
+    p = [a + start * b for a, b in zip(o, d, strict=True)]
+    best = jnp.float32(jnp.inf)
+    for t, valid in crossings(p, d, taper):
+        depth = start + t
+        best = jnp.where(valid & (depth > nearest) & (depth < best), depth, best)
+    return best
+
+
+def _dot(a: list, b: list) -> jax.Array:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _nonzero(x: jax.Array) -> jax.Array:
+    return jnp.where(jnp.abs(x) < 1e-12, 1e-12, x)
+
+
+def _plane(p: list, d: list, taper: jax.Array) -> list:
+    t = -p[2] / _nonzero(d[2])
+    x, y = p[0] + t * d[0], p[1] + t * d[1]
+    return [(t, (jnp.abs(x) <= 1) & (jnp.abs(y) <= 1))]
+
+
+def _box(p: list, d: list, taper: jax.Array) -> list:
+    inverse = [1 / _nonzero(b) for b in d]
+    sides = [((-1 - a) * b, (1 - a) * b) for a, b in zip(p, inverse, strict=True)]
+    enter = [jnp.minimum(*side) for side in sides]
+    leave = [jnp.maximum(*side) for side in sides]
+    first = jnp.maximum(jnp.maximum(enter[0], enter[1]), enter[2])
+    last = jnp.minimum(jnp.minimum(leave[0], leave[1]), leave[2])
+    return [(first, first <= last), (last, first <= last)]
+
+
+def _sphere(p: list, d: list, taper: jax.Array) -> list:
+    inside = 1 - _dot(p, p)
+    half = jnp.sqrt(jnp.maximum(inside, 0) / _dot(d, d))
+    return [(-half, inside >= 0), (half, inside >= 0)]
+
+
+def _cylinder(p: list, d: list, taper: jax.Array) -> list:
+    radius, slope = 1 + taper * p[2], taper * d[2]
+    a = d[0] * d[0] + d[1] * d[1] - slope * slope
+    b = p[0] * d[0] + p[1] * d[1] - radius * slope
+    c = p[0] * p[0] + p[1] * p[1] - radius * radius
+    root = b * b - a * c
+    q = -(b + jnp.where(b < 0, -1, 1) * jnp.sqrt(jnp.maximum(root, 0)))
+    found = []
+    for t in (q / _nonzero(a), c / _nonzero(q)):
+        found.append((t, (root > 0) & (jnp.abs(p[2] + t * d[2]) <= 1)))
+    for end in (-1, 1):
+        t = (end - p[2]) / _nonzero(d[2])
+        x, y = p[0] + t * d[0], p[1] + t * d[1]
+        found.append((t, x * x + y * y <= (1 + end * taper) ** 2))
+    return found
+
+
+def _describe(
+    solids: Solids, origin: jax.Array, direction: jax.Array, depth: jax.Array, index: jax.Array
+) -> Hit:
+    """Normal, face and chart of a crossing."""
+    is_hit = index >= 0
+    index = jnp.maximum(index, 0)
+    point = origin + jnp.where(is_hit, depth, 0) * direction
+    to_local, taper, kind = solids.to_local[index], solids.taper[index], solids.kind[index]
+    x, y, z = _apply(to_local, *point, 1.0)
+    local, square, up = jnp.stack([x, y, z]), jnp.stack([x, y]), jnp.array([0.0, 0.0, 1.0])
+
+    axis = jnp.argmax(jnp.abs(local)).astype(jnp.int32)
+    sign = jnp.where(local[axis] < 0, -1.0, 1.0)
+    box_normal = sign * jax.nn.one_hot(axis, 3)
+    box_face = 2 * axis + jnp.where(sign > 0, 1, 0)
+    box_chart = jnp.select([axis == 0, axis == 1], [local[1:], local[::2]], square)
+
+    on_cap = jnp.abs(z) > jnp.hypot(x, y) / (1 + taper * z)
+    end = jnp.where(z > 0, 1.0, -1.0)
+    side_normal = jnp.stack([x, y, -taper * (1 + taper * z)])
+    cap_face = jnp.where(z > 0, 2, 1)
+    cap_chart = square / (1 + end * taper)  # in units of its own radius
+
+    is_plane, is_box = kind == PLANE, kind == BOX
+    is_cap = (kind == CYLINDER) & on_cap
+    is_side = (kind == CYLINDER) & ~on_cap
+    face = jnp.select([is_box, is_cap], [box_face, cap_face], 0)
+    normal = jnp.select(
+        [is_plane, is_box, is_cap, is_side], [up, box_normal, end * up, side_normal], local
+    )
+    around = jnp.stack([jnp.arctan2(y, x) / jnp.pi, z])
+    chart = jnp.select([is_plane, is_box, is_cap], [square, box_chart, cap_chart], around)
+
+    # Normals go by the transpose of the map to the unit solid.
+    normal = sum(to_local[i, :3] * normal[i] for i in range(3))
+    normal = normal / jnp.sqrt(jnp.sum(normal * normal))
+    normal = jnp.where(jnp.sum(normal * direction) > 0, -normal, normal)
+    return Hit(
+        depth=jnp.where(is_hit, depth, jnp.inf),
+        normal=jnp.where(is_hit, normal, 0),
+        face=jnp.where(is_hit, solids.first_face[index] + face, 0),
+        chart=jnp.clip((chart + 1) / 2, 0, 1),
+    )

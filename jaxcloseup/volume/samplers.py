@@ -1,0 +1,62 @@
+"""Where along its ray a field is evaluated.
+
+Samples are z-depths: ray directions have unit camera-z. No gradient flows through a sample.
+"""
+
+import chex
+import jax
+import jax.numpy as jnp
+
+
+def stratified(
+    key: jax.Array | None, near: float, far: float, num_samples: int, shape: tuple[int, ...]
+) -> jax.Array:
+    """One sample in each of `num_samples` equal bins of [near, far] (NeRF, eq. 2).
+
+    Args:
+      key: consumed; None takes the centers of the bins.
+      near: where the first bin begins.
+      far: where the last bin ends.
+      num_samples: bins for each ray.
+      shape: shape of the rays.
+
+    Returns:
+      `[*shape, num_samples]` ascending samples.
+    """
+    shape = (*shape, num_samples)
+    inside = 0.5 if key is None else jax.random.uniform(key, shape)
+    bins = jax.lax.broadcasted_iota(jnp.result_type(float), shape, len(shape) - 1)
+    return near + (far - near) * (bins + inside) / num_samples
+
+
+def importance(
+    key: jax.Array | None, edges: jax.Array, weights: jax.Array, num_samples: int
+) -> jax.Array:
+    """Samples distributed like a histogram, by inverting its piecewise linear CDF (NeRF, 5.2).
+
+    Every weight is raised by 1e-5 first, so that empty rays are sampled evenly.
+
+    Args:
+      key: consumed; None takes `num_samples` evenly spaced quantiles from 0 to 1 inclusive.
+      edges: `[..., B + 1]` ascending edges of the bins.
+      weights: `[..., B]` non-negative, of any sum.
+      num_samples: samples for each ray.
+
+    Returns:
+      `[..., num_samples]` samples, not sorted unless `key` is None.
+    """
+    chex.assert_equal_shape_prefix([edges, weights], weights.ndim - 1)
+    chex.assert_axis_dimension(edges, -1, weights.shape[-1] + 1)
+    edges, weights = jax.lax.stop_gradient((edges, weights))
+    weights = weights + 1e-5
+    pdf = weights / jnp.sum(weights, axis=-1, keepdims=True)
+    cdf = jnp.cumsum(pdf, axis=-1) - pdf
+    shape = (*weights.shape[:-1], num_samples)
+    if key is None:
+        quantiles = jnp.broadcast_to(jnp.linspace(0, 1, num_samples), shape)
+    else:
+        quantiles = jax.random.uniform(key, shape)
+    # The inverse is a sum of clipped ramps, one for each bin: no search and no gather.
+    inside = jnp.clip((quantiles[..., None] - cdf[..., None, :]) / pdf[..., None, :], 0, 1)
+    widths = jnp.diff(edges, axis=-1)
+    return edges[..., :1] + jnp.sum(inside * widths[..., None, :], axis=-1)

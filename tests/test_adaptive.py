@@ -1,0 +1,159 @@
+"""Surfels that are cloned, split and removed: which, where to, and what is forgotten."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import plane
+import pytest
+from reference_splats import rotation_of
+from splat_scenes import COUNT, HEIGHT, WIDTH, random_scene, to_camera, to_surfels
+
+from jaxcloseup.geometry.cameras import points_to_pixels
+from jaxcloseup.splats import RasterizeConfig
+from jaxcloseup.splats.adaptive import (
+    AdaptiveConfig,
+    PullState,
+    apply_probe,
+    refine,
+    reset_opacities,
+    with_probe,
+)
+from jaxcloseup.splats.field import SurfelConfig, surfel_field, surfel_optimizer
+from jaxcloseup.train import TrainConfig, init_state, run_steps, train_step
+
+
+CONFIG = AdaptiveConfig(gradient=1.0, small=0.01, min_opacity=0.05, huge=0.1)
+EXTENT = 2.0
+SMALL, LARGE, HUGE = 0.01, 0.05, 0.5  # scales in world units: over and under CONFIG's times EXTENT
+grow = jax.jit(functools.partial(refine, config=CONFIG, extent=EXTENT))
+
+
+def scene_of(scales, opacities):
+    """Surfels of these larger scales and opacities, and the rest of no account."""
+    scene = random_scene(5)
+    scene["log_scales"] = np.log(np.stack([scales, 0.3 * np.asarray(scales)], axis=1))
+    opacities = np.asarray(opacities, float)
+    scene["opacity_logits"] = np.log(opacities) - np.log1p(-opacities)
+    return with_probe(to_surfels(scene))
+
+
+def pull_of(mean):
+    views = np.where(np.asarray(mean) > 0, 4.0, 0.0)
+    return PullState(jnp.asarray(mean * views, jnp.float32), jnp.asarray(views, jnp.float32))
+
+
+def test_a_probe_moves_the_image_of_its_center_by_half_images():
+    surfels, camera = with_probe(to_surfels(random_scene(2, depth=(0.5, 3.0)))), to_camera()
+    before, depth = points_to_pixels(camera, surfels.means)
+    probe = jnp.zeros((COUNT, 2)).at[3].set(jnp.array([0.1, -0.2]))
+    after, depth_after = points_to_pixels(
+        camera, apply_probe(surfels.replace(probe=probe), camera).means
+    )
+    expected = np.zeros((COUNT, 2))
+    expected[3] = 0.1 * WIDTH / 2, -0.2 * HEIGHT / 2
+    np.testing.assert_allclose(after - before, expected, atol=1e-3)
+    np.testing.assert_allclose(depth_after, depth, rtol=1e-5)
+
+
+def test_small_are_cloned_large_are_split_faint_and_huge_removed(key):
+    scales, opacities, pulls = np.full(COUNT, SMALL), np.full(COUNT, 0.5), np.zeros(COUNT)
+    pulls[[0, 1]] = 3.0, 2.0
+    scales[1] = LARGE
+    opacities[2] = 0.04
+    scales[3] = HUGE
+    pulls[4] = 0.99  # just not hard enough
+    alive = np.arange(COUNT) < 10
+    before = scene_of(scales, opacities)
+    pull = pull_of(pulls)
+    after, now_alive, new = grow(key, before, jnp.asarray(alive), pull, remove_huge=True)
+    assert int(now_alive.sum()) == 10 - 2 + 2
+    # The hardest pulled goes to the first free row, and so on: rows 2 and 3 were just removed.
+    clone, halves = 2, (1, 3)
+    for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
+        np.testing.assert_array_equal(getattr(after, name)[clone], getattr(before, name)[0])
+        np.testing.assert_array_equal(getattr(after, name)[0], getattr(before, name)[0])
+    for row in halves:
+        smaller = np.asarray(before.log_scales[1]) - np.log(1.6)
+        np.testing.assert_allclose(after.log_scales[row], smaller, rtol=1e-5)
+        np.testing.assert_array_equal(after.opacity_logits[row], before.opacity_logits[1])
+        offset = np.asarray(after.means[row] - before.means[1], float)
+        along = rotation_of(np.asarray(before.quaternions[1], float)).T @ offset
+        assert abs(along[2]) < 1e-6  # in its plane
+        assert np.all(np.abs(along[:2]) < 5 * np.array([LARGE, 0.3 * LARGE]))
+        assert np.abs(along[:2]).max() > 1e-4
+    np.testing.assert_array_equal(np.nonzero(new)[0], [1, 2, 3])
+    untouched = [0, *range(4, 10)]
+    np.testing.assert_array_equal(
+        after.means[jnp.array(untouched)], before.means[jnp.array(untouched)]
+    )
+    kept, _, _ = grow(key, before, jnp.asarray(alive), pull, remove_huge=False)
+    np.testing.assert_array_equal(kept.log_scales[3], before.log_scales[3])
+
+
+def test_without_room_the_hardest_pulled_come_first(key):
+    pulls = np.linspace(1.5, 3, COUNT)
+    alive = np.ones(COUNT, bool)
+    alive[[4, 7]] = False
+    before = scene_of(np.full(COUNT, SMALL), np.full(COUNT, 0.5))
+    after, now_alive, new = grow(key, before, jnp.asarray(alive), pull_of(pulls), remove_huge=False)
+    assert now_alive.all()
+    np.testing.assert_array_equal(np.nonzero(new)[0], [4, 7])
+    np.testing.assert_array_equal(after.means[4], before.means[COUNT - 1])
+    np.testing.assert_array_equal(after.means[7], before.means[COUNT - 2])
+
+
+def test_a_reset_leaves_nothing_opaque():
+    opacities = np.where(np.arange(COUNT) % 2, 0.9, 0.003)
+    after = jax.nn.sigmoid(
+        reset_opacities(scene_of(np.full(COUNT, SMALL), opacities), CONFIG).opacity_logits
+    )
+    np.testing.assert_allclose(after, np.where(np.arange(COUNT) % 2, 0.01, 0.003), rtol=1e-4)
+
+
+def test_training_measures_the_pull_and_adds_surfels():
+    """The pull is the derivative of the loss that finite differences of the center's image show."""
+    density = AdaptiveConfig(every=20, start=19, stop=50, gradient=1e-5, reset_every=45)
+    config = SurfelConfig(
+        capacity=200,
+        sh_degree=0,
+        density=density,
+        opacity_weight=0.0,
+        scale_weight=0.0,
+        regularize_from=1000,
+        raster=RasterizeConfig(capacity=2**13, near=0.2, tile=8, chunk=4, block=12),
+    )
+    field, optimizer = surfel_field(config, extent=EXTENT), surfel_optimizer(config, extent=EXTENT)
+    views, _ = plane.make_views([plane.camera_above(0.0, 0.0, 2.0)])
+    points = np.random.default_rng(0).uniform([-1, -1, 0], [1, 1, 0], (80, 3)).astype(np.float32)
+    state = init_state(
+        jax.random.key(0), points, np.full_like(points, 0.5), field=field, optimizer=optimizer
+    )
+    bound = {"field": field, "optimizer": optimizer, "config": TrainConfig(None, None)}
+    run = jax.jit(functools.partial(run_steps, functools.partial(train_step, **bound)))
+    with jax.numpy_dtype_promotion("standard"):  # optax mixes integers and floats
+        one, _ = run(state, views, count=1)
+        grown, _ = run(state, views, count=21)
+        faded, _ = run(state, views, count=45)
+
+    camera = jax.tree.map(lambda leaf: leaf[0], views.cameras)
+
+    @jax.jit
+    def loss(probe):
+        params = state.params.replace(probe=probe)
+        rendering = field.render(params, state.buffers, camera, None, None)
+        return field.loss(rendering, views.rgb[0], views.weight[0])[0]
+
+    pull = one.opt_state[0]
+    hardest = int(jnp.argmax(pull.total))
+    differences = []
+    for axis in range(2):
+        step = jnp.zeros((200, 2)).at[hardest, axis].set(2e-3)
+        differences.append((loss(step) - loss(-step)) / 4e-3)
+    assert float(pull.total[hardest]) == pytest.approx(float(np.hypot(*differences)), rel=0.05)
+    assert int(grown.buffers.alive.sum()) > 80
+    assert float(grown.opt_state[0].views.max()) == 1  # counted anew
+    assert float(jnp.abs(grown.params.probe).max()) == 0
+    assert float(jax.nn.sigmoid(faded.params.opacity_logits).max()) == pytest.approx(0.01, rel=1e-3)
+    assert float(jnp.abs(faded.opt_state[1][0].mu.opacity_logits).max()) == 0

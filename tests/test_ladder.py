@@ -1,0 +1,100 @@
+"""The zoom ladder: cameras that come nearer to one point, on the plane, whose look is known."""
+
+import dataclasses
+import xml.etree.ElementTree as ET
+
+import jax.numpy as jnp
+import numpy as np
+import plane
+import pytest
+
+from experiments.evaluation.ladder import (
+    MAGNIFICATIONS,
+    gains_over,
+    ladder_in_short,
+    ladder_targets,
+    zoom_curves,
+)
+from experiments.reporting.plots import Curve, line_plot
+from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_rays
+from jaxcloseup.scene import Surface
+from jaxcloseup.scenes import Scene
+
+
+def surface(camera):
+    """The plane z = 0, gray, for any camera."""
+    origins, directions = pixels_to_rays(camera, pixel_grid(camera.height, camera.width))
+    depth = -origins[..., 2] / directions[..., 2]
+    rgb = jnp.full((*depth.shape, 3), 0.5)
+    return Surface(rgb, depth, jnp.zeros_like(rgb))
+
+
+@pytest.fixture(scope="module")
+def ladder():
+    cameras = [plane.camera_above(x, 0.1 * x, 4.0, tilt=0.1 * x) for x in (-1.0, 0.0, 1.0)]
+    views, _ = plane.make_views(cameras)
+    far, _ = plane.make_views([plane.camera_above(0.3, 0.0, 4.0), plane.camera_above(0, 0.2, 3.5)])
+    names = {"train": list("abc"), "test_far": ["x", "y"]}
+    none = np.zeros((0, 3))
+    scene = Scene("plane", views, None, far, none, none, 1.0, 9.0, names, surface=surface)
+    exact = jnp.stack([surface(camera).depth for camera in cameras])
+    return scene, ladder_targets(scene, exact)
+
+
+def test_every_rung_is_nearer_to_one_point_by_its_magnification(ladder):
+    scene, targets = ladder
+    assert list(targets) == [f"zoom_{m}" for m in MAGNIFICATIONS]
+    for i, name in enumerate(scene.names["test_far"]):
+        centers = np.stack([targets[f"zoom_{m}"][i].camera.position for m in MAGNIFICATIONS])
+        assert targets["zoom_1"][i].name == name
+        np.testing.assert_allclose(centers[0], scene.test_far.cameras.position[i], atol=1e-6)
+        # All stand on one line, which meets the plane where the distance to it would be 0.
+        anchor = centers[0] + (centers[1] - centers[0]) * 2
+        np.testing.assert_allclose(anchor[2], 0, atol=1e-5)
+        for m, center in zip(MAGNIFICATIONS, centers, strict=True):
+            np.testing.assert_allclose(anchor - center, (anchor - centers[0]) / m, atol=1e-5)
+            np.testing.assert_array_equal(
+                targets[f"zoom_{m}"][i].camera.rotation, scene.test_far.cameras.rotation[i]
+            )
+
+
+def test_targets_are_what_the_cameras_truly_see(ladder):
+    _, targets = ladder
+    for of_rung in targets.values():
+        for target in of_rung:
+            np.testing.assert_allclose(
+                target.surface.depth, surface(target.camera).depth, rtol=1e-5
+            )
+            assert target.seen.max() == 3
+
+
+def test_a_capture_has_no_ladder(ladder):
+    scene, _ = ladder
+    assert ladder_targets(dataclasses.replace(scene, surface=None), jnp.zeros((3, 4, 5))) == {}
+
+
+def test_curves_and_gains():
+    def splits(*psnr):
+        return {"test": {"psnr": 1.0}} | {
+            f"zoom_{m}": {"psnr": value} for m, value in zip((1, 4, 16), psnr, strict=True)
+        }
+
+    stages = {"control": splits(30.0, 25.0, None), "closeup": splits(29.5, 26.0, 20.0)}
+    curves = zoom_curves(stages)
+    assert curves == [
+        Curve("control", [1, 4], [30.0, 25.0]),
+        Curve("closeup", [1, 4, 16], [29.5, 26.0, 20.0]),
+    ]
+    assert gains_over(curves, "control")[1] == Curve("closeup", [1, 4], [-0.5, 1.0])
+    assert gains_over(curves[1:], "control") == []
+    assert ladder_in_short(stages["control"]).endswith("4x nearer 25.00, 16x nearer -")
+
+
+def test_a_plot_is_one_element_with_its_words():
+    curves = [Curve("arm & leg", [1, 2], [0.0, 1.0], [-1.0, 0.5], [1.0, 1.5])]
+    plot = line_plot(curves, x="times nearer", y="dB", title="Gain", doubling=True, level=0)
+    root = ET.fromstring(plot)
+    assert root.tag.endswith("svg")
+    words = {element.text for element in root.iter() if element.text}
+    assert {"arm & leg", "times nearer", "dB", "Gain"} <= words
+    assert plot == line_plot(curves, x="times nearer", y="dB", title="Gain", doubling=True, level=0)
