@@ -30,9 +30,9 @@ from experiments.viewing.camera_paths import CameraError, Shots
 from experiments.viewing.frames import fine_tune, render_shots
 from jaxcloseup.artifacts.checkpoints import CheckpointError
 from jaxcloseup.artifacts.video import write_video
+from jaxcloseup.label_rules import label_depth
 from jaxcloseup.photographs import camera_at
 from jaxcloseup.scenes import SceneError
-from jaxcloseup.train import label_depth
 
 
 FLAGS = flags.FLAGS

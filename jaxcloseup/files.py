@@ -1,7 +1,11 @@
 """Files that are either whole or not there, lines added to others, and where caches are."""
 
+import json
+import math
 import os
 import pathlib
+from collections.abc import Mapping
+from typing import Any
 
 
 def cache_folder() -> pathlib.Path:
@@ -42,6 +46,24 @@ def append_file(path: str | pathlib.Path, data: bytes) -> None:
             file.write(data)
     except OSError as error:
         raise _unwritable(path, error) from error
+
+
+def write_json(path: str | pathlib.Path, value: Mapping[str, Any]) -> None:
+    """Write strict JSON, whole or not at all; numbers that are not finite become null.
+
+    Raises:
+      OSError: one sentence that names the path and the reason.
+    """
+    write_file(path, json.dumps(strict(value), indent=1, allow_nan=False).encode())
+
+
+def strict(value: Any) -> Any:
+    """The value with None in place of numbers that are not finite, which JSON cannot hold."""
+    if isinstance(value, Mapping):
+        return {key: strict(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [strict(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _unwritable(path, error):

@@ -21,10 +21,11 @@ from jaxcloseup.artifacts.images import (
     write_png,
 )
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
+from jaxcloseup.label_rules import label_depth
 from jaxcloseup.pseudo import label_views
 from jaxcloseup.scenes import Scene
 from jaxcloseup.support import find_support
-from jaxcloseup.train import TrainState, label_depth
+from jaxcloseup.train import TrainState
 
 
 _support = jax.jit(find_support)

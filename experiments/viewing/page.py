@@ -26,9 +26,10 @@ from experiments.viewing.server import Server
 from jaxcloseup.artifacts.gaussians import as_gaussians
 from jaxcloseup.artifacts.images import encode_png, to_uint8
 from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.label_rules import label_depth
 from jaxcloseup.photographs import camera_at
 from jaxcloseup.splats import Surfels
-from jaxcloseup.train import TrainState, label_depth
+from jaxcloseup.train import TrainState
 
 
 _HELP = """Click on the scene for a close-up of what is there, on a camera to go to it.
