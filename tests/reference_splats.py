@@ -93,7 +93,7 @@ def intersect(surfels, camtoworld, intrinsics, pixels, *, near, reach=None):
     return np.array(alphas), np.array(depths)
 
 
-def composite(alphas, depths, payload):
+def blend(alphas, depths, payload):
     """Front to back, one splat after the other, of alphas and depths `[N, P]` in order.
 
     Returns payload sums `[P, F]`, alpha, expected depth, median depth and distortion `[P]`.
@@ -133,7 +133,7 @@ def render(surfels, camtoworld, intrinsics, height, width, *, near, background=N
         payload.append([*sh_color(sh, offset / np.linalg.norm(offset)), *normal])
         order.append(max(offset @ camtoworld[:, 2], near))
     by_depth = np.argsort(order, kind="stable")
-    sums, alpha, depth, median, distortion = composite(
+    sums, alpha, depth, median, distortion = blend(
         alphas[by_depth], depths[by_depth], np.array(payload)[by_depth]
     )
     rgb = sums[:, :3] + (0 if background is None else (1 - alpha)[:, None] * background)

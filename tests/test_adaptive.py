@@ -14,11 +14,11 @@ from jaxcloseup.geometry.cameras import points_to_pixels
 from jaxcloseup.splats import RasterizeConfig
 from jaxcloseup.splats.adaptive import (
     AdaptiveConfig,
-    PullState,
-    apply_probe,
+    ImageGradientState,
+    apply_image_offset,
     refine,
     reset_opacities,
-    with_probe,
+    with_image_offset,
 )
 from jaxcloseup.splats.field import SurfelConfig, surfel_field, surfel_optimizer
 from jaxcloseup.train import TrainConfig, init_state, run_steps, train_step
@@ -36,20 +36,22 @@ def scene_of(scales, opacities):
     scene["log_scales"] = np.log(np.stack([scales, 0.3 * np.asarray(scales)], axis=1))
     opacities = np.asarray(opacities, float)
     scene["opacity_logits"] = np.log(opacities) - np.log1p(-opacities)
-    return with_probe(to_surfels(scene))
+    return with_image_offset(to_surfels(scene))
 
 
-def pull_of(mean):
+def gradients_of(mean):
     views = np.where(np.asarray(mean) > 0, 4.0, 0.0)
-    return PullState(jnp.asarray(mean * views, jnp.float32), jnp.asarray(views, jnp.float32))
+    return ImageGradientState(
+        jnp.asarray(mean * views, jnp.float32), jnp.asarray(views, jnp.float32)
+    )
 
 
 def test_a_probe_moves_the_image_of_its_center_by_half_images():
-    surfels, camera = with_probe(to_surfels(random_scene(2, depth=(0.5, 3.0)))), to_camera()
+    surfels, camera = with_image_offset(to_surfels(random_scene(2, depth=(0.5, 3.0)))), to_camera()
     before, depth = points_to_pixels(camera, surfels.means)
-    probe = jnp.zeros((COUNT, 2)).at[3].set(jnp.array([0.1, -0.2]))
+    image_offset = jnp.zeros((COUNT, 2)).at[3].set(jnp.array([0.1, -0.2]))
     after, depth_after = points_to_pixels(
-        camera, apply_probe(surfels.replace(probe=probe), camera).means
+        camera, apply_image_offset(surfels.replace(image_offset=image_offset), camera).means
     )
     expected = np.zeros((COUNT, 2))
     expected[3] = 0.1 * WIDTH / 2, -0.2 * HEIGHT / 2
@@ -66,7 +68,7 @@ def test_small_are_cloned_large_are_split_faint_and_huge_removed(key):
     pulls[4] = 0.99  # just not hard enough
     alive = np.arange(COUNT) < 10
     before = scene_of(scales, opacities)
-    pull = pull_of(pulls)
+    pull = gradients_of(pulls)
     after, now_alive, new = grow(key, before, jnp.asarray(alive), pull, remove_huge=True)
     assert int(now_alive.sum()) == 10 - 2 + 2
     # The hardest pulled goes to the first free row, and so on: rows 2 and 3 were just removed.
@@ -97,7 +99,9 @@ def test_without_room_the_hardest_pulled_come_first(key):
     alive = np.ones(COUNT, bool)
     alive[[4, 7]] = False
     before = scene_of(np.full(COUNT, SMALL), np.full(COUNT, 0.5))
-    after, now_alive, new = grow(key, before, jnp.asarray(alive), pull_of(pulls), remove_huge=False)
+    after, now_alive, new = grow(
+        key, before, jnp.asarray(alive), gradients_of(pulls), remove_huge=False
+    )
     assert now_alive.all()
     np.testing.assert_array_equal(np.nonzero(new)[0], [4, 7])
     np.testing.assert_array_equal(after.means[4], before.means[COUNT - 1])
@@ -140,8 +144,8 @@ def test_training_measures_the_pull_and_adds_surfels():
     camera = jax.tree.map(lambda leaf: leaf[0], views.cameras)
 
     @jax.jit
-    def loss(probe):
-        params = state.params.replace(probe=probe)
+    def loss(image_offset):
+        params = state.params.replace(image_offset=image_offset)
         rendering = field.render(params, state.buffers, camera, None, None)
         return field.loss(rendering, views.rgb[0], views.weight[0])[0]
 
@@ -154,6 +158,6 @@ def test_training_measures_the_pull_and_adds_surfels():
     assert float(pull.total[hardest]) == pytest.approx(float(np.hypot(*differences)), rel=0.05)
     assert int(grown.buffers.alive.sum()) > 80
     assert float(grown.opt_state[0].views.max()) == 1  # counted anew
-    assert float(jnp.abs(grown.params.probe).max()) == 0
+    assert float(jnp.abs(grown.params.image_offset).max()) == 0
     assert float(jax.nn.sigmoid(faded.params.opacity_logits).max()) == pytest.approx(0.01, rel=1e-3)
     assert float(jnp.abs(faded.opt_state[1][0].mu.opacity_logits).max()) == 0

@@ -8,7 +8,7 @@ from reference_splats import rotation_of
 from splat_scenes import COUNT, HEIGHT, NEAR, WIDTH, random_scene, render, to_camera, to_surfels
 
 from jaxcloseup.splats import RasterizeConfig
-from jaxcloseup.splats.mcmc import McmcConfig, relocate, split_opacity, wander
+from jaxcloseup.splats.mcmc import McmcConfig, add_position_noise, relocate, split_opacity
 
 
 CONFIG = McmcConfig(growth=1.5)
@@ -118,7 +118,7 @@ def test_the_faint_wander_in_their_plane(key):
     scene["opacity_logits"] = logit(np.where(np.arange(COUNT) < 8, 0.006, 0.9))
     surfels = to_surfels(scene)
     alive = jnp.arange(COUNT) < 12
-    move_means = jax.jit(wander, static_argnames="config")
+    move_means = jax.jit(add_position_noise, static_argnames="config")
     moves = np.stack(
         [
             move_means(k, surfels, alive, jnp.float32(1e-3), config=McmcConfig(noise=100)).means

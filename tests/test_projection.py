@@ -19,7 +19,7 @@ def project(surfels, camera):
     discs, normals = to_camera(surfels, camera)
     opacity = jax.nn.sigmoid(surfels.opacity_logits)
     found = project_discs(discs, opacity, normals, camera, near=NEAR)
-    return found.box, found.opacity, found.anchor, found.rows, found.low_pass
+    return found.box, found.opacity, found.anchor, found.homography, found.low_pass
 
 
 @pytest.mark.parametrize(

@@ -362,13 +362,13 @@ def test_volumetric_gaussians_share_the_kernel():
     opacity, color = rng.uniform(0.2, 1, COUNT), rng.uniform(0, 1, (COUNT, 3))
 
     root = np.linalg.cholesky(np.linalg.inv(ellipse)).swapaxes(1, 2)
-    rows = np.zeros((COUNT, 3, 3))
-    rows[:, :2, 1:] = root / z[:, None, None]
-    rows[:, 2, 0] = 1 / z
+    homography = np.zeros((COUNT, 3, 3))
+    homography[:, :2, 1:] = root / z[:, None, None]
+    homography[:, 2, 0] = 1 / z
     reach = 3.34 * np.sqrt(np.diagonal(ellipse, axis1=1, axis2=2))
     footprints = Footprints(
         anchor=center,
-        rows=rows,
+        homography=homography,
         opacity=opacity,
         low_pass=np.full(COUNT, 1e9),
         inverse_depth=np.tile([0.0, np.inf], (COUNT, 1)),
@@ -386,7 +386,7 @@ def test_volumetric_gaussians_share_the_kernel():
     alpha[alpha < 1 / 255] = 0
     nearest = np.argsort(z)
     depth = np.broadcast_to(z[:, None], alpha.shape)
-    sums, total, expected_depth, median, _ = reference.composite(
+    sums, total, expected_depth, median, _ = reference.blend(
         alpha[nearest], depth[nearest], color[nearest]
     )
     np.testing.assert_allclose(image.payload, sums.reshape(HEIGHT, WIDTH, 3), atol=2e-5)

@@ -35,7 +35,7 @@ CONFIG = SurfelConfig(
     means_lr=(2e-3, 2e-4),
     sh_lr=2e-2,
     rotation_lr=1e-2,
-    decay_steps=STEPS,
+    means_lr_steps=STEPS,
     density=McmcConfig(every=25, start=25, stop=150, growth=1.1),
     raster=RasterizeConfig(capacity=2**13, near=0.2, tile=8, chunk=4, block=12),
 )
@@ -206,7 +206,7 @@ def test_first_step_moves_everything_by_its_learning_rate():
 
 
 def test_late_steps_are_smaller():
-    config = dataclasses.replace(CONFIG, decay_steps=1, late_lr_scale=0.1)
+    config = dataclasses.replace(CONFIG, means_lr_steps=1, late_lr_scale=0.1)
     optimizer = surfel_optimizer(config, extent=EXTENT)
     surfels = to_surfels(random_scene(0))
     with jax.numpy_dtype_promotion("standard"):

@@ -35,7 +35,7 @@ TINY_SURFELS = dataclasses.replace(
     field=dataclasses.replace(
         QUICK_SURFELS.field,
         capacity=600,
-        decay_steps=20,
+        means_lr_steps=20,
         density=None,
         raster=RasterizeConfig(capacity=2**14, tile=8, chunk=4, block=12),
     ),

@@ -22,7 +22,7 @@ ALPHA_MAX = 0.99  # nothing is fully opaque, so that what lies behind keeps a gr
 TRANSMITTANCE_MIN = 1e-4  # a pixel is finished before its transmittance would fall below this
 
 # Columns of the packed table that a chunk gathers; the payload follows.
-_ANCHOR, _ROWS, _OPACITY, _LOW_PASS, _RANGE, _PAYLOAD = 0, 2, 11, 12, 13, 15
+_ANCHOR, _HOMOGRAPHY, _OPACITY, _LOW_PASS, _RANGE, _PAYLOAD = 0, 2, 11, 12, 13, 15
 _EXACT = lax.Precision.HIGHEST
 
 
@@ -32,7 +32,7 @@ def pack(footprints) -> jax.Array:
     return jnp.concatenate(
         [
             footprints.anchor,
-            footprints.rows.reshape(count, 9),
+            footprints.homography.reshape(count, 9),
             footprints.opacity[:, None],
             lax.stop_gradient(footprints.low_pass)[:, None],
             lax.stop_gradient(footprints.inverse_depth),
@@ -68,7 +68,8 @@ def _shade(splats: jax.Array, x: jax.Array, y: jax.Array, near: float) -> _Shade
     column = lambda i: splats[:, :, i, None]  # noqa: E731
     dx, dy = x[None, None] - column(_ANCHOR), y[None, None] - column(_ANCHOR + 1)
     u, v, w = (
-        column(i) + column(i + 1) * dx + column(i + 2) * dy for i in (_ROWS, _ROWS + 3, _ROWS + 6)
+        column(i) + column(i + 1) * dx + column(i + 2) * dy
+        for i in (_HOMOGRAPHY, _HOMOGRAPHY + 3, _HOMOGRAPHY + 6)
     )
     squared = u * u + v * v
     low_pass = column(_LOW_PASS) * (dx * dx + dy * dy)
@@ -91,10 +92,10 @@ def _gather(table, lists: TileLists, tiles, position, chunk):
     # Past a list's end anything of the same image will do: it is given the opacity 0.
     index = lists.splats[starts[None] + jnp.where(inside, place, 0)]
     rows = table[index]
-    anchor = rows[..., :_ROWS] - origins[None].astype(table.dtype)
+    anchor = rows[..., :_HOMOGRAPHY] - origins[None].astype(table.dtype)
     opacity = jnp.where(inside, rows[..., _OPACITY], 0)[..., None]
     rows = jnp.concatenate(
-        [anchor, rows[..., _ROWS:_OPACITY], opacity, rows[..., _OPACITY + 1 :]], axis=-1
+        [anchor, rows[..., _HOMOGRAPHY:_OPACITY], opacity, rows[..., _OPACITY + 1 :]], axis=-1
     )
     return rows, index
 
@@ -106,7 +107,7 @@ def _pixels(tile: int, dtype) -> tuple[jax.Array, jax.Array]:
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def composite(config, table: jax.Array, lists: TileLists) -> tuple[jax.Array, jax.Array]:
+def blend_tiles(config, table: jax.Array, lists: TileLists) -> tuple[jax.Array, jax.Array]:
     """Sums of weights times values, and median z-depth, in all tiles in row-major order.
 
     Args:
@@ -118,15 +119,15 @@ def composite(config, table: jax.Array, lists: TileLists) -> tuple[jax.Array, ja
       `[T, F + 4, P]` sums: of the payload, z, 1, and the first and second moment of 1 / z about its
       value at the pixel's first splat. `[T, P]` median z. Only `table` is differentiated.
     """
-    return _composite_forward(config, table, lists)[0]
+    return _blend_forward(config, table, lists)[0]
 
 
-def _composite_forward(config, table, lists):
+def _blend_forward(config, table, lists):
     sums, median, trace = _batched_forward(config)(table, lists)
     return (sums, median), (table, lists, trace)
 
 
-def _composite_backward(config, residuals, cotangents):
+def _blend_backward(config, residuals, cotangents):
     return _batched_backward(config)(*residuals, cotangents), None
 
 
@@ -342,18 +343,18 @@ def _assemble(rows, middle, *, u, v, w, low_pass, clip, scaled, payload):
     ax, ay = rows[..., 0] - middle, rows[..., 1] - middle
     about_anchor = lambda m: (m[0], m[1] - ax * m[0], m[2] - ay * m[0])  # noqa: E731
     u, v, w, low_pass = map(about_anchor, (u, v, w, low_pass))
-    slopes = rows[..., _ROWS:_OPACITY].reshape(*rows.shape[:2], 3, 3)[..., 1:]
+    slopes = rows[..., _HOMOGRAPHY:_OPACITY].reshape(*rows.shape[:2], 3, 3)[..., 1:]
     anchor_bar = [
         rows[..., _LOW_PASS] * low_pass[1 + axis]
         - sum(bar[0] * slopes[..., i, axis] for i, bar in enumerate((u, v, w)))
         for axis in range(2)
     ]
     # A clipped depth moves with the depth of the anchor, 1 / rows[2, 0].
-    constant_bar = w[0] + safe_divide(clip, rows[..., _ROWS + 6] ** 2)
+    constant_bar = w[0] + safe_divide(clip, rows[..., _HOMOGRAPHY + 6] ** 2)
     opacity_bar = safe_divide(scaled, rows[..., _OPACITY])
     constants = [jnp.zeros_like(ax)] * (_PAYLOAD - _LOW_PASS)
     columns = [*anchor_bar, *u, *v, constant_bar, *w[1:], opacity_bar, *constants]
     return jnp.concatenate([jnp.stack(columns, axis=-1), payload], axis=-1)
 
 
-composite.defvjp(_composite_forward, _composite_backward)
+blend_tiles.defvjp(_blend_forward, _blend_backward)

@@ -100,7 +100,9 @@ def project_discs(
     at_anchor = jnp.sum(covectors * ray[:, None], axis=-1)
     at_center = jnp.stack([jnp.zeros_like(depth), jnp.zeros_like(depth), inverse_depth], axis=-1)
     constants = jnp.where(centered, at_center, at_anchor)
-    rows = jnp.concatenate([constants[..., None], covectors[..., :2] / focal[:, None]], axis=-1)
+    homography = jnp.concatenate(
+        [constants[..., None], covectors[..., :2] / focal[:, None]], axis=-1
+    )
 
     # What is drawn where has no derivative, nor has a disc's extent in depth.
     discs, opacity_now, center = lax.stop_gradient((discs, opacity, center))
@@ -112,7 +114,7 @@ def project_discs(
     box = jnp.where(ahead[:, None], _unite(box, _low_pass_box(center, cutoff)), box)
     return Footprints(
         anchor=anchor,
-        rows=rows,
+        homography=homography,
         opacity=jnp.where(drawn, opacity, 0),
         low_pass=jnp.where(ahead, LOW_PASS, 1e9),
         inverse_depth=jnp.stack([1 / farthest, 1 / nearest], axis=-1),

@@ -15,7 +15,7 @@ from flax import struct
 from jax import lax
 
 from jaxcloseup.numerics import safe_divide
-from jaxcloseup.splats.kernel import composite, pack
+from jaxcloseup.splats.kernel import blend_tiles, pack
 from jaxcloseup.splats.tiling import tile_lists
 
 
@@ -61,7 +61,7 @@ class Footprints:
     """
 
     anchor: jax.Array
-    rows: jax.Array
+    homography: jax.Array
     opacity: jax.Array
     low_pass: jax.Array
     inverse_depth: jax.Array
@@ -70,7 +70,7 @@ class Footprints:
     box: jax.Array
 
 
-class Composite(NamedTuple):
+class SplatImage(NamedTuple):
     """An image of footprints, before any background.
 
     Attributes:
@@ -93,15 +93,15 @@ class Composite(NamedTuple):
 
 def rasterize(
     footprints: Footprints, config: RasterizeConfig, *, height: int, width: int
-) -> Composite:
-    """Composite `footprints` into an image of `height` x `width` pixels.
+) -> SplatImage:
+    """SplatImage `footprints` into an image of `height` x `width` pixels.
 
     Differentiable in anchor, rows, opacity and payload. Deterministic; ties in `order` go to the
     lower index.
     """
     count, features = footprints.payload.shape
     chex.assert_shape(footprints.anchor, (count, 2))
-    chex.assert_shape(footprints.rows, (count, 3, 3))
+    chex.assert_shape(footprints.homography, (count, 3, 3))
     chex.assert_shape([footprints.opacity, footprints.low_pass, footprints.order], (count,))
     chex.assert_shape(footprints.inverse_depth, (count, 2))
     chex.assert_shape(footprints.box, (count, 4))
@@ -116,11 +116,11 @@ def rasterize(
         capacity=config.capacity,
     )
     table = pack(footprints)
-    sums, median = composite(config, table, lists)
+    sums, median = blend_tiles(config, table, lists)
     image = functools.partial(_untile, height=height, width=width, tile=config.tile)
     payload = jnp.moveaxis(jax.vmap(image, in_axes=1)(sums[:, :features]), 0, -1)
     depth, alpha, first, second = (image(sums[:, features + i]) for i in range(4))
-    return Composite(
+    return SplatImage(
         payload=payload,
         alpha=alpha,
         depth=safe_divide(depth, alpha),

@@ -77,4 +77,4 @@ def render_surfels(
         chex.assert_shape(background, (3,))
         rgb = rgb + (1 - image.alpha)[..., None] * background[None, None]
     aux = SurfelAux(normal, image.median_depth, image.distortion, image.overflow)
-    return Rendering(rgb, image.depth, image.alpha, aux)
+    return Rendering(rgb, image.depth, image.alpha, aux, normal=aux.normal, overflow=aux.overflow)
