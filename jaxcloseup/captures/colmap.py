@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxcloseup.captures.colmap_files import check_files
+from jaxcloseup.captures.colmap_checks import check_files
 from jaxcloseup.captures.distortion import read_distortion
 from jaxcloseup.captures.frames import Frame, check_photographs
 from jaxcloseup.captures.json_fields import number

@@ -87,7 +87,7 @@ def read_distortion(label: str, lens: dict[str, Any]) -> Distortion | None:
     return Distortion(fisheye, tuple(given.get(key, 0.0) for key in order))
 
 
-def undistortion(
+def undistortion_map(
     distortion: Distortion, intrinsics: tuple[float, float, float, float], width: int, height: int
 ) -> Remap:
     """The map from a pinhole photograph, of the same size and intrinsics, to the distorted one.

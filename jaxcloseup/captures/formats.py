@@ -10,7 +10,7 @@ from jaxcloseup.captures.frames import Frame
 from jaxcloseup.captures.llff import read_llff
 from jaxcloseup.captures.masks import attach_masks
 from jaxcloseup.captures.points import read_ply_points
-from jaxcloseup.captures.reduced import attach_reduced
+from jaxcloseup.captures.reduced_photos import attach_reduced
 from jaxcloseup.captures.splits import divide, listed_split, split_of_file, warn_duplicates
 from jaxcloseup.captures.transforms import read_transforms
 from jaxcloseup.scene import SceneError

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcloseup.captures.bounds import near_far_from_cameras, near_far_from_points
-from jaxcloseup.captures.checks import check_weights, warn_sizes
+from jaxcloseup.captures.depth_range import near_far_from_cameras, near_far_from_points
 from jaxcloseup.captures.formats import Listing, read_listing
 from jaxcloseup.captures.images import pad_images
 from jaxcloseup.captures.json_fields import affine_transform, number
+from jaxcloseup.captures.photo_checks import check_weights, warn_sizes
 from jaxcloseup.captures.photo_reading import Photo, Reading, read_photos
 from jaxcloseup.captures.splits import unique_names
 from jaxcloseup.captures.triangulation import triangulate

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from jaxcloseup.captures.distortion import Remap, undistort, undistortion
+from jaxcloseup.captures.distortion import Remap, undistort, undistortion_map
 from jaxcloseup.captures.frames import Frame, frame_intrinsics
 from jaxcloseup.captures.images import downscale_image, read_file, read_image, read_mask
 from jaxcloseup.captures.photo_cache import content_hash, kept
@@ -22,7 +22,7 @@ from jaxcloseup.scene import SceneError
 
 ALPHA_MODES = ("blend", "mask")
 _MOST_AT_ONCE = 4  # each holds a few times its own size: 12 megapixels take some 100 MB
-_CODE = ("photographs.py", "images.py", "distortion.py")
+_CODE = ("photo_reading.py", "images.py", "distortion.py")
 _BYTES_PER_PIXEL = 12  # of what stays: as read, padded, and weights in float32, at the worst moment
 
 
@@ -93,7 +93,8 @@ def read_photos(splits: Mapping[str, Sequence[Frame]], reading: Reading) -> dict
     read = functools.partial(
         _read_photo,
         reading=reading,
-        find_remap=_one_at_a_time(functools.lru_cache(maxsize=2)(undistortion)),  # mostly one lens
+        # Most captures have one lens.
+        find_remap=_one_at_a_time(functools.lru_cache(maxsize=2)(undistortion_map)),
     )
     first = read(frames[0], frames[0].file in closeups)
     _check_memory(first[0], len(frames), reading)

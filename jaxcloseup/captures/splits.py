@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxcloseup.captures.bounds import depths_in_view
+from jaxcloseup.captures.depth_range import depths_in_view
 from jaxcloseup.captures.frames import Frame, frame_intrinsics
 from jaxcloseup.captures.images import read_image
 from jaxcloseup.scene import DuplicateFileWarning, SceneError, UnknownKeyWarning

@@ -42,7 +42,7 @@ PROCEDURAL_SCENES: tuple[str, ...] = tuple(SCENES)
 NUM_TRAIN, NUM_TEST, NUM_FAR = 60, 12, 8
 _SAMPLES = 8  # rays a pixel
 _SOURCES = (
-    *("raycast.py", "shading.py", "lighting.py", "modeling.py", "planning.py", "procedural.py"),
+    *("raycast.py", "shading.py", "lighting.py", "modeling.py", "planning.py", "loading.py"),
     *("builtin/*.py", "textures/*.py"),
 )
 

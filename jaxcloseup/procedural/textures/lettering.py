@@ -13,12 +13,13 @@ INK, RED, BLUE, GREEN, GOLD, CREAM, WHITE = (
     (35, 32, 30), (176, 40, 34), (34, 66, 130), (42, 98, 58), (204, 152, 50), (244, 236, 216),
     (250, 249, 246),
 )  # fmt: skip
+# Printed on textures: any change, even of spelling, changes the pixels of the built-in scenes.
 TEXT = """
 the lamp stood near a window and its light fell over brick and oak while rain went on in the yard a
 kettle began to sing so we cut bread and set plates along the table nobody had measured how far the
 stairs were worn but every step kept the print of a shoe and the rail was smooth look closer said
 the painter and you will find grain inside the grain small letters under large ones and threads that
-cross where you only saw a color
+cross where you only saw a colour
 """
 
 # Tones of a landscape, from the sky and its sun to the nearest hill.
