@@ -11,7 +11,7 @@ from jaxcloseup.splats.spherical_harmonics import sh_to_rgb
 from jaxcloseup.splats.surfels import Surfels
 
 
-_LEAST_LOG_SCALE = -20.0  # what compressed PLY can hold
+_MIN_LOG_SCALE = -20.0  # what compressed PLY can hold
 
 
 class Gaussians(NamedTuple):
@@ -33,7 +33,7 @@ class Gaussians(NamedTuple):
 def thickened(log_scales: np.ndarray) -> np.ndarray:
     """Log scales `[N, 3]` of discs' `[N, 2]`: as thick as a thousandth of the smaller radius."""
     thin = log_scales.min(axis=1, keepdims=True) + np.float32(np.log(1e-3))
-    return np.concatenate([log_scales, np.maximum(thin, _LEAST_LOG_SCALE)], axis=1)
+    return np.concatenate([log_scales, np.maximum(thin, _MIN_LOG_SCALE)], axis=1)
 
 
 def as_gaussians(surfels: Surfels, alive: jax.Array) -> Gaussians:

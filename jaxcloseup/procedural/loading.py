@@ -75,7 +75,7 @@ def procedural_scene(
     if downscale < 1 or downscale != int(downscale):
         raise ValueError(f"downscale must be a positive integer, not {downscale}")
     width, height = -(-WIDTH // downscale), -(-HEIGHT // downscale)
-    capture = _kept(f"{name}-{width}x{height}", lambda: _capture(name, width, height))
+    capture = _cached(f"{name}-{width}x{height}", lambda: _capture(name, width, height))
     splits = {}
     for split in ("train", "test", "test_far"):
         rgb = jnp.asarray(capture[f"{split}_rgb"])
@@ -118,7 +118,7 @@ def _world(name: str) -> shading.World:
     model = SCENES[name]()
 
     def bake(*scene: Any) -> np.ndarray:
-        return _kept(f"{name}-light", lambda: {"light": bake_light(*scene)})["light"]
+        return _cached(f"{name}-light", lambda: {"light": bake_light(*scene)})["light"]
 
     # The first call may come from inside a trace, whose arrays must not be kept.
     with jax.ensure_compile_time_eval():
@@ -140,7 +140,7 @@ def _cameras(poses: np.ndarray, width: int, height: int) -> Camera:
     )
 
 
-def _kept(stem: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+def _cached(stem: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     """`make()`, from disk where it has been made before by these very sources.
 
     A cache that cannot be read or written costs time and a warning, never more.

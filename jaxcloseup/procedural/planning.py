@@ -51,7 +51,7 @@ def grid_rays(poses: np.ndarray, columns: int, rows: int) -> tuple[np.ndarray, n
     return poses[:, None, :, 3], np.einsum("pj,vij->vpi", in_camera, poses[:, :, :3])
 
 
-def seen_by(solids: Solids, points: np.ndarray, poses: np.ndarray) -> np.ndarray:
+def count_views(solids: Solids, points: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """How many of the views `[V, 3, 4]` show each of the surface points `[P, 3]`."""
     away = points[:, None] - poses[None, :, :, 3]
     in_camera = np.einsum("pvi,vij->pvj", away, poses[:, :, :3])
@@ -150,7 +150,7 @@ def _closeup(
         origins, directions = grid_rays(poses[i : i + 1], 16, 9)
         depths = cast_rays(solids, origins, directions).depth[..., None]
         shown = (origins + depths * directions)[0]
-        views_of = seen_by(solids, np.concatenate([subjects[i : i + 1], shown]), train)
+        views_of = count_views(solids, np.concatenate([subjects[i : i + 1], shown]), train)
         if views_of[0] >= 3 and np.mean(views_of[1:] >= 3) > 0.75:
             return poses[i], subjects[i]
     return None
