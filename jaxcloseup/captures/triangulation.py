@@ -14,9 +14,8 @@ import numpy as np
 _LONGEST_SIDE = 1600  # in pixels; larger photographs are searched at this size
 _MAX_FEATURES = 2000  # per photograph; matching cost grows with their square
 _NEIGHBORS = 4
-_MIN_AXIS_COSINE = np.cos(
-    np.radians(60)
-)  # of the optical axes; SIFT finds few matches beyond 40 degrees
+# Cosine of the widest angle between optical axes; SIFT finds few matches beyond 40 degrees.
+_MIN_AXIS_COSINE = np.cos(np.radians(60))
 _RATIO = 0.8  # best over second-best match distance, as in Lowe (2004)
 _MAX_ERROR = 2.0  # in pixels
 _MIN_ANGLE = np.radians(1.5)  # between rays; below it, depth is unreliable
