@@ -61,7 +61,7 @@ def check_sizes(folder: pathlib.Path, photos: Sequence[Photo]) -> None:
             )
         resized.append(f"{frame.listed} is {width} x {height} pixels instead of {w} x {h}")
     if resized:
-        more = f" and {len(resized) - 1} more" if len(resized) > 1 else ""
+        more = f" (and {len(resized) - 1} more)" if len(resized) > 1 else ""
         warnings.warn(
             f"{folder}: {resized[0]}{more}; the intrinsics were scaled to the images.",
             ImageSizeWarning,
