@@ -1,4 +1,4 @@
-"""Files that are either whole or not there, lines added to others, and where caches are."""
+"""Write whole files and strict JSON atomically, append to files, and find the cache folder."""
 
 import json
 import math
@@ -31,6 +31,24 @@ def write_file(path: str | pathlib.Path, data: bytes) -> None:
             part.unlink(missing_ok=True)
     except OSError as error:
         raise _unwritable(path, error) from error
+
+
+def write_json(path: str | pathlib.Path, value: Any) -> None:
+    """Write `value` as strict JSON, atomically; numbers that are not finite become null.
+
+    Raises:
+      OSError: one sentence that names the path and the reason.
+    """
+    write_file(path, json.dumps(strict(value), indent=1, allow_nan=False).encode())
+
+
+def strict(value: Any) -> Any:
+    """Copy a value for strict JSON, with None in place of numbers that are not finite."""
+    if isinstance(value, Mapping):
+        return {key: strict(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [strict(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def append_file(path: str | pathlib.Path, data: bytes) -> None:

@@ -5,9 +5,7 @@ import numpy as np
 import pytest
 from tiny_capture import POSE, frame, paper_capture, single_file, write_json
 
-from jaxcloseup.scene import (
-    UnknownKeyWarning,
-)
+from jaxcloseup.scene import UnknownKeyWarning
 from jaxcloseup.scenes import SceneError, SceneWarning, load_scene
 
 

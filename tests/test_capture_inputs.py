@@ -4,21 +4,12 @@ import zlib
 import cv2
 import numpy as np
 import pytest
-from tiny_capture import (
-    HEIGHT,
-    PROPERTIES,
-    WIDTH,
-    vertices,
-    write_image,
-    write_ply,
-)
+from tiny_capture import HEIGHT, PROPERTIES, WIDTH, vertices, write_image, write_ply
 
-from jaxcloseup.captures.bounds import near_far_from_cameras, near_far_from_points
+from jaxcloseup.captures.depth_range import near_far_from_cameras, near_far_from_points
 from jaxcloseup.captures.images import read_image
 from jaxcloseup.captures.points import read_ply_points
-from jaxcloseup.scene import (
-    PointsWarning,
-)
+from jaxcloseup.scene import PointsWarning
 from jaxcloseup.scenes import SceneError
 
 

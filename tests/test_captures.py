@@ -1,6 +1,3 @@
-import sys
-import types
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,11 +16,8 @@ from tiny_capture import (
     write_ply,
 )
 
-from jaxcloseup.scene import (
-    DuplicateFileWarning,
-    ImageSizeWarning,
-    NearFarWarning,
-)
+from jaxcloseup import scenes
+from jaxcloseup.scene import DuplicateFileWarning, ImageSizeWarning, NearFarWarning
 from jaxcloseup.scenes import SceneError, load_scene
 
 
@@ -260,11 +254,8 @@ def test_missing_near_far_is_estimated(capture, given):
 
 
 def test_names_of_built_in_scenes(monkeypatch, tmp_path, capture):
-    built_in = types.SimpleNamespace(
-        PROCEDURAL_SCENES=("table", "room"),
-        procedural_scene=lambda name, *, downscale: (name, downscale),
-    )
-    monkeypatch.setitem(sys.modules, "jaxcloseup.procedural.loading", built_in)
+    monkeypatch.setattr(scenes, "PROCEDURAL_SCENES", ("table", "room"))
+    monkeypatch.setattr(scenes, "procedural_scene", lambda name, *, downscale: (name, downscale))
     assert load_scene("table", downscale=2) == ("table", 2)
     with pytest.raises(SceneError, match=r"tabel is neither .* choose one of table, room"):
         load_scene("tabel")

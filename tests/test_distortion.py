@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from tiny_capture import POSE, write_image, write_json
 
-from jaxcloseup.captures.distortion import read_distortion, undistort, undistortion
+from jaxcloseup.captures.distortion import read_distortion, undistort, undistortion_map
 from jaxcloseup.scenes import load_scene
 
 
@@ -71,7 +71,7 @@ def grid():
 def test_rays_keep_their_colors(model):
     lens = LENSES[model]
     distortion = read_distortion("lens", {"camera_model": model, **lens})
-    remap = undistortion(distortion, INTRINSICS, WIDTH, HEIGHT)
+    remap = undistortion_map(distortion, INTRINSICS, WIDTH, HEIGHT)
     photograph = colors(*straighten(*grid(), model, lens))
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     image, weight = undistort(photograph, mask, remap)
@@ -94,7 +94,7 @@ def test_rays_keep_their_colors(model):
 def test_directions_beyond_the_fold_are_not_shown():
     """r (1 - 0.5 r^2) turns back at r = sqrt(2/3); from there on the photograph comes again."""
     distortion = read_distortion("lens", {"k1": -0.5})
-    remap = undistortion(distortion, (20.0, 20.0, 30.0, 22.0), WIDTH, HEIGHT)
+    remap = undistortion_map(distortion, (20.0, 20.0, 30.0, 22.0), WIDTH, HEIGHT)
     column, row = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     radius = np.hypot(column - 30, row - 22) / 20
     np.testing.assert_array_equal(remap.inside, radius < np.sqrt(2 / 3))
@@ -102,7 +102,7 @@ def test_directions_beyond_the_fold_are_not_shown():
 
 def test_masks_are_bent_with_their_photographs():
     distortion = read_distortion("lens", {"camera_model": "RADIAL", **LENSES["RADIAL"]})
-    remap = undistortion(distortion, INTRINSICS, WIDTH, HEIGHT)
+    remap = undistortion_map(distortion, INTRINSICS, WIDTH, HEIGHT)
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[:, 40:] = 255
     weight = undistort(np.zeros((HEIGHT, WIDTH, 3), np.uint8), mask, remap)[1]

@@ -28,7 +28,7 @@ def write_photographs(folder, count, width, height):
 
 def test_photographs_are_never_all_in_memory_at_full_size(tmp_path, monkeypatch):
     """12 photographs of 3 megapixels are 108 MB; those being read and the small ones are not."""
-    monkeypatch.setattr(photo_reading, "_MOST_AT_ONCE", 2)
+    monkeypatch.setattr(photo_reading, "_MAX_CONCURRENT", 2)
     image = write_photographs(tmp_path, 12, 2000, 1500)
     tracemalloc.start()
     try:

@@ -236,7 +236,7 @@ def test_an_unwritable_cache_costs_a_warning(tmp_path, monkeypatch):
     blocked.write_text("in the way")
     monkeypatch.setenv("XDG_CACHE_HOME", str(blocked))
     with pytest.warns(UserWarning, match="cannot keep"):
-        made = loading._kept("anything", lambda: {"value": np.arange(3)})
+        made = loading._cached("anything", lambda: {"value": np.arange(3)})
     np.testing.assert_array_equal(made["value"], [0, 1, 2])
 
 

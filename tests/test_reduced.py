@@ -71,7 +71,7 @@ def test_all_of_them_or_none(tmp_path):
         write_image(tmp_path / "images_2" / name, small)
     rgb, _, scene = load(tmp_path, downscale=2)
     np.testing.assert_array_equal(rgb, expected)
-    lacks = "images_2 is not used, since it lacks 2 of 3 photo_reading, such as a."
+    lacks = "images_2 is not used, since it lacks 2 of 3 photographs, such as a."
     assert lacks in scene.metadata["notes"][-1]
     write_image(tmp_path / "images_2/a.jpg", small)
     assert (load(tmp_path, downscale=2)[0] == 0).all()
