@@ -66,24 +66,6 @@ def append_file(path: str | pathlib.Path, data: bytes) -> None:
         raise _unwritable(path, error) from error
 
 
-def write_json(path: str | pathlib.Path, value: Mapping[str, Any]) -> None:
-    """Write strict JSON, whole or not at all; numbers that are not finite become null.
-
-    Raises:
-      OSError: one sentence that names the path and the reason.
-    """
-    write_file(path, json.dumps(strict(value), indent=1, allow_nan=False).encode())
-
-
-def strict(value: Any) -> Any:
-    """The value with None in place of numbers that are not finite, which JSON cannot hold."""
-    if isinstance(value, Mapping):
-        return {key: strict(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [strict(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def _unwritable(path, error):
     return OSError(
         f"{path} cannot be written ({error.strerror}): choose another output folder or make room "

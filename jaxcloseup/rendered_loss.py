@@ -46,9 +46,7 @@ def rendered_loss(
     return _chunked(field, chunk, params, buffers, batch, key)
 
 
-def judge(
-    field: RadianceField, rendering: Any, target_rgb: jax.Array, weight: jax.Array
-) -> Loss:
+def judge(field: RadianceField, rendering: Any, target_rgb: jax.Array, weight: jax.Array) -> Loss:
     """`field.loss`, with `overflow` among its metrics where the rendering has it."""
     loss, metrics = field.loss(rendering, target_rgb, weight)
     if rendering.overflow is not None:

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import plane
-
 from experiments.methods.presets import QUICK, QUICK_SURFELS
+
 from experiments.training.loop import Programs
 from experiments.training.manifest import about_scene, write_manifest
 from experiments.training.stages import config

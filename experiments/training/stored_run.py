@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from experiments.methods import Preset
 from experiments.training import manifest
@@ -14,7 +15,7 @@ from experiments.training.programs import Programs
 from experiments.training.settings import with_settings
 from experiments.training.setup import initial_state
 from experiments.training.stored_config import preset_from_config
-from jaxcloseup.artifacts.checkpoints import CheckpointError, Checkpoints
+from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.scene import Scene
 from jaxcloseup.scenes import load_scene
 from jaxcloseup.train import TrainState
@@ -23,7 +24,7 @@ from jaxcloseup.train import TrainState
 # Which stage is rendered by default: the first of these that a run has.
 _BY_DEFAULT = ("closeup", "control", "baseline")
 # Names of a state's arrays that version 0.1.0 spelled otherwise.
-_OLD_NAMES = {"regularize": "regularise"}
+_OLD_NAMES = {"regularize": "regularise", "image_offset": "probe"}
 
 
 class RunError(Exception):
@@ -147,8 +148,10 @@ def restore(run: StoredRun, scene: Scene, stage: str) -> tuple[Programs, TrainSt
     """
     programs = Programs(run.preset, scene)
     like = jax.eval_shape(lambda: initial_state(programs, seed=0))
-    like = jax.tree.map(lambda leaf: jax.numpy.zeros(leaf.shape, leaf.dtype), like)
-    found = Checkpoints(run.folder / "checkpoints", run.identity).load(stage, like)
+    like = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), like)
+    old = _OLD_NAMES if str(run.identity.get("version", "")).startswith("0.1.") else {}
+    checkpoints = Checkpoints(run.folder / "checkpoints", run.identity)
+    found = checkpoints.load(stage, like, stored_as=old)
     if found is None:
         raise RunError(f"--stage={stage}: {run.folder} has no state of it")
     step, state, progress = found

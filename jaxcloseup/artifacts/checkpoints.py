@@ -81,12 +81,15 @@ class Checkpoints:
                 "disk and resume the run from the previous checkpoint."
             ) from error
 
-    def load(self, stage: str, like: Any) -> tuple[int, Any, dict[str, Any]] | None:
+    def load(
+        self, stage: str, like: Any, *, stored_as: Mapping[str, str] | None = None
+    ) -> tuple[int, Any, dict[str, Any]] | None:
         """Load a stage's newest step, state and progress, or None if it has no checkpoint.
 
         Args:
           stage: name of the stage.
           like: pytree with the structure, shapes and types of the state.
+          stored_as: names of fields in `like` whose checkpoint has other names, to these.
 
         Raises:
           CheckpointError: the checkpoint cannot be read, or its state differs from `like`.
@@ -96,10 +99,17 @@ class Checkpoints:
         if step is None:
             return None
         items = ocp.args.Composite(
-            state=ocp.args.StandardRestore(_plain(like)), progress=ocp.args.JsonRestore()
+            # Under other names the state comes back as nested dicts.
+            state=ocp.args.StandardRestore(None if stored_as else _plain(like)),
+            progress=ocp.args.JsonRestore(),
         )
         try:
             found = manager.restore(step, args=items)
+            plain = found["state"]
+            if stored_as:
+                plain = jax.tree_util.tree_map_with_path(
+                    lambda path, _: _follow(found["state"], path, stored_as), like
+                )
         except (ValueError, KeyError, OSError) as error:
             raise CheckpointError(
                 f"{self.folder / stage / str(step)} does not hold this run's state "
@@ -107,7 +117,7 @@ class Checkpoints:
             ) from error
         state = jax.tree.map(
             lambda new, old: jax.random.wrap_key_data(new) if _is_key(old) else jnp.asarray(new),
-            found["state"],
+            plain,
             like,
         )
         return step, state, found["progress"]
@@ -148,3 +158,12 @@ def _plain(state):
     return jax.device_get(
         jax.tree.map(lambda leaf: jax.random.key_data(leaf) if _is_key(leaf) else leaf, state)
     )
+
+
+def _follow(tree, path, stored_as):
+    """The leaf of nested dicts and lists that lies at a pytree's path, under other names."""
+    for key in path:
+        name = jax.tree_util.keystr((key,), simple=True)
+        name = stored_as.get(name, name)
+        tree = tree[int(name)] if isinstance(tree, list | tuple) else tree[name]
+    return tree
