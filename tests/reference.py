@@ -37,6 +37,46 @@ def forward_warp(values, pixels, depths, shape):
     return image, buffer
 
 
+def bilinear(image, x, y):
+    """Value `[C]` of an image `[H, W, C]` at one continuous pixel; the border repeats outwards."""
+    height, width, _ = image.shape
+    total = np.zeros(image.shape[-1])
+    for column in (int(np.floor(x - 0.5)), int(np.floor(x - 0.5)) + 1):
+        for row in (int(np.floor(y - 0.5)), int(np.floor(y - 0.5)) + 1):
+            share = (1 - abs(x - 0.5 - column)) * (1 - abs(y - 0.5 - row))
+            total += share * image[min(max(row, 0), height - 1), min(max(column, 0), width - 1)]
+    return total
+
+
+def warp_to(image, source, target, depth, source_depth=None, tolerance=0.02):
+    """Read an image into a target view pixel by pixel; cameras are (camtoworld, intrinsics).
+
+    Returns `image [H, W, C]`, `valid [H, W]` and `margin [H, W]`: how far the nearest decision is,
+    in pixels, world units or relative depth.
+    """
+    image, depth = np.asarray(image, np.float64), np.asarray(depth, np.float64)
+    height, width, channels = image.shape
+    result, valid = np.zeros((*depth.shape, channels)), np.zeros(depth.shape, bool)
+    margin = np.full(depth.shape, np.inf)
+    for row, column in np.ndindex(*depth.shape):
+        at = row, column
+        if not (np.isfinite(depth[at]) and depth[at] > 0):
+            continue
+        point = unproject(*target, [(column + 0.5, row + 0.5)], [depth[at]])
+        ((x, y),), (z,) = project(*source, point)
+        margin[at] = min(abs(z), abs(x), abs(y), abs(x - width), abs(y - height))
+        if z <= 0 or not (0 <= x < width and 0 <= y < height):
+            continue
+        if source_depth is not None:
+            margin[at] = min(margin[at], abs(x - round(x)), abs(y - round(y)))
+            error = abs(float(source_depth[int(y), int(x)]) - z)
+            margin[at] = min(margin[at], abs(error / z - tolerance))
+            if error > tolerance * z:
+                continue
+        result[at], valid[at] = bilinear(image, x, y), True
+    return result, valid, margin
+
+
 def composite_ray(rgb, density, depth, length):
     """Weights, color, alpha, depth, alpha times depth and median depth of one ray's samples."""
     rgb, density, depth = (np.asarray(x, np.float64) for x in (rgb, density, depth))

@@ -13,8 +13,9 @@ from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.photographs import Batch
 from jaxcloseup.rendered_loss import rendered_loss
 from jaxcloseup.volume.encodings import positional_encoding
-from jaxcloseup.volume.nerf import NerfAux, NerfConfig, nerf
+from jaxcloseup.volume.nerf import NerfConfig, nerf
 from jaxcloseup.volume.networks import apply_network, init_network
+from jaxcloseup.volume.renderer import VolumeAux
 
 
 TINY = NerfConfig(
@@ -124,7 +125,7 @@ def test_shapes():
         rgb=(8, 8, 3),
         depth=(8, 8),
         alpha=(8, 8),
-        aux=NerfAux(coarse_rgb=(8, 8, 3), median_depth=(8, 8), expected_depth=(8, 8)),
+        aux=VolumeAux(coarse_rgb=(8, 8, 3), median_depth=(8, 8), expected_depth=(8, 8)),
     )
     assert jax.tree.map(jnp.shape, image) == expected
     assert np.all((image.depth > 1) & (image.depth < 3))
@@ -219,7 +220,7 @@ def test_no_weight_no_loss_no_gradient():
 def test_loss_is_a_weighted_mean():
     rgb = jnp.array([[0.1, 0.2, 0.3], [1.0, 1.0, 1.0]])
     ones = jnp.ones(2)
-    rendering = Rendering(rgb, ones, ones, NerfAux(rgb + 0.1, ones, ones))
+    rendering = Rendering(rgb, ones, ones, VolumeAux(rgb + 0.1, ones, ones))
     target = jnp.array([[0.2, 0.2, 0.3], [0.0, 0.0, 0.0]])
     value, metrics = field().loss(rendering, target, jnp.array([3.0, 1.0]))
     fine = (3 * 0.01 / 3 + 1 * 1) / 4

@@ -8,7 +8,7 @@ import pytest
 from jaxcloseup.field import RadianceField, Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.photographs import Batch
-from jaxcloseup.rendered_loss import rendered_loss
+from jaxcloseup.rendered_loss import judge, rendered_loss
 
 
 CAMERA = Camera(jnp.eye(4)[:3], jnp.array([8.0, 8, 4, 4]), 8, 8)
@@ -97,3 +97,15 @@ def test_a_sum_of_losses_scales_their_gradients():
     alone = differentiate(params, buffers, batch, None, None)[1]
     np.testing.assert_allclose(gradient["first"], 0.5 * alone["first"] + 3, rtol=1e-5)
     np.testing.assert_allclose(gradient["second"], 0.5 * alone["second"], rtol=1e-5)
+
+
+def test_a_renderings_overflow_is_among_its_metrics():
+    rgb, weight = jnp.full((4, 3), 0.5), jnp.ones(4)
+    rendering = Rendering(rgb, weight, weight)
+    loss, metrics = judge(FIELD, rendering, 0 * rgb, weight)
+    assert set(metrics) == {"root"}
+    full = rendering._replace(overflow=jnp.int32(7))
+    same_loss, metrics = judge(FIELD, full, 0 * rgb, weight)
+    assert same_loss == loss
+    assert metrics["overflow"] == 7
+    assert metrics["overflow"].dtype == jnp.float32
