@@ -1,6 +1,6 @@
 """Surfels as a radiance field: trainable 2-D Gaussian splatting (Huang et al., SIGGRAPH 2024).
 
-The field renders whole images only. Its regularizers turn normals towards the surface and gather
+The field renders whole images only. Its regularizers align normals with the surface and gather
 the light along a ray at one depth; their weights do not depend on the unit of length.
 """
 

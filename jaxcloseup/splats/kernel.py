@@ -1,9 +1,9 @@
-"""The kernel of `rasterize`: all tiles composited, with a hand-written derivative.
+"""The kernel of `rasterize`: blends the splats of all tiles, with a hand-written derivative.
 
-Tiles are sorted by the length of their lists and taken in blocks of `B`, a block takes its lists in
-chunks of `K` splats, and a chunk is evaluated at all `P` pixels of its tiles at once, in arrays
-`[K, B, P]`; only the products along a list are sequential. The derivative walks the same chunks
-back to front, so that memory is linear in pixels and pairs, and all sums have one fixed order.
+Tiles are sorted by the length of their lists and processed in blocks of `B`. A block processes its
+lists in chunks of `K` splats and evaluates a chunk at all `P` pixels of its tiles at once, in
+arrays `[K, B, P]`; only the products along a list are sequential. The derivative walks the same
+chunks back to front, so memory is linear in pixels and pairs, and all sums have one fixed order.
 """
 
 import functools
@@ -17,17 +17,17 @@ from jaxcloseup.numerics import safe_divide
 from jaxcloseup.splats.tiling import TileLists
 
 
-ALPHA_MIN = 1 / 255  # fainter contributions are not drawn
-ALPHA_MAX = 0.99  # nothing is fully opaque, so that what lies behind keeps a gradient
-TRANSMITTANCE_MIN = 1e-4  # a pixel is finished before its transmittance would fall below this
+ALPHA_MIN = 1 / 255  # the kernel skips fainter contributions
+ALPHA_MAX = 0.99  # keeps a gradient for splats behind an opaque one
+TRANSMITTANCE_MIN = 1e-4  # a pixel is finished before its transmittance falls below this
 
-# Columns of the packed table that a chunk gathers; the payload follows.
+# First columns of the packed table that chunks gather; the payload comes last.
 _ANCHOR, _HOMOGRAPHY, _OPACITY, _LOW_PASS, _RANGE, _PAYLOAD = 0, 2, 11, 12, 13, 15
 _EXACT = lax.Precision.HIGHEST
 
 
 def pack(footprints) -> jax.Array:
-    """The table `[N, C]` whose rows chunks gather, of `Footprints`."""
+    """Pack `Footprints` into one table `[N, C]`, whose rows the chunks gather."""
     count = footprints.opacity.shape[0]
     return jnp.concatenate(
         [
@@ -43,10 +43,10 @@ def pack(footprints) -> jax.Array:
 
 
 class _Trace(NamedTuple):
-    """What the derivative needs of the forward pass, per pixel of all blocks `[blocks, B, P]`."""
+    """What the forward pass keeps for the derivative, per pixel of all blocks `[blocks, B, P]`."""
 
     transmittance: jax.Array  # behind the last drawn splat
-    stop: jax.Array  # position in the list where the pixel was finished
+    stop: jax.Array  # position in the list at which the pixel was finished
     reference: jax.Array  # inverse depth of the first drawn splat
 
 
@@ -59,8 +59,8 @@ class _Shade(NamedTuple):
     u_numerator: jax.Array
     v_numerator: jax.Array
     rho: jax.Array
-    on_plane: jax.Array  # where the disc, not the low-pass, gives rho
-    clipped: jax.Array  # where the low-pass does and the disc's plane leaves the disc's depths
+    on_plane: jax.Array  # bool: the disc, not the low-pass, gives rho
+    clipped: jax.Array  # bool: the low-pass gives rho and the depth is clipped to the disc's range
 
 
 def _shade(splats: jax.Array, x: jax.Array, y: jax.Array, near: float) -> _Shade:
@@ -73,7 +73,7 @@ def _shade(splats: jax.Array, x: jax.Array, y: jax.Array, near: float) -> _Shade
     )
     squared = u * u + v * v
     low_pass = column(_LOW_PASS) * (dx * dx + dy * dy)
-    # rho compares without dividing, and w <= 0 (a ray that misses the plane) leaves the low-pass.
+    # Compare rho without dividing; where w <= 0 the ray misses the plane and the low-pass counts.
     on_plane = (w > 0) & (squared <= low_pass * (w * w))
     low, high = column(_RANGE), column(_RANGE + 1)
     inverse = jnp.where(on_plane, w, jnp.clip(w, low, high))
@@ -85,11 +85,11 @@ def _shade(splats: jax.Array, x: jax.Array, y: jax.Array, near: float) -> _Shade
 
 
 def _gather(table, lists: TileLists, tiles, position, chunk):
-    """Rows `[K, B, C]` of a chunk of each tile, anchors made local, and their splats `[K, B]`."""
+    """Table rows `[K, B, C]` of each tile's chunk, with local anchors, and splats `[K, B]`."""
     starts, counts, origins = tiles
     place = position + jnp.arange(chunk, dtype=jnp.int32)[:, None]
     inside = place < counts[None]
-    # Past a list's end anything of the same image will do: it is given the opacity 0.
+    # Past a list's end, take the splat at its start and give it opacity 0.
     index = lists.splats[starts[None] + jnp.where(inside, place, 0)]
     rows = table[index]
     anchor = rows[..., :_HOMOGRAPHY] - origins[None].astype(table.dtype)
@@ -101,23 +101,24 @@ def _gather(table, lists: TileLists, tiles, position, chunk):
 
 
 def _pixels(tile: int, dtype) -> tuple[jax.Array, jax.Array]:
-    """Pixel centers `[P]` of a tile whose first corner is the origin."""
+    """Pixel centers x and y `[P]` of a tile whose first corner is the origin."""
     centers = jnp.arange(tile, dtype=dtype) + 0.5
     return jnp.tile(centers, tile), jnp.repeat(centers, tile)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
 def blend_tiles(config, table: jax.Array, lists: TileLists) -> tuple[jax.Array, jax.Array]:
-    """Sums of weights times values, and median z-depth, in all tiles in row-major order.
+    """Blend splats front to back in all tiles; only `table` is differentiated.
 
     Args:
-      config: a `RasterizeConfig`.
-      table: `[N, C]` of `pack`.
-      lists: of `tile_lists`, with the same tile and block.
+      config: a `RasterizeConfig`; static.
+      table: `[N, C]` from `pack`.
+      lists: result of `tile_lists` with the config's tile and block.
 
     Returns:
-      `[T, F + 4, P]` sums: of the payload, z, 1, and the first and second moment of 1 / z about its
-      value at the pixel's first splat. `[T, P]` median z. Only `table` is differentiated.
+      Sums `[T, F + 4, P]` over splats of weight times payload, z, 1, and the first and second power
+      of 1 / z minus its value at the pixel's first splat; and the median z-depth `[T, P]`. Tiles
+      are in row-major order.
     """
     return _blend_forward(config, table, lists)[0]
 
@@ -133,9 +134,9 @@ def _blend_backward(config, residuals, cotangents):
 
 @functools.cache
 def _batched_forward(config):
-    """`_forward` that composites a batch of images as one with so many more tiles.
+    """`_forward` that blends a batch of images as one image with more tiles.
 
-    In loops that are batched as such, all images wait for the slowest at every chunk.
+    If `vmap` batched the loops instead, all images would wait for the slowest at every chunk.
     """
     forward = jax.custom_batching.custom_vmap(functools.partial(_forward, config))
 
@@ -149,7 +150,7 @@ def _batched_forward(config):
 
 @functools.cache
 def _batched_backward(config):
-    """`_backward`, batched like `_batched_forward`."""
+    """`_backward` with the batching of `_batched_forward`."""
     backward = jax.custom_batching.custom_vmap(functools.partial(_backward, config))
 
     @backward.def_vmap
@@ -171,7 +172,7 @@ def _broadcast(size, batched, arguments):
 
 
 def _merge(table, lists):
-    """Tables `[M, N, C]` and lists of M images as the table and the lists of one."""
+    """Merge tables `[M, N, C]` and tile lists of M images into those of one image."""
     count, capacity, tiles = table.shape[1], lists.splats.shape[1], lists.slot.shape[1]
     slots = lists.tile[0].size
 
@@ -200,7 +201,7 @@ def _forward(config, table, lists):
     x, y = _pixels(config.tile, table.dtype)
 
     def attenuate(product, alpha):
-        # The product keeps falling once a pixel is finished, so that it stays finished.
+        # The product keeps falling once a pixel is finished, so the pixel stays finished.
         product = product - alpha * product
         return product, product
 
@@ -230,7 +231,7 @@ def _forward(config, table, lists):
                 reference = jnp.where(drawn & (before == 1), shade.inverse_depth[k], reference)
                 median = jnp.where(drawn & (before > 0.5), shade.z[k], median)
                 before = after
-            # A splat in front of the first one drawn weighs nothing, so one reference serves all.
+            # Splats in front of the first drawn one have weight 0, so one reference serves all.
             shifted = shade.inverse_depth - reference[None]
             channels = [rows[:, :, _PAYLOAD + f, None] for f in range(features)]
             channels += [shade.z, jnp.ones_like(shade.z), shifted, shifted * shifted]
@@ -256,7 +257,7 @@ def _backward(config, table, lists, trace, cotangents):
     columns = table.shape[1]
     features = columns - _PAYLOAD
     x, y = _pixels(config.tile, table.dtype)
-    # About the middle of a tile, where sums over its pixels keep most digits.
+    # Moments about the middle of a tile lose the fewest digits.
     middle = config.tile / 2
     basis = jnp.stack([jnp.ones_like(x), x - middle, y - middle], axis=1)
 
@@ -286,7 +287,7 @@ def _backward(config, table, lists, trace, cotangents):
             place = position + jnp.arange(config.chunk, dtype=jnp.int32)[:, None, None]
             alpha = jnp.where(place < trace.stop[None], shade.alpha, 0)
             shifted = shade.inverse_depth - trace.reference[None]
-            # What a unit of weight of each splat is worth to the loss.
+            # Derivative of the loss with respect to each splat's weight.
             worth = sum(
                 rows[:, :, _PAYLOAD + f, None] * sums_bar[None, :, f] for f in range(features)
             )
@@ -297,11 +298,11 @@ def _backward(config, table, lists, trace, cotangents):
             (behind, after), (behinds, before) = lax.scan(
                 recede, ends, (alpha, passing, worth), reverse=True
             )
-            # What a splat finds behind it is what the next one leaves, up to the chunk's end.
+            # Shift by one: the state behind a splat is the state in front of the next one.
             behinds = jnp.concatenate([behinds[1:], ends[0][None]])
             afters = jnp.concatenate([before[1:], ends[1][None]])
             weight = alpha * before
-            # The splat in which half of the light is lost, or else the last one that is drawn.
+            # The median splat takes transmittance to 1/2, else it is the last drawn one.
             last = (afters <= 0.5) | (afters == trace.transmittance[None])
             median = (alpha > 0) & (before > 0.5) & last
             depth_bar = weight * z_bar + jnp.where(median, median_bar[None], 0)
@@ -336,9 +337,10 @@ def _backward(config, table, lists, trace, cotangents):
 
 
 def _assemble(rows, middle, *, u, v, w, low_pass, clip, scaled, payload):
-    """Cotangents `[K, B, C]` of gathered rows from sums over the tile's pixels.
+    """Cotangents `[K, B, C]` of gathered table rows, from sums over the tile's pixels.
 
-    u, v, w (of the rows) and low_pass are moments `[3, K, B]`: sums of 1, x and y about `middle`.
+    The cotangents of the homography's u, v, w and of the low-pass come as moments `[3, K, B]`: sums
+    of 1, x and y about `middle`.
     """
     ax, ay = rows[..., 0] - middle, rows[..., 1] - middle
     about_anchor = lambda m: (m[0], m[1] - ax * m[0], m[2] - ay * m[0])  # noqa: E731
@@ -349,7 +351,7 @@ def _assemble(rows, middle, *, u, v, w, low_pass, clip, scaled, payload):
         - sum(bar[0] * slopes[..., i, axis] for i, bar in enumerate((u, v, w)))
         for axis in range(2)
     ]
-    # A clipped depth moves with the depth of the anchor, 1 / rows[2, 0].
+    # A clipped depth moves with the anchor's depth, 1 / homography[2, 0].
     constant_bar = w[0] + safe_divide(clip, rows[..., _HOMOGRAPHY + 6] ** 2)
     opacity_bar = safe_divide(scaled, rows[..., _OPACITY])
     constants = [jnp.zeros_like(ax)] * (_PAYLOAD - _LOW_PASS)
