@@ -133,7 +133,7 @@ def _check_options(
     if format is not None and format not in FORMATS:
         raise SceneError(f"format {format!r} is unknown: choose one of {', '.join(FORMATS)}.")
     if zoom is not None and split != "zoom":
-        raise SceneError(f"zoom needs split zoom, but split is {split}: leave out zoom.")
+        raise SceneError(f"zoom needs split 'zoom', but split is {split!r}: leave out zoom.")
     if zoom is not None and (isinstance(zoom, bool) or not isinstance(zoom, int) or zoom < 2):
         raise SceneError(f"zoom must be a whole number of at least 2, got {zoom!r}.")
     if alpha_mode not in ALPHA_MODES:

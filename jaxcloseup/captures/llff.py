@@ -34,7 +34,7 @@ def read_llff(file: pathlib.Path, photographs: pathlib.Path) -> tuple[dict[str, 
     if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
         shape = " x ".join(map(str, getattr(rows, "shape", ()))) or "nothing"
         raise SceneError(
-            f"{file} holds {shape} instead of N x 17, one row per photograph: export it again."
+            f"{file} has shape {shape} instead of N x 17, one row per photograph: export it again."
         )
     if rows.dtype.kind not in "fiu":
         raise SceneError(

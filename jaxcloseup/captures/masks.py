@@ -59,8 +59,8 @@ def attach_masks(
     if holders and not any(found.values()) and len(waiting) == total:
         stem, name = waiting[0].file.stem, waiting[0].file.name
         raise SceneError(
-            f"{holders[0]} holds no mask for any of the {total} photographs: name the mask of "
-            f"{name} {name}.png, {stem}.mask.png or {stem} with an image suffix, or rename the "
+            f"{holders[0]} holds no mask for any of the {total} photographs: for {name}, name the "
+            f"mask {name}.png, {stem}.mask.png or {stem} with an image suffix, or rename the "
             "folder if it holds something else."
         )
     for file in found:

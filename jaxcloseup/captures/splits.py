@@ -200,7 +200,7 @@ def _zoom(name: str, frames: Sequence[Frame], zoom: int) -> Division:
     train, test = parts["train"], parts["train"][::TEST_EVERY]
     note = (
         f"{name}: its {len(train)} training photographs shrink {zoom} times; test is the most "
-        f"detailed crop of every {TEST_EVERY}th of them before that, {len(test)} in all, {zoom} "
+        f"detailed crop of every {TEST_EVERY}th of them, unshrunk, {len(test)} in all, {zoom} "
         f"times finer from the same positions; test_far is {len(parts.get('test_far', ()))} others"
     )
     return Division({"train": train, "test": test, **parts}, (note,), (float(zoom),) * len(test))
