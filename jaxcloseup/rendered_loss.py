@@ -68,14 +68,6 @@ def rendered_loss(
     return _chunked(field, chunk, params, buffers, batch, key)
 
 
-def judge(field: RadianceField, rendering: Any, target_rgb: jax.Array, weight: jax.Array) -> Loss:
-    """`field.loss`, with `overflow` among its metrics where the rendering has it."""
-    loss, metrics = field.loss(rendering, target_rgb, weight)
-    if rendering.overflow is not None:
-        metrics = metrics | {"overflow": rendering.overflow.astype(jnp.float32)}
-    return loss, metrics
-
-
 def _plain(field, params, buffers, batch, key):
     rendering = field.render(params, buffers, batch.cameras, batch.pixels, key)
     return judge(field, rendering, batch.rgb, batch.weight)

@@ -10,7 +10,8 @@ from absl import flags
 
 from experiments.command_line import check_unused
 from experiments.methods import METHODS, Preset
-from experiments.training.settings import describe_settings, with_settings
+from experiments.training import set_flag
+from experiments.training.settings import with_settings
 from jaxcloseup.captures.formats import FORMATS
 from jaxcloseup.captures.photo_reading import ALPHA_MODES
 from jaxcloseup.captures.splits import SPLITS
@@ -19,6 +20,7 @@ from jaxcloseup.scenes import load_scene
 
 
 FLAGS = flags.FLAGS
+flags.adopt_module_key_flags(set_flag)
 flags.DEFINE_enum("method", "surfels", list(METHODS), "radiance field")
 flags.DEFINE_enum(
     "preset",
@@ -26,12 +28,6 @@ flags.DEFINE_enum(
     list(dict.fromkeys(name for method in METHODS.values() for name in method.presets)),
     "hyper-parameters: "
     + "; ".join(f"{name} has {', '.join(method.presets)}" for name, method in METHODS.items()),
-)
-flags.DEFINE_multi_string(
-    "set",
-    [],
-    "name=value changes a setting of the preset, as in --set label_loss_weight=0.1 or --set "
-    "magnification=2:4; repeatable; " + describe_settings(METHODS),
 )
 flags.DEFINE_integer(
     "downscale",

@@ -38,13 +38,15 @@ class StoredRun(NamedTuple):
       folder: the run's folder.
       manifest: its `manifest.json`.
       identity: its `checkpoints/run.json`.
-      preset: how it was trained.
+      trained: how it was trained.
+      preset: the same, with the settings that the user changes now.
       stages: those that have a state.
     """
 
     folder: pathlib.Path
     manifest: Mapping[str, Any]
     identity: Mapping[str, Any]
+    trained: Preset
     preset: Preset
     stages: list[str]
 
@@ -81,7 +83,7 @@ def read_run(folder: pathlib.Path) -> StoredRun:
     )
     if not stages:
         raise RunError(f"--run={folder} has no checkpoint yet: resume it with experiments.run")
-    return StoredRun(folder, about, identity, preset, stages)
+    return StoredRun(folder, about, identity, preset, preset, stages)
 
 
 def change_settings(run: StoredRun, given: Sequence[str]) -> StoredRun:
@@ -147,8 +149,13 @@ def restore(run: StoredRun, scene: Scene, stage: str) -> tuple[Programs, TrainSt
       CheckpointError: the state has another form.
     """
     programs = Programs(run.preset, scene)
-    like = jax.eval_shape(lambda: initial_state(programs, seed=0))
-    like = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), like)
+    shapes = _shapes(programs)
+    if run.preset != run.trained and shapes != _shapes(Programs(run.trained, scene)):
+        raise RunError(
+            f"--set changes the shape of what was trained: --run={run.folder} was trained with "
+            "other shapes, so train anew with these settings, or leave them out"
+        )
+    like = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     old = _OLD_NAMES if str(run.identity.get("version", "")).startswith("0.1.") else {}
     checkpoints = Checkpoints(run.folder / "checkpoints", run.identity)
     found = checkpoints.load(stage, like, stored_as=old)
@@ -158,6 +165,11 @@ def restore(run: StoredRun, scene: Scene, stage: str) -> tuple[Programs, TrainSt
     programs.make_room(progress["growth"])
     print(f"{run.folder}: {scene.name}, {stage} after {step} steps")
     return programs, state
+
+
+def _shapes(programs: Programs) -> TrainState:
+    """The structure of a state, with shapes and types in place of arrays."""
+    return jax.eval_shape(lambda: initial_state(programs, seed=0))
 
 
 def _read_json(folder, name):

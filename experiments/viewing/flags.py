@@ -4,6 +4,7 @@ import pathlib
 
 from absl import flags
 
+from experiments.training import set_flag
 from experiments.training.stored_run import (
     RunError,
     StoredRun,
@@ -14,15 +15,10 @@ from experiments.training.stored_run import (
 
 
 FLAGS = flags.FLAGS
+flags.adopt_module_key_flags(set_flag)
 flags.DEFINE_string("run", None, "folder of the run")
 flags.DEFINE_string("stage", None, "stage to render; default: closeup, or the last that trained")
 flags.DEFINE_string("data", None, "where the run's capture lies now, if it was moved")
-flags.DEFINE_multi_string(
-    "set",
-    [],
-    "name=value changes a setting for fine-tuning, as in --set label_loss_weight=0.1; repeatable; "
-    "the settings are those of experiments.run, as its --help lists them",
-)
 
 
 def named_run() -> tuple[StoredRun, str]:
