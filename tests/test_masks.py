@@ -16,7 +16,7 @@ def single(folder):
 
 
 def weights(scene):
-    """Mean weight of each photograph by its name, of all splits."""
+    """Mean weight of each photograph of all splits, by name."""
     found = {}
     for split, names in scene.names.items():
         views = getattr(scene, split)
@@ -50,7 +50,7 @@ def test_some_masks_are_noted(tmp_path, caplog):
     )
 
 
-def test_no_mask_fits(tmp_path):
+def test_masks_that_fit_no_photograph_are_refused(tmp_path):
     single_file(tmp_path, 3)
     (tmp_path / "masks").mkdir()
     expected = (
@@ -87,7 +87,7 @@ def test_photographs_outside_the_folder(tmp_path, beside):
 
 
 def test_a_mask_is_bent_with_its_photograph(tmp_path):
-    """A mask beside the photographs weighs what the same one named by its frame does."""
+    """A mask in `masks` gives the same weights as the same mask named by its frame."""
     lens = {"fl_x": 30.0, "cx": 24.0, "cy": 20.0, "w": 48, "h": 40, "k1": -0.2, "p1": 0.01}
     mask = np.zeros((40, 48), np.uint8)
     mask[5:30, 10:40] = 255
@@ -102,7 +102,7 @@ def test_a_mask_is_bent_with_its_photograph(tmp_path):
     np.testing.assert_array_equal(load_scene(tmp_path).train.weight, named)
 
 
-def test_masks_that_leave_nothing(tmp_path):
+def test_masks_that_leave_no_pixel_are_refused(tmp_path):
     single_file(tmp_path, 2)
     for name in ("000", "001"):
         write_image(tmp_path / f"masks/{name}.png", np.zeros((HEIGHT, WIDTH), np.uint8))
@@ -113,7 +113,7 @@ def test_masks_that_leave_nothing(tmp_path):
 @pytest.mark.parametrize("make", [single, llff_capture, colmap_capture])
 @pytest.mark.parametrize("name", ["{0.name}.png", "{0.stem}.mask.png"])
 def test_masks_beside_photographs(tmp_path, make, name):
-    """They are no photographs themselves."""
+    """Masks beside photographs are not loaded as photographs."""
     if make is colmap_capture:
         pytest.importorskip("pycolmap")
     make(tmp_path)
@@ -127,7 +127,7 @@ def test_masks_beside_photographs(tmp_path, make, name):
         load_scene(tmp_path)
 
 
-def test_what_is_listed_is_no_mask(tmp_path):
+def test_listed_photographs_are_not_masks(tmp_path):
     names = ["a.png", "a.png.png", "b.mask.png"]
     for name in names:
         write_image(tmp_path / "images" / name, HALF)
@@ -163,7 +163,7 @@ def test_inverted_masks(tmp_path):
 
 
 def test_alpha_as_a_mask(tmp_path):
-    """Colors are the file's own, and what is transparent colors nothing when it shrinks."""
+    """Colors stay the file's own; transparent pixels do not color the reduced image."""
     image = np.full((HEIGHT, WIDTH, 4), [200, 100, 50, 255], np.uint8)
     image[:, 3:, :3], image[:, 3:, 3] = 7, 0
     image[0, 0, 3] = 128
