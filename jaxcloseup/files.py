@@ -9,13 +9,13 @@ from typing import Any
 
 
 def cache_folder() -> pathlib.Path:
-    """Where programs of this user keep what can be made again."""
-    # Unlike `Path.home`, this does not fail where nobody has a home.
+    """The user's folder for files that a program can make again."""
+    # Unlike `Path.home`, `expanduser` does not fail for a user without a home folder.
     return pathlib.Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
 
 
 def write_file(path: str | pathlib.Path, data: bytes) -> None:
-    """Write `data` to `path`, making its folders; a reader or a crash never meets half a file.
+    """Write `data` to `path` and create its folders; nobody sees half a file, even after a crash.
 
     Raises:
       OSError: one sentence that names the path and the reason.
@@ -52,7 +52,7 @@ def strict(value: Any) -> Any:
 
 
 def append_file(path: str | pathlib.Path, data: bytes) -> None:
-    """Add `data` to the end of `path`, making it and its folders if they are not there.
+    """Append `data` to `path`; create the file and its folders if they do not exist.
 
     Raises:
       OSError: one sentence that names the path and the reason.

@@ -1,4 +1,4 @@
-"""Slow NumPy float64 oracles, written from the equations and sharing no code with the package."""
+"""Slow NumPy float64 oracles, written from the equations; they share no code with the package."""
 
 import numpy as np
 
@@ -95,14 +95,14 @@ def composite_ray(rgb, density, depth, length):
 
 
 def invert_cdf(edges, weights, quantiles):
-    """Where the piecewise linear CDF of a histogram, raised by 1e-5, takes the values given."""
+    """Positions at which the linear CDF of a histogram, raised by 1e-5, reaches `quantiles`."""
     edges, weights = np.asarray(edges, np.float64), np.asarray(weights, np.float64) + 1e-5
     cdf = np.concatenate([[0], np.cumsum(weights / weights.sum())])
     return np.interp(quantiles, cdf, edges)
 
 
 def nerf_network(network, positions, directions):
-    """Raw density `[M]` and rgb `[M, 3]` of encoded samples `[M, I]` that look along `[M, J]`."""
+    """Raw density `[M]` and rgb `[M, 3]` of encoded positions `[M, I]` and directions `[M, J]`."""
 
     def layer(params, x):
         weights = np.concatenate([np.asarray(w, np.float64) for w in params["weights"]], axis=1)
@@ -139,8 +139,8 @@ def first_crossing(solids, origin, direction, nearest=1e-4):
     """Depth, world normal and index of the nearest of `solids` = (kind, to_world, taper) on a ray.
 
     Kinds are "plane", "box", "sphere", "cylinder": unit shapes under an affine map `[3, 4]`. Each
-    face is intersected by itself, in the unit frame. Also returned is the least distance, in the
-    unit frame, by which a candidate fell inside or outside its face: small for a grazing ray.
+    face is intersected by itself, in the unit frame. The last result is the least distance, in the
+    unit frame, by which a candidate fell inside or outside its face: it is small for a grazing ray.
     """
     best, margin = (np.inf, np.zeros(3), -1), np.inf
     for index, (kind, to_world, taper) in enumerate(solids):

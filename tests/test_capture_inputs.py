@@ -158,8 +158,8 @@ XYZ = (
             "plain properties x, y, z",
         ),
         (XYZ.format(-1, ""), "-1 of them"),
-        (XYZ.format(1, "property float x\n") + "1 2 3 4\n", "one of its names comes twice"),
-        (XYZ.format(1, "") + "a b c\n", "has words for numbers"),
+        (XYZ.format(1, "property float x\n") + "1 2 3 4\n", "a property name appears twice"),
+        (XYZ.format(1, "") + "a b c\n", "has words instead of numbers"),
         (XYZ.format(2, "") + "1 2 3\n", "ends before its 2 vertices do"),
     ],
 )

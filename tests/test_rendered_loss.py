@@ -15,7 +15,7 @@ CAMERA = Camera(jnp.eye(4)[:3], jnp.array([8.0, 8, 4, 4]), 8, 8)
 
 
 def _render(params, buffers, camera, pixels, key):
-    """Colors that depend on the pixel and its camera, through weights that are trained."""
+    """Colors that depend on the pixel and its camera through trainable weights."""
     x = pixels / 8 + camera.position[..., :2].reshape(-1, 2) + buffers
     rgb = jnp.tanh(x @ params["first"]) @ params["second"]
     if key is not None:
@@ -80,7 +80,7 @@ def test_every_chunk_draws_its_own_numbers():
     assert np.all(metrics["spread"] > 0.3)
 
 
-def test_no_weight_no_loss_no_gradient():
+def test_zero_weight_gives_zero_loss_and_gradient():
     (loss, _), gradient = differentiate(*problem(True, jnp.zeros(10)), None, 4)
     assert loss == 0
     assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(gradient))
