@@ -298,13 +298,13 @@ def test_a_field_with_more_capacity_renders_what_overflowed():
         field = surfel_field(dataclasses.replace(CONFIG, raster=raster), extent=EXTENT)
         return jax.jit(field.render)(params, buffers, camera, None, None)
 
-    capacity = 16
+    capacity = 40
     image = render_with(capacity)
     assert image.overflow > 0
     while int(image.overflow) > 0:
         capacity *= 2
         image = render_with(capacity)
-    assert 16 < capacity < CONFIG.raster.capacity
+    assert 40 < capacity < CONFIG.raster.capacity
     jax.tree.map(np.testing.assert_array_equal, image, render_with(CONFIG.raster.capacity))
     np.testing.assert_array_equal(image.normal, image.aux.surfels.normal)
 

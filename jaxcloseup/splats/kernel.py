@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxcloseup.numerics import safe_divide
+from jaxcloseup.splats.batching import broadcast_batch, merge_images, split_images
 from jaxcloseup.splats.tiling import TileLists
 
 
@@ -142,8 +143,8 @@ def _batched_forward(config):
 
     @forward.def_vmap
     def _(size, batched, table, lists):
-        table, lists = _merge(*_broadcast(size, batched, (table, lists)))
-        return _unmerge(size, forward(table, lists)), (True, True, _Trace(True, True, True))
+        table, lists = merge_images(*broadcast_batch(size, batched, (table, lists)))
+        return split_images(size, forward(table, lists)), (True, True, _Trace(True, True, True))
 
     return forward
 
@@ -155,45 +156,12 @@ def _batched_backward(config):
 
     @backward.def_vmap
     def _(size, batched, table, lists, trace, cotangents):
-        arguments = _broadcast(size, batched, (table, lists, trace, cotangents))
-        table, lists = _merge(*arguments[:2])
+        arguments = broadcast_batch(size, batched, (table, lists, trace, cotangents))
+        table, lists = merge_images(*arguments[:2])
         more = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), arguments[2:])
-        return _unmerge(size, backward(table, lists, *more)), True
+        return split_images(size, backward(table, lists, *more)), True
 
     return backward
-
-
-def _broadcast(size, batched, arguments):
-    return jax.tree.map(
-        lambda leaf, has_axis: leaf if has_axis else jnp.broadcast_to(leaf, (size, *leaf.shape)),
-        arguments,
-        tuple(batched),
-    )
-
-
-def _merge(table, lists):
-    """Merge tables `[M, N, C]` and tile lists of M images into those of one image."""
-    count, capacity, tiles = table.shape[1], lists.splats.shape[1], lists.slot.shape[1]
-    slots = lists.tile[0].size
-
-    def flat(leaf, shift=0):
-        image = jnp.arange(leaf.shape[0], dtype=leaf.dtype)
-        leaf = leaf + shift * image.reshape(-1, *(1,) * (leaf.ndim - 1))
-        return leaf.reshape(-1, *leaf.shape[2:])
-
-    return table.reshape(-1, table.shape[-1]), TileLists(
-        splats=flat(lists.splats, count),
-        starts=flat(lists.starts, capacity),
-        counts=flat(lists.counts),
-        origins=flat(lists.origins),
-        tile=flat(lists.tile, tiles),
-        slot=flat(lists.slot, slots),
-        overflow=lists.overflow.sum(),
-    )
-
-
-def _unmerge(size, tree):
-    return jax.tree.map(lambda leaf: leaf.reshape(size, -1, *leaf.shape[1:]), tree)
 
 
 def _forward(config, table, lists):
@@ -215,31 +183,14 @@ def _forward(config, table, lists):
             return (position < longest) & jnp.any((product >= TRANSMITTANCE_MIN) & listed)
 
         def step(state):
-            position, product, remaining, stop, reference, median, sums = state
+            position, product, *pixels, sums = state
             rows, _ = _gather(table, lists, tiles, position, config.chunk)
             shade = _shade(rows, x, y, config.near)
             before = product
             product, afters = lax.scan(attenuate, product, shade.alpha)
-            weights = []
-            for k in range(config.chunk):
-                alpha, after = shade.alpha[k], afters[k]
-                open_ = after >= TRANSMITTANCE_MIN
-                weights.append(jnp.where(open_, alpha * before, 0))
-                remaining = jnp.where(open_, after, remaining)
-                stop = jnp.where(open_, position + (k + 1), stop)
-                drawn = alpha > 0
-                reference = jnp.where(drawn & (before == 1), shade.inverse_depth[k], reference)
-                median = jnp.where(drawn & (before > 0.5), shade.z[k], median)
-                before = after
-            # Splats in front of the first drawn one have weight 0, so one reference serves all.
-            shifted = shade.inverse_depth - reference[None]
-            channels = [rows[:, :, _PAYLOAD + f, None] for f in range(features)]
-            channels += [shade.z, jnp.ones_like(shade.z), shifted, shifted * shifted]
-            sums = tuple(
-                total + sum(weights[k] * channel[k] for k in range(config.chunk))
-                for total, channel in zip(sums, channels, strict=True)
-            )
-            return position + config.chunk, product, remaining, stop, reference, median, sums
+            weights, pixels = _walk_chunk(shade, before, afters, position, pixels)
+            sums = _add_chunk(sums, weights, rows, shade, reference=pixels[2])
+            return position + config.chunk, product, *pixels, sums
 
         shape = (config.block, config.tile**2)
         ones, zeros = jnp.ones(shape, table.dtype), jnp.zeros(shape, table.dtype)
@@ -253,9 +204,39 @@ def _forward(config, table, lists):
     return in_order(sums), in_order(median), trace
 
 
+def _walk_chunk(shade, before, afters, position, pixels):
+    """Weights `[B, P]` of a chunk's splats, front to back, and the updated `pixels`.
+
+    `pixels` are the remaining transmittance, stop and reference of `_Trace`, and the median depth.
+    """
+    remaining, stop, reference, median = pixels
+    weights = []
+    for k in range(afters.shape[0]):
+        alpha, after = shade.alpha[k], afters[k]
+        open_ = after >= TRANSMITTANCE_MIN
+        weights.append(jnp.where(open_, alpha * before, 0))
+        remaining = jnp.where(open_, after, remaining)
+        stop = jnp.where(open_, position + (k + 1), stop)
+        drawn = alpha > 0
+        reference = jnp.where(drawn & (before == 1), shade.inverse_depth[k], reference)
+        median = jnp.where(drawn & (before > 0.5), shade.z[k], median)
+        before = after
+    return weights, (remaining, stop, reference, median)
+
+
+def _add_chunk(sums, weights, rows, shade, *, reference):
+    """The sums of `blend_tiles`, one `[B, P]` for each channel, with a chunk's splats added."""
+    # Splats in front of the first drawn one have weight 0, so one reference serves all.
+    shifted = shade.inverse_depth - reference[None]
+    channels = [rows[:, :, f, None] for f in range(_PAYLOAD, rows.shape[-1])]
+    channels += [shade.z, jnp.ones_like(shade.z), shifted, shifted * shifted]
+    return tuple(
+        total + sum(weights[k] * channel[k] for k in range(len(weights)))
+        for total, channel in zip(sums, channels, strict=True)
+    )
+
+
 def _backward(config, table, lists, trace, cotangents):
-    columns = table.shape[1]
-    features = columns - _PAYLOAD
     x, y = _pixels(config.tile, table.dtype)
     # Moments about the middle of a tile lose the fewest digits.
     middle = config.tile / 2
@@ -264,6 +245,20 @@ def _backward(config, table, lists, trace, cotangents):
     def moments(values):
         sums = jnp.einsum("kbp,pm->kbm", values, basis, precision=_EXACT)
         return jnp.moveaxis(sums, -1, 0)
+
+    def rows_bar(rows, shade, inverse_bar, scaled, payload):
+        plane = jnp.where(shade.on_plane, scaled * shade.z, 0)
+        return _assemble(
+            rows,
+            middle,
+            u=moments(-plane * shade.z * shade.u_numerator),
+            v=moments(-plane * shade.z * shade.v_numerator),
+            w=moments(jnp.where(shade.clipped, 0, inverse_bar) + plane * shade.rho),
+            low_pass=moments(jnp.where(shade.on_plane, 0, scaled)),
+            clip=jnp.where(shade.clipped, inverse_bar * shade.inverse_depth**2, 0).sum(-1),
+            scaled=scaled.sum(-1),
+            payload=payload,
+        )
 
     cotangents = tuple(bar[lists.tile] for bar in cotangents)
 
@@ -276,9 +271,7 @@ def _backward(config, table, lists, trace, cotangents):
 
     def block(table_bar, tiles):
         *tiles, (sums_bar, median_bar), trace = tiles
-        z_bar, alpha_bar, first_bar, second_bar = (
-            sums_bar[None, :, features + i] for i in range(4)
-        )
+        z_bar, _, first_bar, second_bar = (sums_bar[None, :, i] for i in range(-4, 0))
 
         def step(state):
             position, behind, after, table_bar = state
@@ -287,12 +280,7 @@ def _backward(config, table, lists, trace, cotangents):
             place = position + jnp.arange(config.chunk, dtype=jnp.int32)[:, None, None]
             alpha = jnp.where(place < trace.stop[None], shade.alpha, 0)
             shifted = shade.inverse_depth - trace.reference[None]
-            # Derivative of the loss with respect to each splat's weight.
-            worth = sum(
-                rows[:, :, _PAYLOAD + f, None] * sums_bar[None, :, f] for f in range(features)
-            )
-            worth = worth + alpha_bar + shade.z * z_bar
-            worth = worth + shifted * (first_bar + shifted * second_bar)
+            worth = _worth(rows, shade, shifted, sums_bar)
             passing = 1 / (1 - alpha)
             ends = (behind, after)
             (behind, after), (behinds, before) = lax.scan(
@@ -310,21 +298,9 @@ def _backward(config, table, lists, trace, cotangents):
             inverse_bar = inverse_bar - shade.z * shade.z * depth_bar
             scaled = alpha * (before * worth - behinds * passing)  # d loss / d log(alpha)
             scaled = jnp.where(alpha < ALPHA_MAX, scaled, 0)
-            plane = jnp.where(shade.on_plane, scaled * shade.z, 0)
-            update = _assemble(
-                rows,
-                middle,
-                u=moments(-plane * shade.z * shade.u_numerator),
-                v=moments(-plane * shade.z * shade.v_numerator),
-                w=moments(jnp.where(shade.clipped, 0, inverse_bar) + plane * shade.rho),
-                low_pass=moments(jnp.where(shade.on_plane, 0, scaled)),
-                clip=jnp.where(shade.clipped, inverse_bar * shade.inverse_depth**2, 0).sum(-1),
-                scaled=scaled.sum(-1),
-                payload=jnp.einsum(
-                    "kbp,bfp->kbf", weight, sums_bar[:, :features], precision=_EXACT
-                ),
-            )
-            table_bar = table_bar.at[index.reshape(-1)].add(update.reshape(-1, columns))
+            payload = jnp.einsum("kbp,bfp->kbf", weight, sums_bar[:, :-4], precision=_EXACT)
+            update = rows_bar(rows, shade, inverse_bar, scaled, payload)
+            table_bar = table_bar.at[index.reshape(-1)].add(update.reshape(-1, table.shape[1]))
             return position - config.chunk, behind, after, table_bar
 
         longest = jnp.minimum(trace.stop.max(), tiles[1].max())
@@ -334,6 +310,15 @@ def _backward(config, table, lists, trace, cotangents):
 
     tiles = (lists.starts, lists.counts, lists.origins, cotangents, trace)
     return lax.scan(block, jnp.zeros_like(table), tiles)[0]
+
+
+def _worth(rows, shade, shifted, sums_bar):
+    """Derivative `[K, B, P]` of the loss with respect to each splat's weight."""
+    z_bar, alpha_bar, first_bar, second_bar = (sums_bar[None, :, i] for i in range(-4, 0))
+    features = range(rows.shape[-1] - _PAYLOAD)
+    worth = sum(rows[:, :, _PAYLOAD + f, None] * sums_bar[None, :, f] for f in features)
+    worth = worth + alpha_bar + shade.z * z_bar
+    return worth + shifted * (first_bar + shifted * second_bar)
 
 
 def _assemble(rows, middle, *, u, v, w, low_pass, clip, scaled, payload):
