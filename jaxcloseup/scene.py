@@ -65,8 +65,8 @@ class Scene:
       test_far: held-out ordinary views, or None.
       points: `[P, 3]` float32 world points on surfaces; P may be 0.
       rgb: `[P, 3]` float32 colors of the points in [0, 1].
-      near: smallest z-depth in the scene, in world units.
-      far: largest z-depth in the scene, in world units.
+      near: lower bound of z-depth in the scene, in world units.
+      far: upper bound of z-depth in the scene, in world units.
       names: for each split present, the names of its photographs in order.
       metadata: extra facts from the loader, such as source paths and downscale.
       surface: renders a `Camera` to its exact `Surface`; None for photographed scenes.

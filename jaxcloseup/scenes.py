@@ -2,11 +2,8 @@
 
 import pathlib
 
-from jaxcloseup.captures.formats import FORMATS
-from jaxcloseup.captures.loading import load_capture
-from jaxcloseup.captures.photo_reading import ALPHA_MODES, Reading
-from jaxcloseup.captures.splits import SPLITS
-from jaxcloseup.procedural.loading import PROCEDURAL_SCENES, procedural_scene
+from jaxcloseup.captures import ALPHA_MODES, FORMATS, SPLITS, Reading, load_capture
+from jaxcloseup.procedural import PROCEDURAL_SCENES, procedural_scene
 from jaxcloseup.scene import Scene, SceneError, SceneWarning, Surface
 
 

@@ -76,7 +76,7 @@ def without(key, **changes):
             [frame("train/a.png", transform_matrix=[[10**400] * 4] * 4)],
             "transform_matrix must be a 4x4 matrix",
         ),
-        ([frame("train/a.png", fx=10**400)], r"fx has too many digits \(401\)"),
+        ([frame("train/a.png", fx=10**400)], "fx has 401 digits"),
         ([frame("train/a.png", w=0.5, h=6)], "w must be at least 1 pixel, got 0.5"),
         ([frame("train/a.png", k1=-1e6)], "undistortion leaves nothing of the photograph"),
         ([frame("train/a.png", fx=0)], "fx must be greater than 0, got 0"),
@@ -193,7 +193,7 @@ def test_empty_folder_and_no_folder(tmp_path):
     with pytest.raises(SceneError, match=r"holds no capture: add transforms_train\.json, transf"):
         load_scene(tmp_path)
     (tmp_path / "transforms.json").write_text("{}")
-    with pytest.raises(SceneError, match="is not a folder: give the one"):
+    with pytest.raises(SceneError, match="is not a folder: give the folder"):
         load_scene(tmp_path / "transforms.json")
     with pytest.raises(SceneError, match="is not a folder"):
         load_scene(tmp_path / "none")

@@ -211,7 +211,7 @@ def test_truncated_binary_models(tmp_path, name):
     file.unlink()
     if name in ("rigs", "frames"):  # older versions of COLMAP do not write them
         return
-    reason = "is missing" if name != "cameras" else "neither"
+    reason = "is missing" if name != "cameras" else "holds no capture"
     with pytest.raises(SceneError, match=reason):
         load_scene(tmp_path)
 

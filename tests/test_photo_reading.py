@@ -55,7 +55,7 @@ def test_photographs_that_exceed_memory_are_refused_before_they_are_read(tmp_pat
 @pytest.mark.skipif("JAXCLOSEUP_MANY" not in os.environ, reason="JAXCLOSEUP_MANY=500 takes minutes")
 @pytest.mark.parametrize("options", [{"downscale": 8}, {"split": "zoom", "zoom": 8}])
 def test_many_photographs_of_12_megapixels_stay_under_2_gib(tmp_path, options):
-    """Bounds the peak memory of the process; 500 decoded photographs would take 18 GB."""
+    """Bound the peak memory of the process; 500 decoded photographs would take 18 GB."""
     count = int(os.environ["JAXCLOSEUP_MANY"])
     write_photographs(tmp_path, count, 4000, 3000)
     scene = load_scene(tmp_path, **options)

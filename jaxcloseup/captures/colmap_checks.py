@@ -135,12 +135,12 @@ def _check_text(path, data, count_parameters):
                     "and point id: export it again."
                 )
         numbered = numbered[::2]
-    least = {"cameras": 4, "images": 10, "points3D": 8}[path.stem]
+    fewest = {"cameras": 4, "images": 10, "points3D": 8}[path.stem]
     for number, words in numbered:
         if not words:
             continue
         label = f"{path}: line {number}"
-        if len(words) < least:
+        if len(words) < fewest:
             raise SceneError(f"{label} ends after {len(words)} fields: export it again.")
         try:
             if path.stem == "images":

@@ -87,9 +87,9 @@ def read_listing(
     note = f"{scene}: reading {_describe(kind, name, path)}" + (
         f" and not {rejected}" if rejected else ""
     )
-    given = content.given or (
-        splits_from_file(folder, content.frames) if split == "given" else None
-    )
+    given = content.given
+    if split == "given" and not given:
+        given = splits_from_file(folder, content.frames)
     points, rgb = content.points
     division = divide(scene, content.frames, given, split, points, zoom)
     if split != "zoom":  # crops share files with training photographs but show finer detail
