@@ -78,7 +78,7 @@ def test_folders_of_photographs_have_folders_of_masks(tmp_path):
 
 @pytest.mark.parametrize("beside", ["ngp/masks", "masks"])
 def test_photographs_outside_the_folder(tmp_path, beside):
-    """A photograph is not its own mask."""
+    """A photograph is not taken for its own mask."""
     write_image(tmp_path / "images/a.png")
     pose = {"file_path": "../images/a.png", "transform_matrix": POSE.tolist(), "fl_x": 9.0}
     write_json(tmp_path / "ngp/transforms.json", [pose])
@@ -140,7 +140,7 @@ def test_listed_photographs_are_not_masks(tmp_path):
     assert len(scene.train) == 3 and (np.asarray(scene.train.weight) == 1).all()
 
 
-def test_a_mask_without_its_photograph_is_a_photograph(tmp_path):
+def test_a_mask_of_nothing_is_a_photograph(tmp_path):
     llff_capture(tmp_path)
     (tmp_path / "images/1.png").rename(tmp_path / "images/1.mask.png")
     scene = load_scene(tmp_path, downscale=1)
@@ -155,7 +155,7 @@ def test_inverted_masks(tmp_path):
     write_image(tmp_path / "masks/train/a.png", HALF)
     scene = load_scene(tmp_path, invert_masks=True)
     np.testing.assert_array_equal(scene.train.weight[0], 1 - np.asarray(HALF) / 255)
-    assert (np.asarray(scene.train.weight[1]) == 1).all()  # it has no mask to invert
+    assert (np.asarray(scene.train.weight[1]) == 1).all()  # without a mask nothing is inverted
     for name in "ab":
         write_image(tmp_path / f"masks/train/{name}.png", np.full_like(HALF, 255))
     with pytest.raises(SceneError, match="black is what counts, so leave out invert_masks if"):
