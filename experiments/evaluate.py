@@ -16,9 +16,10 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.command_line import set_up
+from experiments.evaluation.metrics_text import COLUMNS, format_metric
 from experiments.evaluation.scores import Perceptual, find_perceptual, score_image, summarize
-from experiments.reporting.report import COLUMNS, format_metric, write_json
 from jaxcloseup.captures.images import read_image, read_mask
+from jaxcloseup.files import write_json
 from jaxcloseup.photographs import to_float
 from jaxcloseup.scenes import SceneError
 

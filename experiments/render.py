@@ -22,21 +22,23 @@ import numpy as np
 from absl import app, flags
 
 from experiments.command_line import check_unused, set_up
+from experiments.training.fine_tuning import fine_tune
 from experiments.training.loop import TrainingError
-from experiments.training.stages import training_depths
-from experiments.training.stored_run import RunError, load_run_scene, named_run, restore
+from experiments.training.setup import start_labels
+from experiments.training.stored_run import RunError, load_run_scene, restore
 from experiments.viewing import camera_paths
 from experiments.viewing.camera_paths import CameraError, Shots
-from experiments.viewing.frames import fine_tune, render_shots
+from experiments.viewing.flags import named_run
+from experiments.viewing.frames import render_shots
 from jaxcloseup.artifacts.checkpoints import CheckpointError
 from jaxcloseup.artifacts.video import write_video
+from jaxcloseup.label_rules import label_depth
 from jaxcloseup.photographs import camera_at
-from jaxcloseup.scenes import SceneError
-from jaxcloseup.train import label_depth
+from jaxcloseup.scene import SceneError
 
 
 FLAGS = flags.FLAGS
-for _name in ("output_dir", "run", "stage", "data"):
+for _name in ("output_dir", "run", "stage", "data", "set"):
     flags.declare_key_flag(_name)
 flags.DEFINE_string("views", None, "render the cameras of these photographs: test, test_far, train")
 flags.DEFINE_string("camera_path", None, "render the cameras of this file, a camera_path.json")
@@ -121,13 +123,14 @@ def _render() -> None:
         motion = {"magnification": FLAGS.magnification, "frames": FLAGS.frames}
         shots = _resized(camera_paths.dolly(view, pixel, depth, **motion))
     fine_tuned = FLAGS.fine_tune or FLAGS.target is not None
-    depths = None
+    sources = None
     if FLAGS.support or fine_tuned:
-        depths = training_depths(programs, state, record.identity["seed"])
+        expected = record.preset.labels.expected_depth
+        start = start_labels(programs, state, record.identity["seed"], expected_depth=expected)
+        sources = start.sources if FLAGS.support else None
     if fine_tuned:
-        state = fine_tune(programs, state, depths, shots, most=FLAGS.target_steps)
-    seen_from = depths if FLAGS.support else None
-    folders = render_shots(output_dir, programs, state, shots, depths=seen_from)
+        state = fine_tune(programs, start, shots.cameras, most=FLAGS.target_steps)
+    folders = render_shots(output_dir, programs, state, shots, sources=sources)
     print(f"{len(shots.names)} frames: {', '.join(str(folder) for folder in folders)}")
     if way != "views" and len(shots.names) > 1:
         for folder in folders:

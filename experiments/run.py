@@ -2,24 +2,40 @@
 
     python -m experiments.run --scene=table
 
-Stages: `baseline` trains on the photographs; `control` and `closeup` both go on from it for the
-same number of steps, without and with pseudo-labels of random close-ups; `test_time` goes on from
+Stages: `baseline` trains on the photographs; `control` and `closeup` both continue from it for the
+same number of steps, without and with pseudo-labels of random close-ups; `test_time` continues from
 it with labels of the very close-ups that are scored. The scene is a built-in one or a folder.
 """
 
+import dataclasses
+import pathlib
 import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
 
+import jax
 from absl import app, flags
 
 from experiments.command_line import make, set_up
-from experiments.evaluation.scores import find_perceptual
+from experiments.evaluation.scores import NO_PERCEPTUAL, Perceptual, find_perceptual
+from experiments.methods import Preset
 from experiments.reporting.report import print_table
+from experiments.reporting.run_report import report_run
 from experiments.training import flags as training_flags
-from experiments.training.logs import check_tensorboard
+from experiments.training.logs import TrainLog, check_tensorboard
 from experiments.training.loop import TrainingError
-from experiments.training.stages import STAGES, run
-from jaxcloseup.artifacts.checkpoints import CheckpointError
-from jaxcloseup.scenes import SceneError
+from experiments.training.manifest import (
+    about_scene,
+    versions,
+    write_dataparser_transforms,
+    write_manifest,
+)
+from experiments.training.programs import Programs
+from experiments.training.settings import plain_config
+from experiments.training.setup import Training, identity_of
+from experiments.training.stages import STAGES, run_stages
+from jaxcloseup.artifacts.checkpoints import CheckpointError, Checkpoints
+from jaxcloseup.scene import Scene, SceneError
 
 
 FLAGS = flags.FLAGS
@@ -33,7 +49,56 @@ flags.DEFINE_integer("seed", 0, "random seed; the same seed gives the same metri
 flags.DEFINE_integer(
     "save_every", 1000, "steps between checkpoints; each stage's end is kept too", lower_bound=1
 )
-flags.DEFINE_list("stages", list(STAGES), "of the stages those to run; baseline always is")
+flags.DEFINE_list("stages", list(STAGES), "stages to run; baseline always runs")
+
+
+def run(
+    scene: Scene,
+    preset: Preset,
+    seed: int,
+    output_dir: pathlib.Path,
+    *,
+    names: Mapping[str, str],
+    to_run: Sequence[str] = STAGES,
+    save_every: int = 1000,
+    perceptual: Perceptual = NO_PERCEPTUAL,
+    load_options: Mapping[str, Any] | None = None,
+    tensorboard: bool = False,
+) -> dict[str, Any]:
+    """Run the stages on one scene; writes everything under `output_dir` and returns the results.
+
+    Args:
+      scene: what was photographed.
+      preset: how it is trained.
+      seed: random seed.
+      output_dir: an empty folder, or that of the same run, cut off.
+      names: "method" and "preset" by name, for the report.
+      to_run: stages; `baseline` always runs.
+      save_every: steps between checkpoints. Resumes from checkpoints already in `output_dir`.
+      perceptual: networks of LPIPS.
+      load_options: what `load_scene` took, to load the scene again; for the manifest.
+      tensorboard: whether to write event files, beside `stats/train.jsonl`.
+    """
+    scene = dataclasses.replace(scene, train=jax.device_put(scene.train))
+    size = scene.train.cameras
+    print(
+        f"{scene.name}: {len(scene.train)} training photographs of {size.width} x {size.height}, "
+        f"depth {scene.near:.3g} to {scene.far:.3g}"
+    )
+    training = Training(
+        Programs(preset, scene),
+        Checkpoints(output_dir / "checkpoints", identity_of(scene, preset, names) | {"seed": seed}),
+        TrainLog(output_dir, tensorboard=tensorboard),
+        save_every,
+    )
+    load_options = {"downscale": preset.downscale} if load_options is None else load_options
+    about = {**names, "seed": seed, "config": plain_config(preset), "versions": versions()}
+    write_manifest(output_dir, about | about_scene(scene, load_options))
+    write_dataparser_transforms(output_dir, scene)
+    outcome = run_stages(training, seed, output_dir, to_run=to_run, perceptual=perceptual)
+    results = report_run(output_dir, training, outcome, about)
+    write_manifest(output_dir, about | about_scene(scene, load_options), training.seconds)
+    return results
 
 
 def main(argv: list[str]) -> None:

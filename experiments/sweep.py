@@ -11,28 +11,30 @@ import json
 import os
 import pathlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
 from absl import app, flags
 
 from experiments.command_line import make, set_up
-from experiments.evaluation.scores import find_perceptual
-from experiments.methods.presets import Preset, pseudo_settings
+from experiments.evaluation.scores import Perceptual, find_perceptual
+from experiments.methods import Preset
+from experiments.reporting.pictures import comparisons
 from experiments.reporting.report import Picture
 from experiments.reporting.tables import print_sweep, write_sweep
 from experiments.training import flags as training_flags
 from experiments.training.arms import KINDS, make_arm
 from experiments.training.logs import TrainLog, check_tensorboard
-from experiments.training.loop import HOSTS_WAIT, TrainingError
+from experiments.training.loop import TrainingError
 from experiments.training.manifest import NAME as MANIFEST
-from experiments.training.manifest import about_scene, write_manifest
-from experiments.training.stages import config, versions
+from experiments.training.manifest import about_scene, versions, write_manifest
+from experiments.training.programs import HOSTS_WAIT
+from experiments.training.settings import plain_config
 from experiments.training.sweep import run_sweep
 from jaxcloseup.artifacts.checkpoints import CheckpointError
-from jaxcloseup.scenes import Scene, SceneError
-from jaxcloseup.splats.field import SurfelConfig
+from jaxcloseup.label_rules import LABEL_RULES, pool_label_loss
+from jaxcloseup.scene import Scene, SceneError
 
 
 FLAGS = flags.FLAGS
@@ -45,9 +47,10 @@ flags.DEFINE_list(
     "arms",
     list(KINDS),
     "arms: baseline, control, labels (no mask, four poses), mask, diverse (the preset's), oracle "
-    "(true pixels of close-ups), resolved (these, as sharp as the photographs are), test_time, and "
-    "the preset with other settings, as in rgb_tolerance=0.02+label_loss_weight=0.5 or magnification=2:4 "
-    "(a wrong one is answered with the names of all), or both, as in mask+rate=2",
+    "(true pixels of close-ups), resolved (these, as sharp as the photographs are), test_time, the "
+    "preset with other settings of its labels, as in rgb_tolerance=0.02+label_loss_weight=0.5 or "
+    "magnification=2:4, or both, as in mask+lr_scale=2; depth_error=0.5 halves the error of the "
+    "depth that labels are made from",
 )
 flags.DEFINE_integer(
     "max_parallel", 8, "arms and seeds trained at once, which bounds memory", lower_bound=1
@@ -82,18 +85,13 @@ def _check_flags(preset: Preset) -> None:
         values = getattr(FLAGS, flag)
         if not values or len(set(values)) < len(values):
             raise ValueError(f"--{flag}={','.join(values)} must name one or more, each once")
-    for arm in FLAGS.arms:
-        made = make_arm(arm, pseudo_settings(preset))
-        if made.expected_depth is not None and not isinstance(preset.field, SurfelConfig):
-            raise ValueError(f"--arms={arm}: a NeRF has expected depth only; leave it out")
-        changes = made.settings
-        if (
-            preset.train.pooled_loss
-            and 0 < float(changes.label_loss_weight) != preset.label_loss_weight
-        ):
+    pooled = LABEL_RULES[preset.train.label_rule].loss is pool_label_loss
+    for name in FLAGS.arms:
+        labels = make_arm(name, preset).labels
+        if pooled and 0 < labels.label_loss_weight != preset.labels.label_loss_weight:
             raise ValueError(
-                f"--arms={arm}: this preset pools the losses of photographs and labels, which have "
-                "no shares then; only label_loss_weight=0 makes a difference"
+                f"--arms={name}: this preset pools the losses of photographs and labels, so that "
+                "only label_loss_weight=0 makes a difference"
             )
     if "control" not in FLAGS.arms:
         print("warning: without the arm control there are no gains in the tables")
@@ -118,7 +116,6 @@ def main(argv: list[str]) -> None:
     if len(argv) > 1:
         raise app.UsageError(f"unexpected argument: {argv[1]}")
     set_up()
-    names = training_flags.names_from_flags()
     try:
         hosts = _hosts()
         first = hosts is None or hosts[-1] == 0
@@ -133,44 +130,16 @@ def main(argv: list[str]) -> None:
             )
         perceptual = find_perceptual(FLAGS.lpips_weights)
         load_options = training_flags.load_options_from_flags(preset)
-        captures = [training_flags.load(name, load_options) for name in FLAGS.scenes]
-        _check_scenes(captures, output_dir)
+        scenes = [training_flags.load(name, load_options) for name in FLAGS.scenes]
+        _check_scenes(scenes, output_dir)
         make(output_dir)
     except (SceneError, OSError, ValueError) as error:
         sys.exit(f"experiments.sweep: {error}")
     if hosts is not None:
         # Hosts that are done wait for the first one, which writes the tables.
         jax.distributed.initialize(*hosts, shutdown_timeout_seconds=HOSTS_WAIT)
-    about = {**names, "config": config(preset), "versions": versions()}
-    manifest = about | {"seeds": list(range(FLAGS.seeds)), "arms": FLAGS.arms}
-    manifest["scenes"] = {scene.name: about_scene(scene, load_options) for scene in captures}
-    found: dict[str, Any] = {}
-    pictures: list[Picture] = []
-    seconds: dict[str, dict[str, float]] = {scene.name: {} for scene in captures}
     try:
-        # One that is resumed may yet turn out to be another sweep.
-        if first and not FLAGS.resume:
-            write_manifest(output_dir, manifest)
-        for scene in captures:
-            log = TrainLog(output_dir, scene.name, tensorboard=FLAGS.tensorboard)
-            found[scene.name], drawn = run_sweep(
-                scene,
-                preset,
-                FLAGS.arms,
-                FLAGS.seeds,
-                output_dir / "checkpoints" / scene.name,
-                names=names,
-                max_parallel=FLAGS.max_parallel,
-                perceptual=perceptual,
-                seconds=seconds[scene.name],
-                log=log if first else None,
-                compare=output_dir / "compare" / scene.name if first else None,
-            )
-            pictures += [one._replace(section=f"{scene.name}: {one.section}") for one in drawn]
-            if first:
-                write_sweep(output_dir, found, about, pictures)
-        if first:
-            write_manifest(output_dir, manifest, seconds)
+        found = sweep_scenes(scenes, preset, output_dir, load_options, perceptual, first=first)
     except (TrainingError, CheckpointError, OSError) as error:
         if hosts is None:
             sys.exit(f"experiments.sweep: {error}")
@@ -180,6 +149,55 @@ def main(argv: list[str]) -> None:
     if first:
         print_sweep(found)
         print(f"report: {output_dir / 'report.html'}")
+
+
+def sweep_scenes(
+    scenes: Sequence[Scene],
+    preset: Preset,
+    output_dir: pathlib.Path,
+    load_options: Mapping[str, Any],
+    perceptual: Perceptual,
+    *,
+    first: bool,
+) -> dict[str, Any]:
+    """Sweep scene by scene; the first host writes tables, pictures and the report after each.
+
+    Returns:
+      The scores of `run_sweep` by scene.
+    """
+    names = training_flags.names_from_flags()
+    about = {**names, "config": plain_config(preset), "versions": versions()}
+    manifest = about | {"seeds": list(range(FLAGS.seeds)), "arms": FLAGS.arms}
+    manifest["scenes"] = {scene.name: about_scene(scene, load_options) for scene in scenes}
+    found: dict[str, Any] = {}
+    pictures: list[Picture] = []
+    seconds: dict[str, dict[str, float]] = {scene.name: {} for scene in scenes}
+    # One that is resumed may yet turn out to be another sweep.
+    if first and not FLAGS.resume:
+        write_manifest(output_dir, manifest)
+    for scene in scenes:
+        log = TrainLog(output_dir, scene.name, tensorboard=FLAGS.tensorboard)
+        outcome = run_sweep(
+            scene,
+            preset,
+            FLAGS.arms,
+            FLAGS.seeds,
+            output_dir / "checkpoints" / scene.name,
+            names=names,
+            max_parallel=FLAGS.max_parallel,
+            perceptual=perceptual,
+            seconds=seconds[scene.name],
+            log=log if first else None,
+        )
+        found[scene.name] = outcome.scores
+        if first:
+            folder = output_dir / "compare" / scene.name
+            drawn = comparisons(folder, outcome.shown, outcome.renderings)
+            pictures += [one._replace(section=f"{scene.name}: {one.section}") for one in drawn]
+            write_sweep(output_dir, found, about, pictures)
+    if first:
+        write_manifest(output_dir, manifest, seconds)
+    return found
 
 
 if __name__ == "__main__":

@@ -14,13 +14,14 @@ import sys
 from absl import app, flags
 
 from experiments.command_line import set_up
-from experiments.training.stored_run import RunError, load_run_scene, named_run, restore
+from experiments.training.stored_run import RunError, load_run_scene, restore
+from experiments.viewing.flags import named_run
 from jaxcloseup.artifacts.checkpoints import CheckpointError
-from jaxcloseup.scenes import SceneError
+from jaxcloseup.scene import SceneError
 
 
 FLAGS = flags.FLAGS
-for _name in ("run", "stage", "data"):
+for _name in ("run", "stage", "data", "set"):
     flags.declare_key_flag(_name)
 flags.DEFINE_string("host", "127.0.0.1", "address to serve at; by default for this computer alone")
 flags.DEFINE_integer("port", 7007, "port to serve at", lower_bound=1, upper_bound=65535)

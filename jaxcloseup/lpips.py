@@ -1,8 +1,8 @@
-"""LPIPS: the distance of two images in the features of a network trained on photographs.
+"""LPIPS: the distance between two images in the features of a network trained on photographs.
 
 Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018,
-equation 1, version 0.1 with its linear heads on VGG-16 or AlexNet. The function is pure; weights
-are read from the public PyTorch files, by NumPy alone.
+equation 1, version 0.1 with its linear heads on VGG-16 or AlexNet. The function is pure. NumPy
+alone reads its weights from the public PyTorch files.
 """
 
 import importlib.util
@@ -24,8 +24,8 @@ from jaxcloseup.torch_file import TorchFileError, read_tensors
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 
-# Layers in order: channels, size, stride and padding of a convolution, "tap" after the rectified
-# ones whose features count, and size and stride of a maximum.
+# Layers in order: "conv" with channels, size, stride and padding, and a ReLU after it; "max"
+# pooling with size and stride; "tap" where features enter the distance.
 _VGG_BLOCKS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
 _LAYERS = {
     "vgg": [
@@ -53,7 +53,7 @@ _LAYERS = {
     ],
 }
 BACKBONES = tuple(_LAYERS)
-SMALLEST = {"vgg": 16, "alex": 31}  # pixels a side, so that the last maximum has something to see
+SMALLEST = {"vgg": 16, "alex": 31}  # pixels a side that the last pooling needs
 
 FOLDER_VARIABLE = "JAXCLOSEUP_LPIPS"
 _BACKBONE_FILES = {"vgg": "vgg16-*.pth", "alex": "alexnet-*.pth"}
@@ -68,8 +68,8 @@ class LpipsWeights:
     """The weights of one backbone and its heads.
 
     Attributes:
-      convolutions: for each a kernel `[out, in, kh, kw]` and a bias `[out]`.
-      heads: for each tapped layer `[C]`.
+      convolutions: a kernel `[out, in, kh, kw]` and a bias `[out]` per convolution.
+      heads: weights `[C]` per tapped layer.
       backbone: "vgg" or "alex".
     """
 
@@ -79,12 +79,12 @@ class LpipsWeights:
 
 
 def lpips(weights: LpipsWeights, image: jax.Array, target: jax.Array) -> jax.Array:
-    """LPIPS `[...]` of images `[..., H, W, 3]` in [0, 1]; 0 for equal ones, larger is farther.
+    """LPIPS `[...]` of images `[..., H, W, 3]` in [0, 1]; 0 for equal images, more for others.
 
-    Differentiable in the images. Needs 16 pixels a side for VGG, 31 for AlexNet.
+    It is differentiable in the images, which need 16 pixels a side for VGG, 31 for AlexNet.
 
     Raises:
-      ValueError: the images are smaller.
+      ValueError: the images are too small.
     """
     chex.assert_equal_shape([image, target])
     chex.assert_shape(image, (..., None, None, 3))
@@ -130,7 +130,7 @@ def _features(weights, images):
 
 
 def layer_shapes(backbone: str) -> tuple[list[tuple[int, ...]], list[int]]:
-    """Shapes `[out, in, kh, kw]` of the kernels, and channels of the heads."""
+    """Kernel shapes `[out, in, kh, kw]` of the convolutions, and channels of the heads."""
     kernels, heads, channels = [], [], 3
     for kind, *sizes in _LAYERS[backbone]:
         if kind == "conv":
@@ -144,19 +144,19 @@ def layer_shapes(backbone: str) -> tuple[list[tuple[int, ...]], list[int]]:
 def load_lpips(backbone: str, folder: str | os.PathLike[str] | None = None) -> LpipsWeights:
     """Read the weights of a backbone and its heads.
 
-    Looked for are torchvision's `vgg16-*.pth` or `alexnet-*.pth`, and the heads of version 0.1,
+    The files are torchvision's `vgg16-*.pth` or `alexnet-*.pth`, and for the heads of version 0.1
     `vgg.pth` or `alex.pth` (or `lpips_vgg.pth`, `lpips_alex.pth`).
 
     Args:
       backbone: "vgg" or "alex".
-      folder: where both are. By default the folder that the environment variable JAXCLOSEUP_LPIPS
-        names, else PyTorch's cache, and for the heads the installed package `lpips`.
+      folder: folder of both files. By default the environment variable JAXCLOSEUP_LPIPS names it;
+        without that variable, PyTorch's cache and the installed package `lpips` are searched.
 
     Raises:
-      LpipsError: a file is not there, or does not hold these weights.
+      LpipsError: a file is missing, or does not hold these weights.
     """
     if backbone not in BACKBONES:
-        raise LpipsError(f'"{backbone}" is no backbone of LPIPS: choose {" or ".join(BACKBONES)}.')
+        raise LpipsError(f'"{backbone}" is not an LPIPS backbone: choose {" or ".join(BACKBONES)}.')
     folders = _folders(folder)
     network = _find(folders, [_BACKBONE_FILES[backbone]], f"{backbone} network")
     heads = _find(folders, [f"lpips_{backbone}.pth", f"{backbone}.pth"], f"{backbone} heads")
@@ -210,5 +210,5 @@ def _find(folders, patterns, what):
                 return path
     looked = " or ".join(map(str, folders))
     raise LpipsError(
-        f"no LPIPS weights: {looked} has no {' or '.join(patterns)} ({what}); put it there"
+        f"no LPIPS weights: {looked} has no {' or '.join(patterns)} ({what}): put the file there"
     )

@@ -1,8 +1,8 @@
 """Image quality: PSNR, SSIM and color-corrected PSNR, each for one image and weighted by pixel.
 
-Images are `[H, W, 3]` floats in [0, 1]; batch with `jax.vmap`. Published numbers are those of 8-bit
-images: `quantize` both first, and a saved PNG reproduces the number. A weight that is 0 everywhere
-gives NaN, for the caller to report as absent.
+Images are `[H, W, 3]` floats in [0, 1]; batch with `jax.vmap`. Published numbers refer to 8-bit
+images: `quantize` both images first, so that a saved PNG reproduces the number. A weight that is 0
+everywhere gives NaN, which callers report as absent.
 """
 
 import chex
@@ -17,7 +17,7 @@ SSIM_TAPS = 11
 
 
 def quantize(image: jax.Array) -> jax.Array:
-    """The image as 8 bits per channel would hold it: clipped to [0, 1], rounded to n / 255."""
+    """Round an image to 8 bits per channel: clip to [0, 1], then round to n / 255."""
     return jnp.round(jnp.clip(image, 0, 1) * 255) / 255
 
 
@@ -27,24 +27,27 @@ def psnr(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = None
     Args:
       image: `[H, W, 3]` in [0, 1].
       target: `[H, W, 3]` in [0, 1].
-      weight: `[H, W]` of each pixel in the mean; all alike by default.
+      weight: `[H, W]` weight of each pixel in the mean; 1 by default.
     """
     weight = _check(image, target, weight)
     return -10 * jnp.log10(_weighted_mean((image - target) ** 2, weight))
 
 
 def ssim(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = None) -> jax.Array:
-    """Structural similarity, 1 for equal images; mean over the windows that lie inside.
+    """Structural similarity, 1 for equal images; mean over the windows inside the image.
 
     Wang et al., "Image quality assessment: from error visibility to structural similarity", 2004,
-    equations 13 to 17, for each channel alone: Gaussian windows of 11 taps and sigma 1.5,
+    equations 13 to 17, per channel: Gaussian windows of 11 taps and sigma 1.5,
     K1 = 0.01, K2 = 0.03.
 
     Args:
       image: `[H, W, 3]` in [0, 1], at least 11 pixels a side.
       target: `[H, W, 3]` in [0, 1].
-      weight: `[H, W]`; a window weighs what the pixel at its center does, whatever else it covers,
-        so crop padding away rather than give it the weight 0.
+      weight: `[H, W]`; a window has the weight of its central pixel, whatever else it covers, so
+        crop padding away instead of giving it weight 0.
+
+    Raises:
+      ValueError: a side of the image has fewer than 11 pixels.
     """
     weight = _check(image, target, weight)
     if min(image.shape[:2]) < SSIM_TAPS:
@@ -60,11 +63,11 @@ def ssim(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = None
 def cc_psnr(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = None) -> jax.Array:
     """PSNR after the affine change of the image's colors that fits the target best.
 
-    The change, a 3x3 matrix and an offset for the whole image, minimizes the weighted squared error
-    and its result is clipped to [0, 1]: exposure and white balance are forgiven. Programs fit
-    different families of changes (multinerf adds quadratic terms, gsplat takes each channel alone),
-    so these numbers compare only among themselves. Where colors span less than three dimensions,
-    as in a gray image, the change of least norm is taken. Arguments as in `psnr`.
+    The change, a 3x3 matrix and an offset for the whole image, minimizes the weighted squared
+    error; its result is clipped to [0, 1]. Differences in exposure and white balance do not count.
+    Other programs fit other changes (multinerf adds quadratic terms, gsplat fits each channel
+    alone), so do not compare these numbers with theirs. Where colors span less than three
+    dimensions, as in a gray image, the change of least norm applies. Arguments as in `psnr`.
     """
     weight = _check(image, target, weight)
     matrix, offset = fit_colors(image, target, weight)
@@ -78,19 +81,19 @@ def fit_colors(
     """The affine change of an image's colors with the least weighted squared error.
 
     Args:
-      image: `[H, W, 3]`.
-      target: `[H, W, 3]`.
-      weight: `[H, W]`.
-      ridge: weight of the change's squared distance from none, against the mean squared error.
+      image: `[H, W, 3]` colors to change.
+      target: `[H, W, 3]` colors to reach.
+      weight: `[H, W]` non-negative weights of the pixels.
+      ridge: weight of the squared distance from the identity, against the mean squared error.
 
     Returns:
-      Matrix `[3, 3]` and offset `[3]`: rows of colors times the matrix, plus the offset. NaN where
-      the weights sum to 0; of least norm where the colors leave it open.
+      Matrix `[3, 3]` and offset `[3]`; the changed colors are `image @ matrix + offset`. Both are
+      NaN if the weights sum to 0, and have the least norm if the colors do not determine them.
     """
     share = safe_divide(weight, jnp.sum(weight), fill=jnp.nan)[..., None]
     mean = jnp.sum(share * image, axis=(0, 1), keepdims=True)
     target_mean = jnp.sum(share * target, axis=(0, 1), keepdims=True)
-    # Centerd colors take the offset out of the system and keep its condition low.
+    # Centered colors take the offset out of the system and keep its condition number low.
     colors, targets = (image - mean).reshape(-1, 3), (target - target_mean).reshape(-1, 3)
     weighted = colors.T * share.reshape(1, -1)
     towards = ridge * jnp.eye(3, dtype=image.dtype)

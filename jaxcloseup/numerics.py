@@ -27,11 +27,11 @@ def matmul(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 def take_turns(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`function` whose `jax.vmap` computes one member of the batch after the other on a CPU.
+    """Make `jax.vmap` of a function compute its batch one member after another on a CPU.
 
-    For work that is cut to the size of a core's cache: done for a whole batch at once it would not
-    fit. Elsewhere batches stay together. The function takes arrays, closes over none that may be
-    batched, and is not differentiated in reverse.
+    This suits work that is cut to the size of a core's cache, which a whole batch would exceed.
+    Other backends keep the batch together. The function must take arrays, close over no array that
+    may be batched, and not be differentiated in reverse mode.
     """
     if jax.default_backend() != "cpu":
         return function

@@ -1,4 +1,4 @@
-"""Photographs with their cameras, and the random pixels of them that a training step sees."""
+"""Photographs with their cameras, and random draws of their pixels for training."""
 
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ class Views:
     Attributes:
       cameras: stacked cameras, `[V]` on every leaf.
       rgb: `[V, H, W, 3]`, uint8 or float in [0, 1].
-      weight: `[V, H, W]` in [0, 1]; 0 is padding or masked out.
+      weight: `[V, H, W]` in [0, 1]; 0 marks padding and masked pixels.
     """
 
     cameras: Camera
@@ -24,18 +24,18 @@ class Views:
     weight: jax.Array
 
     def __len__(self) -> int:
-        """How many photographs there are."""
+        """Number of photographs."""
         return self.rgb.shape[0]
 
 
 class Batch(NamedTuple):
-    """Pixels to render and the colors they should have.
+    """Pixels to render and their true colors.
 
     Attributes:
-      cameras: one stacked camera for each pixel `[B]`, or one camera when `pixels` is None.
+      cameras: stacked cameras `[B]`, one per pixel, or one camera for all of them.
       pixels: `[B, 2]` pixel centers, or None for the whole image.
       rgb: `[B, 3]` or `[H, W, 3]` float colors in [0, 1].
-      weight: `[B]` or `[H, W]`, 0 where the color must not count.
+      weight: `[B]` or `[H, W]`, 0 where the color does not count.
     """
 
     cameras: Camera
@@ -52,12 +52,12 @@ def to_float(rgb: jax.Array) -> jax.Array:
 
 
 def camera_at(cameras: Camera, index: jax.Array | int) -> Camera:
-    """One camera (or, for an index array, several) out of stacked cameras."""
+    """Pick one camera, or several by an array of indices, out of stacked cameras."""
     return jax.tree.map(lambda leaf: leaf[index], cameras)
 
 
 def sample_pixels(key: jax.Array, views: Views, count: int) -> Batch:
-    """`count` pixels drawn uniformly, with replacement, from all photographs; `key` is consumed."""
+    """Draw `count` pixels of all photographs uniformly, with replacement; `key` is consumed."""
     num_views, height, width = views.weight.shape
     key_view, key_y, key_x = jax.random.split(key, 3)
     view = jax.random.randint(key_view, (count,), 0, num_views)
@@ -72,7 +72,7 @@ def sample_pixels(key: jax.Array, views: Views, count: int) -> Batch:
 
 
 def sample_image(key: jax.Array, views: Views) -> Batch:
-    """One whole photograph, drawn uniformly; `key` is consumed."""
+    """Draw one whole photograph uniformly; `key` is consumed."""
     view = jax.random.randint(key, (), 0, len(views))
     return Batch(
         camera_at(views.cameras, view), None, to_float(views.rgb[view]), views.weight[view]

@@ -1,4 +1,4 @@
-"""PLY files of vertices, as NumPy structured arrays."""
+"""Vertices in PLY files, as NumPy structured arrays."""
 
 import pathlib
 
@@ -17,14 +17,14 @@ _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 class PlyError(ValueError):
-    """A PLY file that cannot be read. The message is one sentence that says what to do."""
+    """A PLY file cannot be read. The message is one sentence that says what to do."""
 
 
 def read_vertices(path: str | pathlib.Path) -> np.ndarray:
-    """The vertices of a PLY file, of any encoding, order and number of plain properties.
+    """Read the vertices of a PLY file, in any encoding, with any plain properties in any order.
 
     Raises:
-      PlyError: not there, not a PLY file, cut short, or not beginning with vertices with x, y, z.
+      PlyError: the file is missing, is cut short, is not PLY, or its vertices have no x, y, z.
     """
     path = pathlib.Path(path)
     try:
@@ -42,7 +42,7 @@ def read_vertices(path: str | pathlib.Path) -> np.ndarray:
             vertices = np.array([tuple(map(float, row.split())) for row in rows], dtype)
         except ValueError as error:
             whole = all(len(row.split()) == len(properties) for row in rows)
-            words = f"{path} has words for numbers in its vertices: export it again."
+            words = f"{path} has words instead of numbers in its vertices: export it again."
             raise PlyError(words if whole else short) from error
         if len(rows) < count:
             raise PlyError(short)
@@ -82,10 +82,10 @@ def _parse_header(path: pathlib.Path, header: bytes) -> tuple[str, int, list[tup
         if not {"x", "y", "z"} <= set(names):
             raise KeyError("x, y, z")
         if len(set(names)) < len(names):
-            raise ValueError("one of its names comes twice")
+            raise ValueError("a property name appears twice")
         count = int(vertex[0][2])
         if count < 0:
-            raise ValueError(f"{count} of them")
+            raise ValueError(f"a count of {count}")
         return encodings[0], count, properties
     except (KeyError, IndexError, ValueError) as error:
         raise PlyError(

@@ -1,7 +1,7 @@
 """Pseudo-labels for virtual close-up views: pose, depth, two warps, mask; the same for every field.
 
-`depths` are the z-depths `[V, H, W]` of the training views, rendered by the field after its first
-training and kept; 0 is undefined. No gradient flows through labels, depths or poses.
+Labels are read from the training photographs (`LabelSources`). No gradient flows through labels,
+depths or poses.
 """
 
 import functools
@@ -34,26 +34,48 @@ def _by_default(value: float) -> jax.Array:
 
 
 @struct.dataclass
+class LabelSources:
+    """The training photographs with what labels need to read them, V views.
+
+    Attributes:
+      views: the photographs.
+      depths: `[V, H, W]` their z-depth, rendered by the field after its first training and kept;
+        0 is undefined.
+      blocks: their pixels with a depth, in blocks, for forward warps.
+    """
+
+    views: Views
+    depths: jax.Array
+    blocks: SourceBlocks
+
+
+def label_sources(views: Views, depths: jax.Array) -> LabelSources:
+    """Join photographs with their rendered z-depths `[V, H, W]`, once for many labels."""
+    return LabelSources(views, depths, block_sources(views.cameras, depths, views.weight))
+
+
+@struct.dataclass
 class PseudoSettings:
     """What makes a pseudo-label; every leaf is traced, so settings stack into the arms of a sweep.
 
     Attributes:
       pose: how virtual cameras are drawn.
       use_mask: `[]` 1 keeps labels where both warps agree in color, 0 keeps every defined label.
-      rgb_tolerance: `[]` epsilon of the mask, largest difference of a channel.
+      rgb_tolerance: `[]` epsilon of the mask, the largest difference of a channel.
       depth_tolerance: `[]` relative; the source view's depth must confirm the label's; inf: off.
       fixed_anchors: `[]` 1 draws only the four fixed anchors of the paper's ablation.
       forward_label: `[]` 1 takes the color from the forward warps (released), 0 the backward one.
       leave_out_source: `[]` 1 keeps the source view out of the union that checks its label.
-      label_loss_weight: `[]` share of the labels' loss in a step's, 1/2 in the paper; 0: no labels. Where
-        both losses are pooled, any other share is as good.
-      max_ray_angle: `[]` radians between the rays of a virtual pixel and of its source, beyond
-        which there is no label; inf: off.
+      label_loss_weight: `[]` weight of the labels' loss in a step, 1/2 in the paper; the
+        photographs' loss has the rest. 0 turns labels off. A label rule that pools both losses
+        treats all other weights alike.
+      max_ray_angle: `[]` largest angle in radians between the rays of a virtual pixel and of its
+        source; inf: off.
       num_sources: `[]` photographs whose colors are averaged: the source view, and those that see
         most of the virtual pixels under small angles. 1 in the paper.
-      source_tolerance: `[]` relative; a wanted view has the photograph that sees most of what it
-        sees, within this tolerance of depth; inf: that has most pixels landing in it, as published.
-      rate: `[]` factor on what the optimizer changes in steps with labels.
+      source_tolerance: `[]` relative depth tolerance for choosing a target view's source; inf
+        ignores occlusion, as published.
+      lr_scale: `[]` factor on the optimizer's updates in steps with labels.
     """
 
     pose: PoseSettings
@@ -67,7 +89,7 @@ class PseudoSettings:
     max_ray_angle: jax.Array = _by_default(jnp.inf)
     num_sources: jax.Array = _by_default(1)
     source_tolerance: jax.Array = _by_default(_SOURCE_TOLERANCE)
-    rate: jax.Array = _by_default(1)
+    lr_scale: jax.Array = _by_default(1)
 
 
 class PseudoLabel(NamedTuple):
@@ -87,9 +109,10 @@ class PseudoLabel(NamedTuple):
 
 
 def sample_virtual_camera(
-    key: jax.Array, views: Views, depths: jax.Array, settings: PseudoSettings
+    key: jax.Array, sources: LabelSources, settings: PseudoSettings
 ) -> tuple[Camera, jax.Array]:
     """Draw a virtual close-up camera and the index `[]` of its training view; `key` is consumed."""
+    views, depths = sources.views, sources.depths
     key_view, key_pose = jax.random.split(key)
     index = jax.random.randint(key_view, (), 0, len(views))
     weight = views.weight[index]
@@ -107,36 +130,46 @@ def make_label(
     views: Views,
     depths: jax.Array,
     settings: PseudoSettings,
-    *,
-    sources: SourceBlocks | None = None,
+) -> PseudoLabel:
+    """Label pixels of a virtual view from photographs `views` with z-depths `depths[V, H, W]`.
+
+    The same as `label_pixels`, for callers that label once: blocks of sources are made anew.
+    """
+    return label_pixels(camera, pixels, depth, source_index, label_sources(views, depths), settings)
+
+
+def label_pixels(
+    camera: Camera,
+    pixels: jax.Array,
+    depth: jax.Array,
+    source_index: jax.Array | int,
+    sources: LabelSources,
+    settings: PseudoSettings,
 ) -> PseudoLabel:
     """Label pixels of a virtual view from the training photographs.
 
     Args:
       camera: the virtual camera.
-      pixels: `[..., 2]` pixel centers of it.
+      pixels: `[..., 2]` its pixel centers.
       depth: `[...]` their rendered z-depth D'; 0 where undefined.
       source_index: the training view n that the backward warp reads.
-      views: the training photographs.
-      depths: `[V, H, W]` their rendered z-depth.
+      sources: the training photographs.
       settings: tolerances and switches.
-      sources: `block_sources(views.cameras, depths, views.weight)`, if the caller labels often.
 
     Returns:
       A `PseudoLabel` over `[...]`.
     """
     chex.assert_equal_shape_prefix([pixels, depth], depth.ndim)
-    if sources is None:
-        sources = block_sources(views.cameras, depths, views.weight)
+    views = sources.views
     # Backward: lift with D', read the source photographs where the points project.
     points = pixels_to_points(camera, pixels, depth)
     defined = depth > 0
     some = points.reshape(-1, 3)[:: max(1, depth.size // _RANKING_PIXELS)]
-    ranked = _rank_sources(camera, some, source_index, views, depths, settings)
+    ranked = _rank_sources(camera, some, source_index, sources, settings)
 
     def add_source(rank, sums):
         index = ranked[rank]
-        color, weight = _read_source(camera, points, index, views, depths, settings)
+        color, weight = _read_source(camera, points, index, sources, settings)
         weight = jnp.where(defined, weight, 0)
         known = (weight > 0).astype(color.dtype)
         new = known[..., None] * color, weight, known
@@ -152,7 +185,7 @@ def make_label(
     backward = safe_divide(colors, known[..., None])
     # Forward: every training pixel, the nearest on each virtual pixel.
     exclude = jnp.where(settings.leave_out_source > 0, source_index, -1)
-    union = union_warp(sources, views.cameras, views.rgb, camera, pixels, exclude=exclude)
+    union = union_warp(sources.blocks, views.cameras, views.rgb, camera, pixels, exclude=exclude)
     forward = to_float(union.values)
     agree = union.hit & rgb_consistent(backward, forward, settings.rgb_tolerance)
     from_forward = settings.forward_label > 0
@@ -166,8 +199,9 @@ def make_label(
     return jax.lax.stop_gradient(label)
 
 
-def _read_source(camera, points, index, views, depths, settings):
-    """What view `index` shows at points `[..., 3]`, and its weight, 0 where that is no label."""
+def _read_source(camera, points, index, sources, settings):
+    """Colors of view `index` at points `[..., 3]`, and their weight: 0 where there is no label."""
+    views, depths = sources.views, sources.depths
     source = camera_at(views.cameras, index)
     maps = depths[index], views.weight[index]
     landed, _, weight = sample_where_visible(source, *maps, points, settings.depth_tolerance)
@@ -177,8 +211,9 @@ def _read_source(camera, points, index, views, depths, settings):
     return jnp.where(known[..., None], color, 0), jnp.where(known, weight, 0)
 
 
-def _rank_sources(camera, points, first, views, depths, settings):
+def _rank_sources(camera, points, first, sources, settings):
     """Indices `[V]` of the views: `first`, then those that see most of points `[N, 3]` best."""
+    views = sources.views
 
     def score(view):
         source, depth, weight = view
@@ -188,7 +223,7 @@ def _rank_sources(camera, points, first, views, depths, settings):
         sees = (weight > 0) & (cosine >= _least_cosine(settings))
         return jnp.sum(jnp.where(sees, cosine, 0))
 
-    scores = jax.lax.map(score, (views.cameras, depths, views.weight))
+    scores = jax.lax.map(score, (views.cameras, sources.depths, views.weight))
     return jnp.argsort(-scores.at[first].set(jnp.inf), stable=True)
 
 
@@ -205,35 +240,28 @@ def _least_cosine(settings):
 
 
 def label_views(
-    cameras: Camera,
-    target_depths: jax.Array,
-    views: Views,
-    depths: jax.Array,
-    settings: PseudoSettings,
-    *,
-    sources: SourceBlocks | None = None,
+    cameras: Camera, target_depths: jax.Array, sources: LabelSources, settings: PseudoSettings
 ) -> Views:
-    """Label whole views at known poses, for test-time fine-tuning: pixels without label weigh 0.
+    """Label whole views at known poses, for target views: pixels without a label weigh 0.
 
     Args:
       cameras: stacked `[Q]`.
       target_depths: `[Q, H, W]` rendered z-depth of these views; 0 where undefined.
-      views: the training photographs.
-      depths: `[V, H, W]` their rendered z-depth.
+      sources: the training photographs.
       settings: tolerances and switches.
-      sources: as for `make_label`.
     """
-    if sources is None:
-        sources = block_sources(views.cameras, depths, views.weight)
     pixels = pixel_grid(cameras.height, cameras.width)
 
     def one_view(target):
         camera, depth = target
         source = best_source(
-            camera, views, depths, depth=depth, tolerance=settings.source_tolerance
+            camera,
+            sources.views,
+            sources.depths,
+            depth=depth,
+            tolerance=settings.source_tolerance,
         )
-        data = source, views, depths, settings
-        label = make_label(camera, pixels, depth, *data, sources=sources)
+        label = label_pixels(camera, pixels, depth, source, sources, settings)
         return label.rgb, label.weight
 
     rgb, weight = jax.lax.map(one_view, (cameras, target_depths))

@@ -6,12 +6,32 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxcloseup.field import RadianceField
+from jaxcloseup.field import RadianceField, Rendering
 from jaxcloseup.numerics import safe_divide, take_turns
 from jaxcloseup.photographs import Batch
 
 
 Loss = tuple[jax.Array, dict[str, jax.Array]]
+
+
+def judge(
+    field: RadianceField, rendering: Rendering, target_rgb: jax.Array, weight: jax.Array
+) -> Loss:
+    """`field.loss` of a rendering, with the rendering's overflow among the metrics.
+
+    Args:
+      field: field that rendered.
+      rendering: rendering of pixels `[...]`.
+      target_rgb: `[..., 3]` true colors.
+      weight: `[...]` non-negative.
+
+    Returns:
+      The loss and its metrics, with `"overflow"`, float32, if the field has a static capacity.
+    """
+    loss, metrics = field.loss(rendering, target_rgb, weight)
+    if rendering.overflow is not None:
+        metrics = metrics | {"overflow": rendering.overflow.astype(jnp.float32)}
+    return loss, metrics
 
 
 def rendered_loss(
@@ -23,23 +43,25 @@ def rendered_loss(
     field: RadianceField,
     chunk: int | None = None,
 ) -> Loss:
-    """`field.loss` of what `field` renders at a batch's pixels, differentiable in `params` alone.
+    """Loss of what `field` renders at a batch's pixels, differentiable in `params` alone.
 
-    With `chunk`, differentiation takes the gradient of so many pixels as soon as they are rendered
-    and adds it up, so that nothing is kept for a backward pass and nothing computed twice. The sum
-    is exact, for a field's loss is a weighted mean over pixels; random numbers are others than
-    without `chunk`. Renderers of whole images have nothing to gain.
+    With `chunk`, differentiation renders that many pixels, takes their gradient and adds it to a
+    sum, so nothing is kept for a backward pass and nothing is computed twice. The sum is exact,
+    because a field's loss is a weighted mean over pixels. The chunks' renderings are then joined
+    along the pixels and judged once, so every array of a rendering must be per pixel: an array that
+    belongs to a whole rendering, such as `overflow`, could not be joined. Chunking changes the
+    random draws. A field that renders only whole images gains nothing from it.
 
     Args:
-      params: differentiated.
-      buffers: of the field.
-      batch: pixels and their colors.
+      params: parameters of the field.
+      buffers: buffers of the field.
+      batch: pixels and their true colors.
       key: consumed by the rendering; None renders deterministically.
-      field: static; renders and judges.
-      chunk: static; pixels differentiated at once, None for all of them.
+      field: static; renders, and defines the loss.
+      chunk: static; pixels to differentiate at once, usually `field.gradient_chunk`; None for all.
 
     Returns:
-      The loss and its metrics.
+      The loss and its metrics, from `judge`.
     """
     if chunk is None or batch.pixels is None or len(batch.pixels) <= chunk:
         return _plain(field, params, buffers, batch, key)
@@ -48,7 +70,7 @@ def rendered_loss(
 
 def _plain(field, params, buffers, batch, key):
     rendering = field.render(params, buffers, batch.cameras, batch.pixels, key)
-    return field.loss(rendering, batch.rgb, batch.weight)
+    return judge(field, rendering, batch.rgb, batch.weight)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
@@ -80,7 +102,7 @@ def _add_up(field, chunk, params, buffers, batch, key):
     zeros = jax.tree.map(jnp.zeros_like, params)
     gradients, renderings = jax.lax.scan(add_gradient, zeros, (pieces, keys))
     rendering = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: len(batch.pixels)], renderings)
-    return field.loss(rendering, batch.rgb, batch.weight), gradients
+    return judge(field, rendering, batch.rgb, batch.weight), gradients
 
 
 def _chunked_backward(field, chunk, gradients, cotangent):
@@ -92,7 +114,7 @@ _chunked.defvjp(_chunked_forward, _chunked_backward)
 
 
 def _split(batch: Batch, chunk: int) -> Batch:
-    """Pieces of `chunk` pixels on a new leading axis; pixels of no weight fill the last one up."""
+    """Pieces of `chunk` pixels on a new leading axis; pixels of weight 0 fill up the last one."""
     count = len(batch.pixels)
     fill = -count % chunk
     cameras = batch.cameras

@@ -1,4 +1,4 @@
-"""The record that every loader returns."""
+"""`Scene`, the record that every loader returns, with its errors and warnings."""
 
 import dataclasses
 from collections.abc import Callable
@@ -12,40 +12,41 @@ from jaxcloseup.photographs import Views
 
 
 class SceneError(ValueError):
-    """A scene that cannot be loaded."""
+    """The scene cannot be loaded; the message is one sentence that says what to do."""
 
 
 class SceneWarning(UserWarning):
-    """A scene that was loaded, though something about it may not be what its owner meant."""
+    """The scene was loaded, but something in its files looks like a mistake."""
 
 
 class UnknownKeyWarning(SceneWarning):
-    """A file holds fields that nothing here reads."""
+    """A file holds fields that the loader ignores."""
 
 
 class ImageSizeWarning(SceneWarning):
-    """Photographs are not of the size their file gives."""
+    """Photographs differ in size from what their file states; intrinsics were scaled."""
 
 
 class NearFarWarning(SceneWarning):
-    """The depth range was estimated."""
+    """The files give no depth range, so it was estimated."""
 
 
 class DuplicateFileWarning(SceneWarning):
-    """One photograph is listed more than once."""
+    """A photograph is listed more than once."""
 
 
 class PointsWarning(SceneWarning):
-    """Some of the initial points were dropped."""
+    """Some initial points were dropped."""
 
 
 class Surface(NamedTuple):
-    """What a camera truly sees, per pixel `[H, W]`.
+    """The exact image, depth and normals that a camera sees, per pixel `[H, W]`.
 
     Attributes:
       rgb: `[H, W, 3]` anti-aliased color in [0, 1].
-      depth: `[H, W]` exact z-depth at the pixel center, world units; 0 where nothing is hit.
-      normal: `[H, W, 3]` unit world normal at the pixel center, towards the camera; 0 where empty.
+      depth: `[H, W]` exact z-depth at the pixel center in world units; 0 where rays hit nothing.
+      normal: `[H, W, 3]` unit world normal at the pixel center, facing the camera; 0 where rays
+        hit nothing.
     """
 
     rgb: jax.Array
@@ -58,17 +59,17 @@ class Scene:
     """A capture in memory.
 
     Attributes:
-      name: what it is called.
-      train: the far photographs.
+      name: name of the scene.
+      train: far photographs to train on.
       test: held-out close-ups, or None.
       test_far: held-out ordinary views, or None.
-      points: `[P, 3]` world points on the surface, possibly none.
-      rgb: `[P, 3]` their float colors in [0, 1].
-      near: z-depth before which nothing is.
-      far: z-depth behind which nothing is.
+      points: `[P, 3]` float32 world points on surfaces; P may be 0.
+      rgb: `[P, 3]` float32 colors of the points in [0, 1].
+      near: lower bound of z-depth in the scene, in world units.
+      far: upper bound of z-depth in the scene, in world units.
       names: for each split present, the names of its photographs in order.
-      metadata: anything a format adds: source paths, downscale, capture-to-world transform.
-      surface: `camera -> Surface`, the exact scene at any pose; None for photographs.
+      metadata: extra facts from the loader, such as source paths and downscale.
+      surface: renders a `Camera` to its exact `Surface`; None for photographed scenes.
     """
 
     name: str

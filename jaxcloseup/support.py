@@ -1,4 +1,4 @@
-"""Support: what the training photographs saw of each rendered pixel, and how sharply."""
+"""Support: how many training photographs saw each rendered pixel, and how sharply."""
 
 from typing import NamedTuple
 
@@ -13,12 +13,12 @@ from jaxcloseup.photographs import Views
 
 
 class Support(NamedTuple):
-    """What photographs saw behind pixels.
+    """How well photographs saw the surface at each pixel of a rendered view.
 
     Attributes:
-      count: `[...]` int32 training photographs that saw the surface there.
-      footprint: `[...]` side of the smallest of their pixels there, in pixels of the rendered view:
-        1 is as sharp as the render, 4 is four times coarser; infinity where none saw it.
+      count: `[...]` int32 number of training photographs that saw the surface.
+      footprint: `[...]` side of their smallest pixel on it, in pixels of the rendered view: 1 is as
+        sharp as the render, 4 is four times coarser; infinity where no photograph saw it.
     """
 
     count: jax.Array
@@ -34,25 +34,28 @@ def find_support(
     *,
     tolerance: float = 0.02,
 ) -> Support:
-    """How many training photographs saw the surface behind each pixel, and the finest at what size.
+    """Count the training photographs that saw the surface at each pixel, and find the finest.
 
-    A view saw a point that lands on a pixel of its photograph, of weight above 0, at a depth
-    confirmed by its own depth map to a relative `tolerance`. At z-depth z a pixel covers z / f of a
-    surface that is parallel to the image, f the geometric mean of fx and fy; the footprint is the
-    ratio of that in the photograph to that in the rendered view.
+    A photograph saw a point if the point lands on one of its pixels of weight above 0 and its own
+    depth map confirms the point's z-depth to a relative `tolerance`. At z-depth z, a pixel covers
+    z / f of a surface that is parallel to the image, where f is the geometric mean of fx and fy.
+    The footprint is that size in the photograph divided by that size in the rendered view.
 
-    Not covered: a surface seen at a grazing angle is less sharp than the footprint says; nor are
-    lens blur, motion blur, focus and compression, of which the arrays say nothing. All rests on
-    rendered depth: where it is wrong in both views alike, so is what is counted. A photograph that
-    was reduced for training counts with its reduced pixels.
+    The footprint overstates the sharpness of a surface seen at a grazing angle, and it ignores lens
+    blur, motion blur, focus and compression. It relies on rendered depth: where that is wrong in
+    both views alike, the count is wrong too. A photograph that was reduced for training counts with
+    its reduced pixels.
 
     Args:
-      camera: of the rendered view.
-      pixels: `[..., 2]` pixel centers of it.
-      depth: `[...]` their z-depth; 0 is undefined, and then nobody saw it.
-      views: the training photographs.
-      depths: `[V, H, W]` their z-depth; 0 is undefined.
-      tolerance: relative.
+      camera: camera of the rendered view.
+      pixels: `[..., 2]` pixel centers of the rendered view.
+      depth: `[...]` z-depth of these pixels; 0 is undefined and counts as unseen.
+      views: training photographs.
+      depths: `[V, H, W]` z-depth of the photographs; 0 is undefined.
+      tolerance: relative depth tolerance.
+
+    Returns:
+      `Support` of the pixels `[...]`.
     """
     chex.assert_equal_shape_prefix([pixels, depth], depth.ndim)
     points = pixels_to_points(camera, pixels, depth)

@@ -1,7 +1,7 @@
-"""Reading tensors out of PyTorch's files without PyTorch: the zip format and the one before it.
+"""Read tensors from PyTorch's files without PyTorch, in the zip format and the legacy format.
 
-Both hold a pickle that names types and storages; here only tensors, containers and numbers are
-built, so a file can run no code.
+Both hold a pickle that names types and storages. The reader builds only tensors, containers and
+numbers, so a file cannot run code.
 """
 
 import collections
@@ -22,20 +22,20 @@ _TYPES = {
     "LongStorage": np.int64,
     "IntStorage": np.int32,
 }
-# The first two pickles of a file of before PyTorch 1.6: its mark and its version.
+# The first two pickles of a legacy file (before PyTorch 1.6): magic number and version.
 _MAGIC = 0x1950A86A20F9469CFC6C
 _VERSION = 1001
 
 
 class TorchFileError(Exception):
-    """A file that holds no readable tensors. The message is one sentence that says what to do."""
+    """A file holds no readable tensors. The message is one sentence that says what to do."""
 
 
 def read_tensors(path: str | pathlib.Path) -> dict[str, np.ndarray]:
-    """The tensors of a state dictionary that `torch.save` wrote, by name.
+    """Read the tensors, by name, of a state dictionary that `torch.save` wrote.
 
     Raises:
-      TorchFileError: the file is missing, truncated, or something other than named tensors.
+      TorchFileError: the file is missing or truncated, or does not hold named tensors.
     """
     path = pathlib.Path(path)
     try:
@@ -43,7 +43,7 @@ def read_tensors(path: str | pathlib.Path) -> dict[str, np.ndarray]:
         found = read(path)
     except OSError as error:
         raise TorchFileError(f"{path} cannot be read ({error.strerror}): restore it.") from error
-    except Exception as error:  # a pickle that is cut or strange may fail in any way
+    except Exception as error:  # a damaged pickle can fail in any way
         raise TorchFileError(
             f"{path} is not a whole file of PyTorch tensors ({error}): download it again."
         ) from error
@@ -70,23 +70,23 @@ def _read_legacy(path):
         kinds: dict[str, Any] = {}
 
         def later(kind, key):
-            # The numbers stand behind the pickle: tensors are made when these are known.
+            # The numbers follow the pickle, so tensors are built after it.
             kinds[key] = kind
             return key
 
         if _Unpickler(file, later).load() != _MAGIC or _Unpickler(file, later).load() != _VERSION:
-            raise ValueError("no mark of PyTorch")
+            raise ValueError("its magic number is not PyTorch's")
         _Unpickler(file, later).load()  # sizes of the writer's integers
         found = _Unpickler(file, later).load()
         for key in _Unpickler(file, later).load():
             (count,) = struct.unpack("<q", file.read(8))
             kind = np.dtype(kinds[key])
             storages[key] = np.frombuffer(file.read(count * kind.itemsize), kind, count)
-    return {name: _view(storages[of.storage], *of.form) for name, of in found.items()}
+    return {name: _view(storages[wait.storage], *wait.form) for name, wait in found.items()}
 
 
 class _Pending(collections.namedtuple("_Pending", "storage form")):
-    """A tensor whose numbers are not read yet."""
+    """A tensor whose numbers have not been read yet."""
 
 
 def _view(storage, offset, shape, strides):
@@ -109,14 +109,14 @@ def _parameter(tensor, *_):
 
 
 class _Unpickler(pickle.Unpickler):
-    """Builds tensors, dictionaries and numbers, and refuses everything else."""
+    """Builds tensors, dictionaries and numbers, and refuses anything else."""
 
     def __init__(self, file, load):
         super().__init__(file, encoding="utf-8")
         self._load = load
 
     def find_class(self, module: str, name: str) -> Any:
-        """What a pickle may name."""
+        """The function or type behind a name, if a pickle may use it."""
         known = {
             ("collections", "OrderedDict"): collections.OrderedDict,
             ("torch._utils", "_rebuild_tensor_v2"): _tensor,
@@ -129,6 +129,6 @@ class _Unpickler(pickle.Unpickler):
         return known[module, name]
 
     def persistent_load(self, pid: Any) -> Any:
-        """A storage, by its kind and key."""
+        """The storage with the type and key in `pid`."""
         _, kind, key, *_ = pid
         return self._load(kind, key)

@@ -5,7 +5,6 @@
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -14,13 +13,19 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from jaxcloseup.field import RadianceField, Rendering
+from jaxcloseup.field import RadianceField
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
-from jaxcloseup.geometry.union_warp import SourceBlocks
+from jaxcloseup.label_rules import LABEL_RULES, add_label_loss, label_depth, mix_losses
 from jaxcloseup.numerics import take_turns
 from jaxcloseup.photographs import Batch, Views, sample_image, sample_pixels
-from jaxcloseup.pseudo import PseudoSettings, make_label, sample_virtual_camera
-from jaxcloseup.rendered_loss import rendered_loss
+from jaxcloseup.pseudo import (
+    LabelSources,
+    PseudoSettings,
+    label_pixels,
+    label_sources,
+    sample_virtual_camera,
+)
+from jaxcloseup.rendered_loss import judge, rendered_loss
 
 
 Metrics = dict[str, jax.Array]
@@ -50,22 +55,14 @@ class TrainConfig:
     """How much one step looks at.
 
     Attributes:
-      num_rays: training pixels of a step; None takes one whole photograph.
-      num_label_rays: pseudo-labeled pixels of a step; None takes the whole virtual image.
-      perturbed_depth: render virtual depth with sampling noise, as released, not without (paper).
-      undivided_depth: use depth not divided by alpha, as released, for labels.
-      pooled_loss: one mean over all valid pixels, as released, not half of each mean (paper);
-        for fields that render single pixels.
-      gradient_chunk: pixels differentiated at once, see `rendered_loss`; None for all. With chunks,
-        every leaf of the field's `aux` is per pixel.
+      num_rays: pixels of photographs in a step; None takes one whole photograph.
+      num_label_rays: labeled pixels in a step; None takes the whole virtual image.
+      label_rule: a name in `LABEL_RULES`. Whole virtual images always add both losses.
     """
 
     num_rays: int | None = 1024
     num_label_rays: int | None = 1024
-    perturbed_depth: bool = False
-    undivided_depth: bool = False
-    pooled_loss: bool = False
-    gradient_chunk: int | None = None
+    label_rule: str = "paper"
 
 
 def init_state(
@@ -107,7 +104,7 @@ def train_step(
     key_step = jax.random.fold_in(state.key, state.step)
     key_batch, key_render, key_adapt, _ = jax.random.split(key_step, 4)
     batch = _sample_batch(key_batch, views, config)
-    loss_of = functools.partial(rendered_loss, field=field, chunk=config.gradient_chunk)
+    loss_of = functools.partial(rendered_loss, field=field, chunk=field.gradient_chunk)
 
     def loss(params):
         return loss_of(params, state.buffers, batch, key_render)
@@ -124,78 +121,94 @@ def pseudo_step(
     field: RadianceField,
     optimizer: optax.GradientTransformation,
     config: TrainConfig,
-    sources: SourceBlocks | None = None,
 ) -> tuple[TrainState, Metrics]:
-    """One step on training photographs and on one pseudo-labeled virtual close-up.
+    """`closeup_step` on photographs `views` with z-depths `depths[V, H, W]`.
 
-    L = (1 - s) L_c + s L_pl with `settings.label_loss_weight` s, 1/2 in the paper, where L_pl is the mean
-    over labeled pixels only, and 0 without any. The photographs' draw is that of `train_step` at
-    the same step, so that a control is paired.
+    The blocks of `label_sources` are made anew in every step: make them once in a long training.
+    """
+    sources = label_sources(views, depths)
+    return closeup_step(state, sources, settings, field=field, optimizer=optimizer, config=config)
+
+
+def closeup_step(
+    state: TrainState,
+    sources: LabelSources,
+    settings: PseudoSettings,
+    *,
+    field: RadianceField,
+    optimizer: optax.GradientTransformation,
+    config: TrainConfig,
+) -> tuple[TrainState, Metrics]:
+    """One step on training photographs and on one pseudo-labeled random close-up.
+
+    L = (1 - w) L_c + w L_pl with w = `settings.label_loss_weight`, 1/2 in the paper, where L_pl is
+    the mean over labeled pixels only, and 0 without any. The step draws the same photographs as
+    `train_step` at the same count of steps, so that a control is paired.
 
     Args:
       state: what is trained.
-      views: training photographs.
-      depths: `[V, H, W]` their z-depth, from `render_depths`.
+      sources: the training photographs, from `label_sources`.
       settings: virtual poses and masks.
       field: static; what is trained.
       optimizer: static.
       config: static.
-      sources: `block_sources(views.cameras, depths, views.weight)`; recomputed here if absent.
 
     Returns:
-      The next state, and metrics with `label_coverage`, the share of labeled virtual pixels; where
-      the two means are not pooled, the field's metrics of the labeled pixels as `label_<name>`.
+      The next state, and metrics with `label_coverage`, the share of labeled virtual pixels; unless
+      the rule pools both losses, also the field's metrics of the labeled pixels as `label_<name>`.
     """
     key_step = jax.random.fold_in(state.key, state.step)
     key_batch, key_render, key_adapt, key_label = jax.random.split(key_step, 4)
     key_virtual, key_pixels, key_depth, key_virtual_render = jax.random.split(key_label, 4)
-    batch = _sample_batch(key_batch, views, config)
-
-    camera, source_index = sample_virtual_camera(key_virtual, views, depths, settings)
+    batch = _sample_batch(key_batch, sources.views, config)
+    camera, source_index = sample_virtual_camera(key_virtual, sources, settings)
     pixels = _sample_virtual_pixels(key_pixels, camera, config.num_label_rays)
-    label_pixels = pixel_grid(camera.height, camera.width) if pixels is None else pixels
+    rule = LABEL_RULES[config.label_rule]
+    loss_of = functools.partial(rendered_loss, field=field, chunk=field.gradient_chunk)
+    weight = settings.label_loss_weight
 
-    key_depth = key_depth if config.perturbed_depth else None
+    def render_depth_image(params):
+        return field.render(params, state.buffers, camera, pixels, rule.depth_key(key_depth))
 
-    def render(params, buffers, camera, pixels, key):
+    def label_of(rendering, pixels):
+        depth = rule.depth(jax.lax.stop_gradient(rendering))
+        return label_pixels(camera, pixels, depth, source_index, sources, settings)
+
+    def image_loss(params):
+        # The loss judges the same image that depth is taken from.
+        rendering = render_depth_image(params)
+        label = label_of(rendering, pixel_grid(camera.height, camera.width))
+        of_labels = judge(field, rendering, label.rgb, label.weight)
+        of_photographs = loss_of(params, state.buffers, batch, key_render)
+        value, metrics = mix_losses(of_photographs, of_labels, weight)
+        return value, metrics | {"label_coverage": jnp.mean(label.weight)}
+
+    if pixels is None:
+        return _update(state, image_loss, key_adapt, field, optimizer, settings.lr_scale)
+
+    def render_pixels(params, buffers, camera, pixels, key):
         return field.render(params, buffers, camera, pixels, key)
 
-    def label_of(seen):
-        depth = label_depth(seen, divided=not config.undivided_depth)
-        data = source_index, views, depths, settings
-        return make_label(camera, label_pixels, depth, *data, sources=sources)
+    rendering = take_turns(render_pixels)(
+        jax.lax.stop_gradient(state.params),
+        state.buffers,
+        camera,
+        pixels,
+        rule.depth_key(key_depth),
+    )
+    label = label_of(rendering, pixels)
+    labeled = Batch(camera, pixels, label.rgb, label.weight)
 
-    of_virtual = state.buffers, camera, pixels, key_depth
+    def pixel_loss(params):
+        value, metrics = rule.loss(
+            lambda batch, key: loss_of(params, state.buffers, batch, key),
+            (batch, key_render),
+            (labeled, key_virtual_render),
+            weight,
+        )
+        return value, metrics | {"label_coverage": jnp.mean(label.weight)}
 
-    loss_of = functools.partial(rendered_loss, field=field, chunk=config.gradient_chunk)
-    if pixels is not None:
-        label = label_of(take_turns(render)(jax.lax.stop_gradient(state.params), *of_virtual))
-
-    def loss(params):
-        if pixels is None:
-            # The image that depth is taken from is the one that is judged.
-            seen = render(params, *of_virtual)
-            of_image = label_of(jax.lax.stop_gradient(seen))
-            coverage = jnp.mean(of_image.weight)
-            virtual_loss, virtual_metrics = field.loss(seen, of_image.rgb, of_image.weight)
-        else:
-            coverage = jnp.mean(label.weight)
-            virtual = Batch(camera, pixels, label.rgb, label.weight)
-            if config.pooled_loss:
-                some = (settings.label_loss_weight > 0).astype(label.weight.dtype)
-                pooled = _pool(batch, virtual._replace(weight=some * label.weight))
-                value, metrics = loss_of(params, state.buffers, pooled, key_render)
-                return value, metrics | {"label_coverage": coverage}
-            virtual_loss, virtual_metrics = loss_of(
-                params, state.buffers, virtual, key_virtual_render
-            )
-        batch_loss, metrics = loss_of(params, state.buffers, batch, key_render)
-        metrics = metrics | {f"label_{name}": value for name, value in virtual_metrics.items()}
-        share = settings.label_loss_weight
-        value = (1 - share) * batch_loss + share * virtual_loss
-        return value, metrics | {"label_coverage": coverage}
-
-    return _update(state, loss, key_adapt, field, optimizer, settings.rate)
+    return _update(state, pixel_loss, key_adapt, field, optimizer, settings.lr_scale)
 
 
 def labeled_step(
@@ -208,15 +221,16 @@ def labeled_step(
     optimizer: optax.GradientTransformation,
     config: TrainConfig,
 ) -> tuple[TrainState, Metrics]:
-    """One step on training photographs and on views labeled once, for test-time fine-tuning.
+    """One step on training photographs and on views that were labeled once, such as target views.
 
-    The loss is that of `pseudo_step`, never pooled; the photographs' draw is that of `train_step`.
+    The losses are added as in the paper, never pooled. The step draws the same photographs as
+    `train_step`.
 
     Args:
       state: what is trained.
       views: training photographs.
-      labels: of `label_views`.
-      settings: of which `label_loss_weight` and `rate` count.
+      labels: from `label_views`.
+      settings: `label_loss_weight` and `lr_scale` count.
       field: static.
       optimizer: static.
       config: static.
@@ -229,16 +243,17 @@ def labeled_step(
         labeled = sample_image(key_label_batch, labels)
     else:
         labeled = sample_pixels(key_label_batch, labels, config.num_label_rays)
-    loss_of = functools.partial(rendered_loss, field=field, chunk=config.gradient_chunk)
+    loss_of = functools.partial(rendered_loss, field=field, chunk=field.gradient_chunk)
 
     def loss(params):
-        batch_loss, metrics = loss_of(params, state.buffers, batch, key_render)
-        label_loss, label_metrics = loss_of(params, state.buffers, labeled, key_label_render)
-        share = settings.label_loss_weight
-        value = (1 - share) * batch_loss + share * label_loss
-        return value, metrics | {f"label_{name}": value for name, value in label_metrics.items()}
+        return add_label_loss(
+            lambda batch, key: loss_of(params, state.buffers, batch, key),
+            (batch, key_render),
+            (labeled, key_label_render),
+            settings.label_loss_weight,
+        )
 
-    return _update(state, loss, key_adapt, field, optimizer, settings.rate)
+    return _update(state, loss, key_adapt, field, optimizer, settings.lr_scale)
 
 
 def run_steps(
@@ -271,38 +286,30 @@ def render_depths(
     *,
     near: float,
     far: float,
-    min_alpha: float = 0.5,
     key: jax.Array | None = None,
-    divided: bool = True,
+    depth: Callable[..., jax.Array] = label_depth,
 ) -> jax.Array:
     """Z-depths `[V, H, W]` of whole views, one after the other, for labels and anchors.
 
-    Depth is 0, undefined, where alpha is under `min_alpha` or depth outside [near, far]. The
-    released script renders with sampling noise (`key`) and does not divide by alpha (`divided`).
-    Of surfels, `overflow` goes unseen here: render one by one where pairs may not fit.
+    Nothing here tells whether a rendering overflowed: render views one by one where that can be.
+
+    Args:
+      field: what renders.
+      params: its parameters.
+      buffers: its buffers.
+      cameras: stacked `[V]`.
+      near: smallest depth that labels can use, world units.
+      far: largest one.
+      key: consumed by the renderings; None renders deterministically.
+      depth: that of a `LabelRule`.
     """
 
     def one_view(view):
         camera, key = view
-        seen = field.render(params, buffers, camera, None, key)
-        return label_depth(seen, near=near, far=far, min_alpha=min_alpha, divided=divided)
+        return depth(field.render(params, buffers, camera, None, key), near=near, far=far)
 
     keys = None if key is None else jax.random.split(key, cameras.intrinsics.shape[0])
     return jax.lax.map(one_view, (cameras, keys))
-
-
-def label_depth(
-    rendering: Rendering,
-    *,
-    near: float = 0.0,
-    far: float = math.inf,
-    min_alpha: float = 0.5,
-    divided: bool = True,
-) -> jax.Array:
-    """Z-depth `[...]` of a rendering where it is fit for labels, else 0: see `render_depths`."""
-    depth = rendering.depth if divided else rendering.depth * rendering.alpha
-    defined = (rendering.alpha >= min_alpha) & (depth >= near) & (depth <= far)
-    return jnp.where(defined, depth, 0)
 
 
 def _sample_batch(key, views, config):
@@ -319,21 +326,11 @@ def _sample_virtual_pixels(key, camera, count):
     return jax.random.randint(key, (count, 2), 0, size).astype(jnp.float32) + 0.5
 
 
-def _pool(batch, virtual):
-    """One batch of the pixels of both; the second has one camera for all of its."""
-    cameras = jax.tree.map(
-        lambda leaf: jnp.broadcast_to(leaf, (len(virtual.pixels), *leaf.shape)), virtual.cameras
-    )
-    return jax.tree.map(
-        lambda *leaves: jnp.concatenate(leaves), batch, virtual._replace(cameras=cameras)
-    )
-
-
-def _update(state, loss, key_adapt, field, optimizer, rate=None):
+def _update(state, loss, key_adapt, field, optimizer, lr_scale=None):
     (value, metrics), gradients = jax.value_and_grad(loss, has_aux=True)(state.params)
     updates, opt_state = optimizer.update(gradients, state.opt_state, state.params)
-    if rate is not None:
-        updates = jax.tree.map(lambda leaf: rate.astype(leaf.dtype) * leaf, updates)
+    if lr_scale is not None:
+        updates = jax.tree.map(lambda leaf: lr_scale.astype(leaf.dtype) * leaf, updates)
     after = state.replace(
         step=state.step + 1,
         params=optax.apply_updates(state.params, updates),

@@ -1,4 +1,4 @@
-"""Slow NumPy float64 oracles, written from the equations and sharing no code with the package."""
+"""Slow NumPy float64 oracles, written from the equations; they share no code with the package."""
 
 import numpy as np
 
@@ -37,6 +37,46 @@ def forward_warp(values, pixels, depths, shape):
     return image, buffer
 
 
+def bilinear(image, x, y):
+    """Value `[C]` of an image `[H, W, C]` at one continuous pixel; the border repeats outwards."""
+    height, width, _ = image.shape
+    total = np.zeros(image.shape[-1])
+    for column in (int(np.floor(x - 0.5)), int(np.floor(x - 0.5)) + 1):
+        for row in (int(np.floor(y - 0.5)), int(np.floor(y - 0.5)) + 1):
+            share = (1 - abs(x - 0.5 - column)) * (1 - abs(y - 0.5 - row))
+            total += share * image[min(max(row, 0), height - 1), min(max(column, 0), width - 1)]
+    return total
+
+
+def warp_to(image, source, target, depth, source_depth=None, tolerance=0.02):
+    """Read an image into a target view pixel by pixel; cameras are (camtoworld, intrinsics).
+
+    Returns `image [H, W, C]`, `valid [H, W]` and `margin [H, W]`: how far the nearest decision is,
+    in pixels, world units or relative depth.
+    """
+    image, depth = np.asarray(image, np.float64), np.asarray(depth, np.float64)
+    height, width, channels = image.shape
+    result, valid = np.zeros((*depth.shape, channels)), np.zeros(depth.shape, bool)
+    margin = np.full(depth.shape, np.inf)
+    for row, column in np.ndindex(*depth.shape):
+        at = row, column
+        if not (np.isfinite(depth[at]) and depth[at] > 0):
+            continue
+        point = unproject(*target, [(column + 0.5, row + 0.5)], [depth[at]])
+        ((x, y),), (z,) = project(*source, point)
+        margin[at] = min(abs(z), abs(x), abs(y), abs(x - width), abs(y - height))
+        if z <= 0 or not (0 <= x < width and 0 <= y < height):
+            continue
+        if source_depth is not None:
+            margin[at] = min(margin[at], abs(x - round(x)), abs(y - round(y)))
+            error = abs(float(source_depth[int(y), int(x)]) - z)
+            margin[at] = min(margin[at], abs(error / z - tolerance))
+            if error > tolerance * z:
+                continue
+        result[at], valid[at] = bilinear(image, x, y), True
+    return result, valid, margin
+
+
 def composite_ray(rgb, density, depth, length):
     """Weights, color, alpha, depth, alpha times depth and median depth of one ray's samples."""
     rgb, density, depth = (np.asarray(x, np.float64) for x in (rgb, density, depth))
@@ -55,14 +95,14 @@ def composite_ray(rgb, density, depth, length):
 
 
 def invert_cdf(edges, weights, quantiles):
-    """Where the piecewise linear CDF of a histogram, raised by 1e-5, takes the values given."""
+    """Positions at which the linear CDF of a histogram, raised by 1e-5, reaches `quantiles`."""
     edges, weights = np.asarray(edges, np.float64), np.asarray(weights, np.float64) + 1e-5
     cdf = np.concatenate([[0], np.cumsum(weights / weights.sum())])
     return np.interp(quantiles, cdf, edges)
 
 
 def nerf_network(network, positions, directions):
-    """Raw density `[M]` and rgb `[M, 3]` of encoded samples `[M, I]` that look along `[M, J]`."""
+    """Raw density `[M]` and rgb `[M, 3]` of encoded positions `[M, I]` and directions `[M, J]`."""
 
     def layer(params, x):
         weights = np.concatenate([np.asarray(w, np.float64) for w in params["weights"]], axis=1)
@@ -99,8 +139,8 @@ def first_crossing(solids, origin, direction, nearest=1e-4):
     """Depth, world normal and index of the nearest of `solids` = (kind, to_world, taper) on a ray.
 
     Kinds are "plane", "box", "sphere", "cylinder": unit shapes under an affine map `[3, 4]`. Each
-    face is intersected by itself, in the unit frame. Also returned is the least distance, in the
-    unit frame, by which a candidate fell inside or outside its face: small for a grazing ray.
+    face is intersected by itself, in the unit frame. The last result is the least distance, in the
+    unit frame, by which a candidate fell inside or outside its face: it is small for a grazing ray.
     """
     best, margin = (np.inf, np.zeros(3), -1), np.inf
     for index, (kind, to_world, taper) in enumerate(solids):

@@ -1,9 +1,9 @@
 """A slow splatter in NumPy float64: rays against planes, every splat at every pixel, no tiles.
 
-It shares neither code nor formulas with the package: it intersects, where the package interpolates
-homographies. What the two agree on by decision is listed here: the constants, the order (by center
-depth, not nearer than `near`), the floor about the projected center, and depth held to the disc's
-own range where that floor wins.
+It shares neither code nor formulas with the package: it intersects rays with discs, while the
+package interpolates homographies. Both follow the same decisions: the constants, the order (by
+center depth, at least `near`), the low-pass about the projected center, and depth clipped to the
+disc's own range where the low-pass counts.
 """
 
 import numpy as np
@@ -13,14 +13,14 @@ ALPHA_MIN, ALPHA_MAX, T_MIN, LOW_PASS = 1 / 255, 0.99, 1e-4, 2.0
 
 
 def rotation_of(wxyz):
-    """Rotation matrix of one quaternion, by rotating the basis with q v q*."""
+    """Rotation matrix `[3, 3]` of one quaternion, from rotating the basis with q v q*."""
     w, *v = np.asarray(wxyz, np.float64) / np.linalg.norm(wxyz)
     v = np.array(v)
     return np.stack([e + 2 * np.cross(v, np.cross(v, e) + w * e) for e in np.eye(3)], axis=1)
 
 
 def sh_color(sh, direction):
-    """Color of coefficients `[K, 3]` along a unit direction, basis written out as numbers."""
+    """Color `[3]` of coefficients `[K, 3]` along a unit direction, with the basis as numbers."""
     x, y, z = direction
     basis = [
         0.28209479177387814,
@@ -42,7 +42,7 @@ def sh_color(sh, direction):
 
 
 def depth_reach(surfels, camtoworld):
-    """How far in depth each disc extends from its center, out to where it fades."""
+    """Half the range of depth `[N]` that each disc covers, up to where it fades."""
     rotation = np.asarray(camtoworld)[:, :3]
     opacity = 1 / (1 + np.exp(-surfels["opacity_logits"]))
     cutoff = np.sqrt(2 * np.log(np.maximum(255 * opacity, 1)))
@@ -56,8 +56,8 @@ def depth_reach(surfels, camtoworld):
 def intersect(surfels, camtoworld, intrinsics, pixels, *, near, reach=None):
     """Opacity and depth `[N, P]` of every surfel at `pixels[P, 2]`; opacity 0 is not drawn.
 
-    `reach` is held fixed by finite differences: the package gives the depth range of a disc no
-    derivative but that of its center.
+    Finite differences pass a fixed `reach`, because in the package a disc's range of depth has no
+    derivative except that of its center.
     """
     rotation, position = np.asarray(camtoworld)[:, :3], np.asarray(camtoworld)[:, 3]
     fx, fy, cx, cy = intrinsics
@@ -93,8 +93,8 @@ def intersect(surfels, camtoworld, intrinsics, pixels, *, near, reach=None):
     return np.array(alphas), np.array(depths)
 
 
-def composite(alphas, depths, payload):
-    """Front to back, one splat after the other, of alphas and depths `[N, P]` in order.
+def blend(alphas, depths, payload):
+    """Blend splats one after the other; alphas and depths `[N, P]` are sorted front to back.
 
     Returns payload sums `[P, F]`, alpha, expected depth, median depth and distortion `[P]`.
     """
@@ -118,7 +118,7 @@ def composite(alphas, depths, payload):
 
 
 def render(surfels, camtoworld, intrinsics, height, width, *, near, background=None, reach=None):
-    """An image as a dictionary of `[H, W, ...]`; `surfels` is a dictionary of float64 arrays."""
+    """Images `[H, W, ...]` by name; `surfels` is a dictionary of float64 arrays."""
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
     camtoworld = np.asarray(camtoworld, np.float64)
@@ -133,7 +133,7 @@ def render(surfels, camtoworld, intrinsics, height, width, *, near, background=N
         payload.append([*sh_color(sh, offset / np.linalg.norm(offset)), *normal])
         order.append(max(offset @ camtoworld[:, 2], near))
     by_depth = np.argsort(order, kind="stable")
-    sums, alpha, depth, median, distortion = composite(
+    sums, alpha, depth, median, distortion = blend(
         alphas[by_depth], depths[by_depth], np.array(payload)[by_depth]
     )
     rgb = sums[:, :3] + (0 if background is None else (1 - alpha)[:, None] * background)

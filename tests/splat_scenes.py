@@ -1,4 +1,4 @@
-"""Small random splat scenes, and renderers that all tests share so that each compiles once."""
+"""Small random splat scenes, and one renderer that all tests share so that it compiles once."""
 
 import functools
 
@@ -18,7 +18,7 @@ CONFIG = RasterizeConfig(capacity=1024, near=NEAR, tile=8, chunk=4, block=4)
 
 
 def random_scene(seed, *, depth=(1.0, 3.0), log_scale=(-4.0, -0.7), count=COUNT):
-    """A dictionary of float32-representable float64 arrays in front of the identity pose."""
+    """Surfels in front of the identity pose: float64 arrays by name, exact in float32."""
     rng = np.random.default_rng(seed)
     z = rng.uniform(*depth, count)
     xy = rng.uniform(-0.5, 0.5, (count, 2)) * np.maximum(np.abs(z), 0.5)[:, None]
@@ -49,7 +49,7 @@ def to_camera(camtoworld=IDENTITY, intrinsics=INTRINSICS, size=(HEIGHT, WIDTH), 
 
 
 def render(surfels, camera, alive=None, config=CONFIG):
-    """All images of `render_surfels` by name, over `BACKGROUND`."""
+    """All images of `render_surfels` over `BACKGROUND`, by name."""
     alive = jnp.ones(surfels.means.shape[0], bool) if alive is None else alive
     return _render(surfels, camera, alive, config)
 

@@ -1,4 +1,4 @@
-"""Surfels that are cloned, split and removed: which, where to, and what is forgotten."""
+"""Adaptive density control: which surfels are cloned, split and removed, and where they go."""
 
 import functools
 
@@ -14,11 +14,11 @@ from jaxcloseup.geometry.cameras import points_to_pixels
 from jaxcloseup.splats import RasterizeConfig
 from jaxcloseup.splats.adaptive import (
     AdaptiveConfig,
-    PullState,
-    apply_probe,
+    ImageGradientState,
+    apply_image_offset,
     refine,
     reset_opacities,
-    with_probe,
+    with_image_offset,
 )
 from jaxcloseup.splats.field import SurfelConfig, surfel_field, surfel_optimizer
 from jaxcloseup.train import TrainConfig, init_state, run_steps, train_step
@@ -26,30 +26,32 @@ from jaxcloseup.train import TrainConfig, init_state, run_steps, train_step
 
 CONFIG = AdaptiveConfig(gradient=1.0, small=0.01, min_opacity=0.05, huge=0.1)
 EXTENT = 2.0
-SMALL, LARGE, HUGE = 0.01, 0.05, 0.5  # scales in world units: over and under CONFIG's times EXTENT
+SMALL, LARGE, HUGE = 0.01, 0.05, 0.5  # scales in world units, around CONFIG's times EXTENT
 grow = jax.jit(functools.partial(refine, config=CONFIG, extent=EXTENT))
 
 
 def scene_of(scales, opacities):
-    """Surfels of these larger scales and opacities, and the rest of no account."""
+    """Random surfels with the given scales along the first tangent and the given opacities."""
     scene = random_scene(5)
     scene["log_scales"] = np.log(np.stack([scales, 0.3 * np.asarray(scales)], axis=1))
     opacities = np.asarray(opacities, float)
     scene["opacity_logits"] = np.log(opacities) - np.log1p(-opacities)
-    return with_probe(to_surfels(scene))
+    return with_image_offset(to_surfels(scene))
 
 
-def pull_of(mean):
+def gradients_of(mean):
     views = np.where(np.asarray(mean) > 0, 4.0, 0.0)
-    return PullState(jnp.asarray(mean * views, jnp.float32), jnp.asarray(views, jnp.float32))
+    return ImageGradientState(
+        jnp.asarray(mean * views, jnp.float32), jnp.asarray(views, jnp.float32)
+    )
 
 
-def test_a_probe_moves_the_image_of_its_center_by_half_images():
-    surfels, camera = with_probe(to_surfels(random_scene(2, depth=(0.5, 3.0)))), to_camera()
+def test_an_image_offset_moves_the_center_by_half_images():
+    surfels, camera = with_image_offset(to_surfels(random_scene(2, depth=(0.5, 3.0)))), to_camera()
     before, depth = points_to_pixels(camera, surfels.means)
-    probe = jnp.zeros((COUNT, 2)).at[3].set(jnp.array([0.1, -0.2]))
+    image_offset = jnp.zeros((COUNT, 2)).at[3].set(jnp.array([0.1, -0.2]))
     after, depth_after = points_to_pixels(
-        camera, apply_probe(surfels.replace(probe=probe), camera).means
+        camera, apply_image_offset(surfels.replace(image_offset=image_offset), camera).means
     )
     expected = np.zeros((COUNT, 2))
     expected[3] = 0.1 * WIDTH / 2, -0.2 * HEIGHT / 2
@@ -57,19 +59,19 @@ def test_a_probe_moves_the_image_of_its_center_by_half_images():
     np.testing.assert_allclose(depth_after, depth, rtol=1e-5)
 
 
-def test_small_are_cloned_large_are_split_faint_and_huge_removed(key):
-    scales, opacities, pulls = np.full(COUNT, SMALL), np.full(COUNT, 0.5), np.zeros(COUNT)
-    pulls[[0, 1]] = 3.0, 2.0
+def test_small_surfels_are_cloned_large_split_faint_and_huge_removed(key):
+    scales, opacities, means = np.full(COUNT, SMALL), np.full(COUNT, 0.5), np.zeros(COUNT)
+    means[[0, 1]] = 3.0, 2.0
     scales[1] = LARGE
     opacities[2] = 0.04
     scales[3] = HUGE
-    pulls[4] = 0.99  # just not hard enough
+    means[4] = 0.99  # just below the threshold
     alive = np.arange(COUNT) < 10
     before = scene_of(scales, opacities)
-    pull = pull_of(pulls)
-    after, now_alive, new = grow(key, before, jnp.asarray(alive), pull, remove_huge=True)
+    gradients = gradients_of(means)
+    after, now_alive, new = grow(key, before, jnp.asarray(alive), gradients, remove_huge=True)
     assert int(now_alive.sum()) == 10 - 2 + 2
-    # The hardest pulled goes to the first free row, and so on: rows 2 and 3 were just removed.
+    # The surfel with the largest gradient takes the first free row; rows 2 and 3 were just removed.
     clone, halves = 2, (1, 3)
     for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
         np.testing.assert_array_equal(getattr(after, name)[clone], getattr(before, name)[0])
@@ -88,16 +90,16 @@ def test_small_are_cloned_large_are_split_faint_and_huge_removed(key):
     np.testing.assert_array_equal(
         after.means[jnp.array(untouched)], before.means[jnp.array(untouched)]
     )
-    kept, _, _ = grow(key, before, jnp.asarray(alive), pull, remove_huge=False)
+    kept, _, _ = grow(key, before, jnp.asarray(alive), gradients, remove_huge=False)
     np.testing.assert_array_equal(kept.log_scales[3], before.log_scales[3])
 
 
-def test_without_room_the_hardest_pulled_come_first(key):
-    pulls = np.linspace(1.5, 3, COUNT)
+def test_without_room_the_largest_gradients_come_first(key):
+    gradients = gradients_of(np.linspace(1.5, 3, COUNT))
     alive = np.ones(COUNT, bool)
     alive[[4, 7]] = False
     before = scene_of(np.full(COUNT, SMALL), np.full(COUNT, 0.5))
-    after, now_alive, new = grow(key, before, jnp.asarray(alive), pull_of(pulls), remove_huge=False)
+    after, now_alive, new = grow(key, before, jnp.asarray(alive), gradients, remove_huge=False)
     assert now_alive.all()
     np.testing.assert_array_equal(np.nonzero(new)[0], [4, 7])
     np.testing.assert_array_equal(after.means[4], before.means[COUNT - 1])
@@ -112,8 +114,8 @@ def test_a_reset_leaves_nothing_opaque():
     np.testing.assert_allclose(after, np.where(np.arange(COUNT) % 2, 0.01, 0.003), rtol=1e-4)
 
 
-def test_training_measures_the_pull_and_adds_surfels():
-    """The pull is the derivative of the loss that finite differences of the center's image show."""
+def test_training_records_image_gradients_and_adds_surfels():
+    """The recorded gradient agrees with finite differences of the loss in the image offset."""
     density = AdaptiveConfig(every=20, start=19, stop=50, gradient=1e-5, reset_every=45)
     config = SurfelConfig(
         capacity=200,
@@ -140,20 +142,22 @@ def test_training_measures_the_pull_and_adds_surfels():
     camera = jax.tree.map(lambda leaf: leaf[0], views.cameras)
 
     @jax.jit
-    def loss(probe):
-        params = state.params.replace(probe=probe)
+    def loss(image_offset):
+        params = state.params.replace(image_offset=image_offset)
         rendering = field.render(params, state.buffers, camera, None, None)
         return field.loss(rendering, views.rgb[0], views.weight[0])[0]
 
-    pull = one.opt_state[0]
-    hardest = int(jnp.argmax(pull.total))
+    recorded = one.opt_state[0]
+    strongest = int(jnp.argmax(recorded.total))
     differences = []
     for axis in range(2):
-        step = jnp.zeros((200, 2)).at[hardest, axis].set(2e-3)
+        step = jnp.zeros((200, 2)).at[strongest, axis].set(2e-3)
         differences.append((loss(step) - loss(-step)) / 4e-3)
-    assert float(pull.total[hardest]) == pytest.approx(float(np.hypot(*differences)), rel=0.05)
+    assert float(recorded.total[strongest]) == pytest.approx(
+        float(np.hypot(*differences)), rel=0.05
+    )
     assert int(grown.buffers.alive.sum()) > 80
-    assert float(grown.opt_state[0].views.max()) == 1  # counted anew
-    assert float(jnp.abs(grown.params.probe).max()) == 0
+    assert float(grown.opt_state[0].views.max()) == 1  # recorded anew after the refinement
+    assert float(jnp.abs(grown.params.image_offset).max()) == 0
     assert float(jax.nn.sigmoid(faded.params.opacity_logits).max()) == pytest.approx(0.01, rel=1e-3)
     assert float(jnp.abs(faded.opt_state[1][0].mu.opacity_logits).max()) == 0

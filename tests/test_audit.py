@@ -13,11 +13,11 @@ from experiments.evaluation.audit import (
     left_out_curve,
     resolved_by_photographs,
 )
-from experiments.methods.presets import pseudo_settings
+from experiments.methods import pseudo_settings
 from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_rays
-from jaxcloseup.scene import Surface
-from jaxcloseup.scenes import Scene
+from jaxcloseup.pseudo import label_sources
+from jaxcloseup.scene import Scene, Surface
 
 
 WAVELENGTH = 0.3
@@ -89,16 +89,12 @@ def test_curves_of_a_mask_that_knows_and_of_one_that_does_not():
 def test_labels_from_exact_depth_are_sorted_and_never_leak():
     cameras = [plane.camera_above(x, 0.1 * x, 4.0, tilt=0.1 * x) for x in (-1.0, 0.0, 1.0)]
     scene, depths = scene_of(cameras)
-    of_labels = {
-        "scene": scene,
-        "depths": depths,
-        "render_depth": lambda camera: striped(camera).depth,
-        "count": 3,
-    }
+    sources = label_sources(scene.train, depths)
+    of_labels = {"render_depth": lambda camera: striped(camera).depth, "count": 3}
     strict = settings().replace(rgb_tolerance=jnp.float32(0.02))
-    masked = audit_labels(jax.random.key(0), depths, settings=strict, **of_labels)
+    masked = audit_labels(jax.random.key(0), depths, scene, sources, strict, **of_labels)
     no_mask = strict.replace(use_mask=jnp.float32(0))
-    whole = audit_labels(jax.random.key(0), depths, settings=no_mask, **of_labels)
+    whole = audit_labels(jax.random.key(0), depths, scene, sources, no_mask, **of_labels)
     # Without a mask everything is kept that the source sees; the curve is of any mask.
     assert masked["kept"] < 0.5 < whole["kept"] == 1
     curve = masked["curve"]
@@ -117,11 +113,11 @@ def test_left_out_photographs_judge_labels_and_model():
         rgb, depth = (jnp.asarray(a, jnp.float32) for a in (rgb - 0.1, depth))
         return Rendering(rgb, depth, jnp.ones_like(depth))
 
-    curve = left_out_curve(views, depths, render, settings())
+    curve = left_out_curve(label_sources(views, depths), render, settings())
     np.testing.assert_allclose(curve["model"], 0.1, atol=5e-3)
     assert max(curve["error"]) < 0.02
     assert 0.3 < curve["coverage"][-1] <= 1
 
 
 def settings():
-    return pseudo_settings(TINY).replace(leave_out_source=jnp.float32(0))
+    return pseudo_settings(TINY.labels).replace(leave_out_source=jnp.float32(0))

@@ -1,4 +1,4 @@
-"""Rows of the table of bad inputs in BUILD.md that no other test has."""
+"""Bad inputs that the tests of single modules do not cover."""
 
 import json
 import pathlib
@@ -24,7 +24,7 @@ def changed(**changes):
 
 
 def holding(name, data, make=paper_capture):
-    """A capture one of whose files has this content: bytes, text or pixels."""
+    """Make a capture in which the file `name` holds `data`: bytes, text or pixels."""
 
     def write(folder):
         make(folder)
@@ -96,7 +96,7 @@ def masked(value):
 
 
 def reduced(names, height=3, data=None):
-    """With `images_2`, of which the last picture may be bytes that are none."""
+    """Make a capture with `images_2`; `data` overwrites its last image."""
 
     def make(folder):
         two(folder)
@@ -133,18 +133,24 @@ NULL_POSE = [[1, 0, 0, None], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         (split_file('{"test": [["0.png"]]}'), r"test must be a list of the frames' name"),
         (split_file(b'{"test": ["\xe9.png"]}'), r"split\.json is not readable as JSON"),
         (holding("masks/000.png", "x", two), r"masks/000\.png is not a readable image"),
-        (holding("masks/000.png", BLACK_3, two), "3 x 3 pixels and its photograph 8 x 6"),
+        (holding("masks/000.png", BLACK_3, two), "3 x 3 pixels but its photograph is 8 x 6"),
         (holding("images/000.mask.png", BLACK_3, two), r"images/000\.mask\.png is 3 x 3 pixels"),
         (holding("points3d.ply", HUGE_PLY), "ends before its 1000000000000 vertices do"),
-        (model(cameras=[]), "do not belong together"),
-        (model(points=["1 0 0 5 1 2 3 0.5 9 9"]), "do not belong together"),
+        (model(cameras=[]), "do not match each other"),
+        (model(points=["1 0 0 5 1 2 3 0.5 9 9"]), "do not match each other"),
         (without("sparse/0/points3D.txt"), r"points3D\.txt is missing"),
         (without("images"), "3 of 3 listed images do not exist"),
         (text_as_binary, r"cameras\.bin: camera \d+ has the unknown camera model"),
-        (rows(lambda values: values.astype(complex)), "holds complex128 values and not numbers"),
-        (rows(lambda values: np.array([{}], object)), "is not a whole NumPy file"),
+        (
+            rows(lambda values: values.astype(complex)),
+            "holds complex128 values instead of real num",
+        ),
+        (rows(lambda values: np.array([{}], object)), "is truncated or not a NumPy file"),
         (rows(infinite), r"row of 1\.png: height must be a finite number, got inf"),
-        (holding("images/9.png", PIXEL, llff_capture), r"has 3 poses and .*images 4 photographs"),
+        (
+            holding("images/9.png", PIXEL, llff_capture),
+            r"has 3 poses but .*images has 4 photo",
+        ),
     ],
 )
 def test_wrong_captures(tmp_path, make, message):
@@ -159,13 +165,13 @@ def test_wrong_captures(tmp_path, make, message):
 @pytest.mark.parametrize(
     ("make", "options", "message"),
     [
-        (masked(255), {"invert_masks": True}, "black is what counts, so leave out invert_masks"),
-        (masked(0), {}, "white is what counts, so invert them with invert_masks if"),
-        (two, {"alpha_mode": "mask"}, "no photograph is transparent anywhere: leave out alpha_m"),
+        (masked(255), {"invert_masks": True}, "invert_masks keeps black pixels; leave it out if"),
+        (masked(0), {}, "white pixels are kept; set invert_masks if"),
+        (two, {"alpha_mode": "mask"}, "no photograph has transparent pixels: leave out alpha_m"),
         (
             holding("images/001.png", CLEAR, two),
             {"alpha_mode": "mask"},
-            "opaque pixels are what counts, so leave out alpha_mode",
+            "only opaque pixels are kept, so leave out alpha_mode",
         ),
         (two, {"split": "zoom", "downscale": 2}, "downscale 2 times zoom 4 leaves nothing of it"),
         (reduced(["000", "001"], height=7), {"downscale": 2}, r"4 x 7 pixels, which is not 8 x 6"),
@@ -180,7 +186,7 @@ def test_wrong_options(tmp_path, make, options, message):
 
 @pytest.mark.parametrize("data", [b"", b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + bytes(17), None])
 def test_broken_png(tmp_path, data, capfd):
-    """Empty, of 0 x 0 pixels, and with a chunk whose name and checksum do not belong together."""
+    """An empty file, an image of 0 x 0 pixels, and a chunk with a wrong checksum."""
     paper_capture(tmp_path)
     path = tmp_path / "train/a.png"
     path.write_bytes(path.read_bytes().replace(b"IDAT", b"IDAX") if data is None else data)
@@ -194,10 +200,10 @@ def test_broken_png(tmp_path, data, capfd):
         (changed(), {}, None),
         (holding("train/a.png", PIXEL), {}, None),
         (reduced(["000"]), {"downscale": 2}, "lacks 1 of 2 photographs, such as 001"),
-        (lambda folder: single_file(folder, 1), {"split": "zoom"}, "1 in all, is test"),
+        (lambda folder: single_file(folder, 1), {"split": "zoom"}, "unshrunk, 1 in all"),
     ],
 )
-def test_strange_but_fine(tmp_path, make, options, note):
+def test_unusual_captures_load(tmp_path, make, options, note):
     make(tmp_path)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -206,7 +212,7 @@ def test_strange_but_fine(tmp_path, make, options, note):
     assert note is None or note in scene.metadata["notes"][-1]
 
 
-def test_a_palette_is_a_picture(tmp_path):
+def test_palette_images_load(tmp_path):
     image = pytest.importorskip("PIL.Image")
     paper_capture(tmp_path)
     picture = image.new("P", (WIDTH, HEIGHT), 1)
@@ -219,19 +225,19 @@ def test_one_photograph_in_two_lists(tmp_path):
     llff_capture(tmp_path)
     lists = {"train": ["0.png", "1.png"], "test": ["1.png"]}
     (tmp_path / "split.json").write_text(json.dumps(lists))
-    with pytest.warns(UserWarning, match=r"lists 1 photographs again: 1\.png \(train and test\)"):
+    with pytest.warns(UserWarning, match=r"lists 1 photographs more than once: 1\.png \(train and"):
         load_scene(tmp_path)
 
 
-def test_a_list_for_a_path(tmp_path):
+def test_a_list_instead_of_a_path(tmp_path):
     paper_capture(tmp_path)
     write_frames(tmp_path / "transforms_train.json", [frame("train/a.png")], ply_file_path=["a"])
     with pytest.raises(SceneError, match=r"ply_file_path \['a'\] does not exist"):
         load_scene(tmp_path)
 
 
-def test_what_may_not_be_read(tmp_path, monkeypatch):
-    """Files that their owner has shut; the permissions themselves do not hold for everybody."""
+def test_unreadable_files(tmp_path, monkeypatch):
+    """Simulate missing permissions, because root may read every file."""
     paper_capture(tmp_path)
 
     def refuse(path, *_, **__):

@@ -4,25 +4,16 @@ import zlib
 import cv2
 import numpy as np
 import pytest
-from tiny_capture import (
-    HEIGHT,
-    PROPERTIES,
-    WIDTH,
-    vertices,
-    write_image,
-    write_ply,
-)
+from tiny_capture import HEIGHT, PROPERTIES, WIDTH, vertices, write_image, write_ply
 
-from jaxcloseup.captures.bounds import near_far_from_cameras, near_far_from_points
+from jaxcloseup.captures.depth_range import near_far_from_cameras, near_far_from_points
 from jaxcloseup.captures.images import read_image
 from jaxcloseup.captures.points import read_ply_points
-from jaxcloseup.scene import (
-    PointsWarning,
-)
+from jaxcloseup.scene import PointsWarning
 from jaxcloseup.scenes import SceneError
 
 
-# Decoding
+# Decoding.
 
 
 def test_gray_deep_and_transparent_images(tmp_path):
@@ -44,7 +35,7 @@ def test_gray_deep_and_transparent_images(tmp_path):
 def test_exif_orientation_is_not_applied(tmp_path):
     write_image(tmp_path / "a.jpg")
     data = (tmp_path / "a.jpg").read_bytes()
-    tiff = b"II*\0" + struct.pack("<IHHHIII", 8, 1, 0x0112, 3, 1, 6, 0)  # turned by 90 degrees
+    tiff = b"II*\0" + struct.pack("<IHHHIII", 8, 1, 0x0112, 3, 1, 6, 0)  # rotated by 90 degrees
     app1 = b"\xff\xe1" + struct.pack(">H", 8 + len(tiff)) + b"Exif\0\0" + tiff
     (tmp_path / "a.jpg").write_bytes(data[:2] + app1 + data[2:])
     assert cv2.imread(str(tmp_path / "a.jpg")).shape == (WIDTH, HEIGHT, 3)  # the tag is well-formed
@@ -57,11 +48,11 @@ def test_truncated_images(tmp_path, suffix, keep, capfd):
     write_image(tmp_path / f"a{suffix}", np.random.default_rng(0).integers(0, 256, (64, 64, 3)))
     data = (tmp_path / f"a{suffix}").read_bytes()
     (tmp_path / f"a{suffix}").write_bytes(data[: int(len(data) * keep)])
-    with pytest.raises(SceneError, match=r"a\.(jpg|png) is not a readable image, or it is trunc"):
+    with pytest.raises(SceneError, match=r"a\.(jpg|png) is not a readable image or is trunc"):
         read_image(tmp_path / f"a{suffix}")
 
 
-def test_truncated_jpeg_with_a_whole_thumbnail(tmp_path, capfd):
+def test_truncated_jpeg_with_a_complete_thumbnail(tmp_path, capfd):
     write_image(tmp_path / "a.jpg")
     whole = (tmp_path / "a.jpg").read_bytes()
     app1 = b"\xff\xe1" + struct.pack(">H", 2 + len(whole)) + whole
@@ -83,25 +74,25 @@ def test_not_an_image(tmp_path):
         read_image(tmp_path / "b.png")
 
 
-def test_a_header_that_says_the_image_is_huge(tmp_path):
+def test_a_header_with_a_huge_image_size(tmp_path):
     write_image(tmp_path / "a.png")
     data = (tmp_path / "a.png").read_bytes()
     header = b"IHDR" + struct.pack(">II", 100_000, 100_000) + data[24:29]
     huge = data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:]
     (tmp_path / "a.png").write_bytes(huge)
-    with pytest.raises(SceneError, match=r"a\.png says that it is too large to decode"):
+    with pytest.raises(SceneError, match=r"a\.png is too large to decode"):
         read_image(tmp_path / "a.png")
 
 
 def test_cmyk_becomes_rgb(tmp_path):
-    """Cyan at full strength takes all the red away."""
+    """Full cyan removes all red."""
     image = pytest.importorskip("PIL.Image")
     image.new("CMYK", (WIDTH, HEIGHT), (255, 0, 0, 0)).save(tmp_path / "a.jpg")
     red, green, blue = read_image(tmp_path / "a.jpg")[2, 3].tolist()
     assert red < 60 and green > 150 and blue > 150
 
 
-# Points
+# Points.
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
@@ -167,8 +158,8 @@ XYZ = (
             "plain properties x, y, z",
         ),
         (XYZ.format(-1, ""), "-1 of them"),
-        (XYZ.format(1, "property float x\n") + "1 2 3 4\n", "one of its names comes twice"),
-        (XYZ.format(1, "") + "a b c\n", "has words for numbers"),
+        (XYZ.format(1, "property float x\n") + "1 2 3 4\n", "a property name appears twice"),
+        (XYZ.format(1, "") + "a b c\n", "has words instead of numbers"),
         (XYZ.format(2, "") + "1 2 3\n", "ends before its 2 vertices do"),
     ],
 )
@@ -178,7 +169,7 @@ def test_ply_errors(tmp_path, text, message):
         read_ply_points(tmp_path / "p.ply")
 
 
-# Depth range
+# Depth range.
 
 
 def look_at(position, target):
@@ -190,7 +181,7 @@ def look_at(position, target):
 
 
 def test_near_far_from_points():
-    """A ball of radius 1 seen from 4 and, close up, from 2; stray points do not count."""
+    """Cameras see a ball of radius 1 from distances 4 and 2; stray points are ignored."""
     rng = np.random.default_rng(0)
     ball = rng.normal(size=(3000, 3))
     ball /= np.linalg.norm(ball, axis=1, keepdims=True)
@@ -209,7 +200,7 @@ def test_near_far_from_cameras():
     distances = np.linalg.norm(offsets, axis=1)
     near, far = near_far_from_cameras(poses)
     np.testing.assert_allclose([near, far], [distances.min() / 10, distances.max() * 4])
-    # Parallel axes meet nowhere; diverging ones meet behind the cameras.
+    # Parallel axes do not meet; diverging ones meet behind the cameras.
     parallel = np.repeat(poses[:1], 3, 0)
     parallel[:, 0, 3] += [0, 3, 6]
     np.testing.assert_allclose(near_far_from_cameras(parallel), [0.3, 300])

@@ -1,6 +1,3 @@
-import sys
-import types
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,11 +16,8 @@ from tiny_capture import (
     write_ply,
 )
 
-from jaxcloseup.scene import (
-    DuplicateFileWarning,
-    ImageSizeWarning,
-    NearFarWarning,
-)
+from jaxcloseup import scenes
+from jaxcloseup.scene import DuplicateFileWarning, ImageSizeWarning, NearFarWarning
 from jaxcloseup.scenes import SceneError, load_scene
 
 
@@ -51,7 +45,7 @@ def test_paper_layout(capture):
 
 
 def test_opengl_pose_becomes_opencv(capture):
-    """OpenGL's identity looks along -z with y up: what is up is drawn above, near the top."""
+    """OpenGL's identity looks along -z with y up, so points above the axis land higher up."""
     scene = load_scene(capture)
     points = POSE[:3, 3] + [[0, 0, -2], [1, 0, -2], [0, 1, -2]]
     pixels, depth = reference.project(scene.train.cameras.camtoworld[0], [10, 11, 4, 3], points)
@@ -59,7 +53,7 @@ def test_opengl_pose_becomes_opencv(capture):
     np.testing.assert_allclose(pixels, [[4, 3], [9, 3], [4, 3 - 5.5]], atol=1e-6)
 
 
-def test_half_pixel_moves_what_the_file_gives(capture):
+def test_half_pixel_moves_the_given_principal_point(capture):
     scene = load_scene(capture, half_pixel=True)
     np.testing.assert_allclose(scene.train.cameras.intrinsics[0], [10, 11, 4.5, 3.5])
     scene = load_scene(capture, half_pixel=True, downscale=2)
@@ -87,7 +81,7 @@ def test_blender_layout(tmp_path):
     with pytest.warns(DuplicateFileWarning):
         scene = load_scene(tmp_path, background=0.0, half_pixel=True)
     assert scene.train.rgb[0, 0].tolist() == [[100, 50, 0]] + [[0] * 3] * 3 + [[200, 0, 0]] * 4
-    # No principal point in the file, so none to move.
+    # The file gives no principal point, so half_pixel moves none.
     np.testing.assert_allclose(scene.train.cameras.intrinsics[0], [4, 4, 4, 3], rtol=1e-6)
 
 
@@ -120,7 +114,7 @@ def test_one_photograph(tmp_path):
     assert len(scene.train) == 1 and scene.test is None and scene.test_far is None
 
 
-def test_both_kinds_of_file(capture, caplog):
+def test_separate_files_win_over_a_single_one(capture, caplog):
     single_file(capture, 3)
     with caplog.at_level("INFO", "jaxcloseup"):
         assert load_scene(capture).names["train"] == ["a", "b"]
@@ -143,7 +137,7 @@ def test_lens_fields(tmp_path, lens, expected):
     np.testing.assert_allclose(
         load_scene(tmp_path).train.cameras.intrinsics[0], expected, rtol=1e-6
     )
-    # A frame's own lens wins over the file's, in whatever fields either is written.
+    # A frame's own lens wins over the file's, whichever fields they use.
     write_json(tmp_path / "transforms.json", [{**pose, **lens}], fx=99.0, fl_x=98.0)
     np.testing.assert_allclose(
         load_scene(tmp_path).train.cameras.intrinsics[0], expected, rtol=1e-6
@@ -168,7 +162,7 @@ def test_mixed_sizes_are_padded(tmp_path):
     assert scene.metadata["sizes"]["train"] == [(8, 6), (6, 8)]
 
 
-def test_mask_weighs_pixels(capture):
+def test_masks_become_weights(capture):
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[:, :3] = 255
     write_image(capture / "masks/a.png", mask)
@@ -183,7 +177,7 @@ def test_mask_weighs_pixels(capture):
     again = load_scene(capture, downscale=2)
     np.testing.assert_array_equal(again.train.weight, scene.train.weight)
     write_image(capture / "masks/a.png", mask[:3])
-    with pytest.raises(SceneError, match=r"masks/a\.png is 8 x 3 pixels and its photograph 8 x 6"):
+    with pytest.raises(SceneError, match=r"masks/a\.png is 8 x 3 pixels but its photograph is 8"):
         load_scene(capture)
 
 
@@ -195,7 +189,7 @@ def test_downscale_averages_areas(tmp_path):
     expected = image.reshape(3, 2, 4, 2, 3).mean((1, 3))
     np.testing.assert_allclose(scene.train.rgb[0], expected, atol=0.51)
     np.testing.assert_allclose(scene.train.cameras.intrinsics[0], [5, 5.5, 2, 1.5])
-    # 8 x 6 becomes 2 x 2: each axis has its own ratio, and both edges stay edges.
+    # 8 x 6 becomes 2 x 2: each axis has its own ratio, and the image keeps its borders.
     scene = load_scene(tmp_path, downscale=3)
     assert scene.train.rgb.shape == (1, 2, 2, 3) and scene.train.cameras.width == 2
     np.testing.assert_allclose(scene.train.cameras.intrinsics[0], [2.5, 11 / 3, 1, 1], rtol=1e-6)
@@ -207,12 +201,12 @@ def test_downscale_averages_areas(tmp_path):
 def test_resized_images_rescale_intrinsics(capture):
     frames = [frame("train/a.png", w=16, h=12), frame("train/b.png", w=16, h=12)]
     write_json(capture / "transforms_train.json", frames)
-    with pytest.warns(ImageSizeWarning, match=r"train/a\.png is 8 x 6 and not 16 x 12 and 1 more"):
+    with pytest.warns(ImageSizeWarning, match=r"a\.png is 8 x 6 pixels instead of 16 x 12 \(and 1"):
         scene = load_scene(capture)
     np.testing.assert_allclose(scene.train.cameras.intrinsics[0], [5, 5.5, 2, 1.5])
 
 
-def test_strange_paths(tmp_path):
+def test_unicode_spaces_and_backslashes_in_paths(tmp_path):
     folder = tmp_path / "Büro 写真"
     write_image(folder / "train/één foto.png", value=7)
     write_json(folder / "transforms_train.json", [frame("train\\één foto.png")])
@@ -225,7 +219,7 @@ def test_names_are_unique(tmp_path):
     for name in listed:
         write_image(tmp_path / name)
     write_json(tmp_path / "transforms_train.json", [frame(name) for name in [*listed, listed[0]]])
-    with pytest.warns(DuplicateFileWarning, match=r"lists 1 photographs again: c0/x\.png"):
+    with pytest.warns(DuplicateFileWarning, match=r"lists 1 photographs more than once: c0/x\.png"):
         names = load_scene(tmp_path).names["train"]
     assert names == ["c0_x", "c1_x", "c1_x_2", "c1_x_3", "c0_x_2"]
 
@@ -246,7 +240,9 @@ def test_points_come_with_the_capture(capture):
 @pytest.mark.parametrize("given", [{"near": None, "far": None}, {"near": 0.5, "far": None}])
 def test_missing_near_far_is_estimated(capture, given):
     write_json(capture / "transforms_train.json", [frame("train/a.png")], **given)
-    with pytest.warns(NearFarWarning, match="far; from the poses, near 0\\.[15] and far 100 are"):
+    with pytest.warns(
+        NearFarWarning, match="far; estimated near 0\\.[15] and far 100 from the pos"
+    ):
         scene = load_scene(capture)
     assert 0 < scene.near < scene.far == 100
     assert given["near"] in (None, scene.near)
@@ -260,11 +256,8 @@ def test_missing_near_far_is_estimated(capture, given):
 
 
 def test_names_of_built_in_scenes(monkeypatch, tmp_path, capture):
-    built_in = types.SimpleNamespace(
-        PROCEDURAL_SCENES=("table", "room"),
-        procedural_scene=lambda name, *, downscale: (name, downscale),
-    )
-    monkeypatch.setitem(sys.modules, "jaxcloseup.procedural.loading", built_in)
+    monkeypatch.setattr(scenes, "PROCEDURAL_SCENES", ("table", "room"))
+    monkeypatch.setattr(scenes, "procedural_scene", lambda name, *, downscale: (name, downscale))
     assert load_scene("table", downscale=2) == ("table", 2)
     with pytest.raises(SceneError, match=r"tabel is neither .* choose one of table, room"):
         load_scene("tabel")
@@ -273,11 +266,11 @@ def test_names_of_built_in_scenes(monkeypatch, tmp_path, capture):
     assert load_scene(f"./{capture.name}").name == capture.name
 
 
-# A real capture
+# A real capture.
 
 
 def test_plush(shared):
-    """Points look like the photographs where the oracle draws them, and not a few pixels beside."""
+    """Points match the photographs where the oracle projects them, but not 4 pixels away."""
     scene = load_scene(shared / "data" / "plush")
     assert (len(scene.train), len(scene.test), len(scene.test_far)) == (49, 11, 7)
     assert scene.train.rgb.shape[1:] == (600, 800, 3) and scene.points.shape == (7548, 3)
@@ -295,7 +288,7 @@ def test_plush(shared):
             seen = photo[row, column] / 255
             differences[shift].append(np.abs(seen - colors[inside]).mean(1))
     medians = [np.median(np.concatenate(differences[shift])) for shift in shifts]
-    assert medians[0] < 0.08  # about half of 0.15, that of points in any other order
+    assert medians[0] < 0.08  # about half of 0.15, the median for points in random order
     assert medians[0] < 0.75 * min(medians[1:]), medians
 
 

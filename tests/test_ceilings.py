@@ -7,12 +7,12 @@ import plane
 import pytest
 from tiny_runs import TINY
 
-from experiments.methods.presets import pseudo_settings
+from experiments.methods import pseudo_settings
 from experiments.training.ceilings import CEILING_VIEWS, labels_of_less_error
 from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_rays
 from jaxcloseup.photographs import camera_at
-from jaxcloseup.scene import Surface
-from jaxcloseup.scenes import Scene
+from jaxcloseup.pseudo import label_sources
+from jaxcloseup.scene import Scene, Surface
 
 
 OFF = 1.1  # trained depth over the exact one
@@ -33,7 +33,7 @@ def test_labels_come_nearer_to_the_truth_as_depth_does():
     views, exact = plane.make_views(cameras)
     names, none = {"train": list("abc")}, np.zeros((0, 3))
     scene = Scene("plane", views, None, None, none, none, 0.5, 9.0, names, surface=surface)
-    settings = pseudo_settings(TINY).replace(
+    settings = pseudo_settings(TINY.labels).replace(
         use_mask=jnp.float32(0), depth_tolerance=jnp.float32(jnp.inf)
     )
 
@@ -43,8 +43,9 @@ def test_labels_come_nearer_to_the_truth_as_depth_does():
 
     errors = {}
     for share in (0.0, 0.5, 1.0):
-        data = jax.random.key(0), scene, OFF * exact, exact, trained, settings
-        labels = labels_of_less_error(*data, share=share)
+        sources = label_sources(views, OFF * exact)
+        key = jax.random.key(0)
+        labels = labels_of_less_error(key, scene, sources, exact, trained, settings, share=share)
         assert len(labels) == CEILING_VIEWS
         truth = jnp.stack([surface(camera_at(labels.cameras, i)).rgb for i in range(CEILING_VIEWS)])
         difference = np.abs(labels.rgb - truth).mean(axis=-1)
@@ -60,7 +61,14 @@ def test_undefined_depth_stays_undefined(share):
     scene = Scene(
         "plane", views, None, None, none, none, 0.5, 9.0, {"train": ["a"]}, surface=surface
     )
-    data = jax.random.key(0), scene, exact, exact
     nothing = jnp.zeros((CEILING_VIEWS, plane.HEIGHT, plane.WIDTH))
-    labels = labels_of_less_error(*data, lambda _: nothing, pseudo_settings(TINY), share=share)
+    labels = labels_of_less_error(
+        jax.random.key(0),
+        scene,
+        label_sources(views, exact),
+        exact,
+        lambda _: nothing,
+        pseudo_settings(TINY.labels),
+        share=share,
+    )
     np.testing.assert_array_equal(labels.weight, 0)

@@ -1,4 +1,4 @@
-"""Checkpoints: what was saved comes back, half of one never does, another run's is refused."""
+"""Checkpoints: saved states load exactly, partial ones are ignored, other runs are refused."""
 
 import contextlib
 import resource
@@ -23,7 +23,7 @@ def state(value):
     }
 
 
-def test_the_newest_state_comes_back_to_the_bit(tmp_path):
+def test_the_newest_state_loads_bit_for_bit(tmp_path):
     first = Checkpoints(tmp_path / "c", RUN)
     assert first.load("baseline", state(0)) is None
     for step in (2, 4, 6):
@@ -43,10 +43,10 @@ def test_the_newest_state_comes_back_to_the_bit(tmp_path):
     assert kept == {"4", "6"}
 
 
-def test_half_of_a_checkpoint_is_none(tmp_path):
+def test_a_partial_checkpoint_is_ignored(tmp_path):
     checkpoints = Checkpoints(tmp_path, RUN)
     checkpoints.save("baseline", 3, state(3), {})
-    # As a crash leaves it: still under the name that it is written under.
+    # A crash leaves a checkpoint under its temporary name.
     half = tmp_path / "baseline" / "5.orbax-checkpoint-tmp"
     (half / "state").mkdir(parents=True)
     (half / "state" / "data").write_bytes(b"half")
@@ -56,7 +56,7 @@ def test_half_of_a_checkpoint_is_none(tmp_path):
 
 @contextlib.contextmanager
 def room_for(size):
-    """No file can become larger than so many bytes, whatever writes it."""
+    """Limit the size of every file that the process writes to `size` bytes."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
@@ -65,7 +65,9 @@ def room_for(size):
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def test_a_full_disk_costs_the_newest_checkpoint_alone(tmp_path):
+# Orbax abandons its other writes, whose callbacks may then find a closed event loop.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_full_disk_costs_only_the_newest_checkpoint(tmp_path):
     checkpoints = Checkpoints(tmp_path, RUN)
     checkpoints.save("baseline", 3, state(3), {})
     noise = {"noise": jax.random.uniform(jax.random.key(0), (600_000,))}
@@ -78,22 +80,22 @@ def test_a_full_disk_costs_the_newest_checkpoint_alone(tmp_path):
     assert (step, int(found["step"])) == (3, 3)
 
 
-def test_another_run_is_refused_by_the_first_difference(tmp_path):
+def test_another_run_is_refused_with_the_first_difference(tmp_path):
     Checkpoints(tmp_path, RUN)
     other = RUN | {"config": {"field": {"capacity": 200}, "steps": [1, 2]}}
-    with pytest.raises(CheckpointError, match=r"whose config.field.capacity is 100 and not 200"):
+    with pytest.raises(CheckpointError, match=r"whose config.field.capacity is 100 instead of 200"):
         Checkpoints(tmp_path, other)
-    other = RUN | {"config": RUN["config"] | {"colors": None}}  # of a version that has none
-    with pytest.raises(CheckpointError, match=r"whose config.colors is absent and not None"):
+    other = RUN | {"config": RUN["config"] | {"colors": None}}  # an older version lacks this field
+    with pytest.raises(CheckpointError, match=r"whose config.colors is absent instead of None"):
         Checkpoints(tmp_path, other)
-    with pytest.raises(CheckpointError, match=r"whose seed is 0 and not 1"):
+    with pytest.raises(CheckpointError, match=r"whose seed is 0 instead of 1"):
         Checkpoints(tmp_path, RUN | {"seed": 1})
     (tmp_path / "run.json").write_text("{")
     with pytest.raises(CheckpointError, match=r"run.json cannot be read"):
         Checkpoints(tmp_path, RUN)
 
 
-def test_a_state_of_another_form_is_refused(tmp_path):
+def test_a_state_of_another_structure_is_refused(tmp_path):
     checkpoints = Checkpoints(tmp_path, RUN)
     checkpoints.save("baseline", 3, state(3), {})
     with pytest.raises(CheckpointError, match="does not hold this run's state"):

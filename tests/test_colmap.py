@@ -17,7 +17,7 @@ pycolmap = pytest.importorskip("pycolmap")
 
 
 def to_binary(model, *, rigs=True):
-    """Rewrite a text model as a binary one, as of before rigs and frames or after."""
+    """Rewrite a text model as a binary one, with or without the rigs and frames of COLMAP 3.12."""
     reconstruction = pycolmap.Reconstruction()
     reconstruction.read_text(str(model))
     for file in model.glob("*.txt"):
@@ -46,7 +46,7 @@ def test_folders(tmp_path, model, caplog):
 
 
 @pytest.mark.parametrize("rigs", [True, False])
-def test_binary_is_text(tmp_path, rigs):
+def test_binary_and_text_models_agree(tmp_path, rigs):
     colmap_capture(tmp_path)
     text = load_scene(tmp_path)
     to_binary(tmp_path / "sparse/0", rigs=rigs)
@@ -57,13 +57,13 @@ def test_binary_is_text(tmp_path, rigs):
 
 
 def test_poses_are_world_to_camera(tmp_path):
-    """A point is drawn where COLMAP's own formula, x = R X + t, puts it."""
+    """Points project to where COLMAP's own formula, x = R X + t, puts them."""
     rng = np.random.default_rng(1)
     rotation, quaternion, position = random_pose(rng)
     pose = " ".join(map(str, [*quaternion, *position]))
     write_image(tmp_path / "images/deep/a.png")
     write_model(tmp_path / "sparse/0", [image_line(7, "deep/a.png", pose), ""], points=())
-    with pytest.warns(UserWarning, match=r"images\.txt: no near and far; from the poses"):
+    with pytest.warns(UserWarning, match=r"images\.txt: no near and far; estimated .* from the"):
         scene = load_scene(tmp_path)
     inside = rng.uniform([-1, -1, 3], [1, 1, 5], (20, 3))
     pixels, depth = reference.project(
@@ -88,7 +88,7 @@ def test_poses_are_world_to_camera(tmp_path):
     ],
 )
 def test_camera_models(tmp_path, camera, lens):
-    """Lenses that bend give the same photographs as the same lens in transforms.json."""
+    """A distorted lens gives the same photographs as the same lens in transforms.json."""
     colmap_capture(tmp_path, cameras=[f"1 {camera}"])
     for i in range(3):
         ramp = np.arange(HEIGHT * WIDTH * 3, dtype=np.uint8).reshape(HEIGHT, WIDTH, 3)
@@ -126,7 +126,7 @@ def test_two_formats_in_one_folder(tmp_path):
         load_scene(tmp_path, format="nerf")
 
 
-def test_points_that_training_does_not_see_are_left_out(tmp_path):
+def test_points_that_training_does_not_see_are_dropped(tmp_path):
     for i in range(3):
         write_image(tmp_path / f"images/{i:03d}.png")
     seen = ["4 3 1 4 3 2", "4 3 1", "4 3 1 4 3 2"]  # the first photograph is held out
@@ -135,7 +135,7 @@ def test_points_that_training_does_not_see_are_left_out(tmp_path):
     write_model(tmp_path / "sparse", lines, points=points)
     scene = load_scene(tmp_path)
     np.testing.assert_allclose(scene.points, [[-2, 0.5, 5]])
-    assert "1 of 2 points, which fewer than two training photographs" in scene.metadata["notes"][-1]
+    assert "dropped 1 of 2 points, which fewer than two training" in scene.metadata["notes"][-1]
 
 
 def test_pycolmap_is_not_installed(tmp_path, monkeypatch):
@@ -145,7 +145,7 @@ def test_pycolmap_is_not_installed(tmp_path, monkeypatch):
         load_scene(tmp_path)
 
 
-# Bad input
+# Bad input.
 
 IMAGES = [image_line(1, "000.png"), "", image_line(2, "001.png"), ""]
 
@@ -155,7 +155,7 @@ IMAGES = [image_line(1, "000.png"), "", image_line(2, "001.png"), ""]
     [
         ({"cameras": ["1 FISHY 8 6 10 11 4 3"]}, r"cameras\.txt: camera 1 has the unknown.*FISHY"),
         ({"cameras": ["1 FOV 8 6 10 11 4 3 0.5"]}, r"cameras\.txt: camera 1: lens dist.*'FOV'"),
-        ({"cameras": ["1 PINHOLE 8 6 10 11 4"]}, r"cameras\.txt: line 2: PINHOLE has 4 param.*3"),
+        ({"cameras": ["1 PINHOLE 8 6 10 11 4"]}, r"cameras\.txt: line 2: PINHOLE needs 4 param.*3"),
         ({"cameras": ["1 PINHOLE 8"]}, r"cameras\.txt: line 2 ends after 3 fields"),
         (
             {"cameras": ["1 PINHOLE 8 6 -10 11 4 3"]},
@@ -163,7 +163,7 @@ IMAGES = [image_line(1, "000.png"), "", image_line(2, "001.png"), ""]
         ),
         ({"cameras": ["1 SIMPLE_PINHOLE 8 6 0 4 3"]}, r"camera 1: f must be greater than 0"),
         ({"cameras": ["1 PINHOLE 8 6 nan 11 4 3"]}, r"cameras\.txt: line 2 holds .*not finite"),
-        ({"cameras": ["1 PINHOLE x 6 10 11 4 3"]}, r"cameras\.txt: line 2 holds a word"),
+        ({"cameras": ["1 PINHOLE x 6 10 11 4 3"]}, r"cameras\.txt: line 2 holds text"),
         ({"cameras": ["1 PINHOLE 0 6 10 11 4 3"]}, "camera 1: width must be greater than 0"),
         ({"cameras": [PINHOLE.replace("8 6", "6 8")]}, "EXIF orientation"),
         ({"cameras": [PINHOLE.replace("8 6", "16 6")]}, r"8 x 6 pixels, but w and h are 16 x 6"),
@@ -171,7 +171,10 @@ IMAGES = [image_line(1, "000.png"), "", image_line(2, "001.png"), ""]
         ({"images": [image_line(1, "000.png", "nan 0 0 0 0 0 0"), ""]}, "000.png.*not finite"),
         ({"images": [image_line(1, "000.png", "1 0 0 0 inf 0 0"), ""]}, "000.png.*not finite"),
         ({"images": [image_line(1, "000.png", "0 0 0 0 1 0 0"), ""]}, "rotation is 0, 0, 0, 0"),
-        ({"images": [image_line(1, "000.png", "x 0 0 0 1 0 0"), ""]}, "line 2 holds a word"),
+        (
+            {"images": [image_line(1, "000.png", "x 0 0 0 1 0 0"), ""]},
+            "line 2 holds text",
+        ),
         ({"images": ["1 1 0 0 0"]}, r"images\.txt: line 2 ends after 5 fields"),
         ({"images": [*IMAGES[:1], "4 3"]}, r"images\.txt: line 3 holds 2 numbers"),
         (
@@ -179,7 +182,7 @@ IMAGES = [image_line(1, "000.png"), "", image_line(2, "001.png"), ""]
             r"images\.txt lists '001\.png' more than once",
         ),
         ({"images": [image_line(1, "x.png"), "", *IMAGES[2:]]}, r"1 of 2 listed .* \(x\.png\)"),
-        ({"images": [image_line(1, "000.png", camera=5), ""]}, "do not belong together"),
+        ({"images": [image_line(1, "000.png", camera=5), ""]}, "do not match each other"),
         ({"points": ["1 nan 0 5 1 2 3 0.5"]}, r"points3D\.txt: line 2 holds .*not finite"),
         ({"points": ["1 2 0 5 1"]}, r"points3D\.txt: line 2 ends after 5 fields"),
     ],
@@ -200,15 +203,15 @@ def test_truncated_binary_models(tmp_path, name):
     data = file.read_bytes()
     for kept in range(0, len(data), 5):
         file.write_bytes(data[:kept])
-        with pytest.raises(SceneError, match=rf"{name}\.bin is (truncated, it ends|empty)"):
+        with pytest.raises(SceneError, match=rf"{name}\.bin is (truncated in record|empty)"):
             load_scene(tmp_path)
     file.write_bytes(data + b"12345")
     with pytest.raises(SceneError, match=rf"{name}\.bin has 5 bytes after its"):
         load_scene(tmp_path)
     file.unlink()
-    if name in ("rigs", "frames"):  # a model may be older than they are
+    if name in ("rigs", "frames"):  # older versions of COLMAP do not write them
         return
-    reason = "is missing" if name != "cameras" else "neither"
+    reason = "is missing" if name != "cameras" else "holds no capture"
     with pytest.raises(SceneError, match=reason):
         load_scene(tmp_path)
 
@@ -229,16 +232,16 @@ def test_wrong_binary_models(tmp_path):
     (model / "images.bin").write_bytes(images)
     frames = (model / "frames.bin").read_bytes()
     (model / "frames.bin").write_bytes(frames[:12] + b"\x63" + frames[13:])
-    with pytest.raises(SceneError, match="do not belong together"):
+    with pytest.raises(SceneError, match="do not match each other"):
         load_scene(tmp_path)
 
 
-# A real capture
+# A real capture.
 
 
 def test_plush_loads_three_ways(shared, monkeypatch):
     none = np.zeros((0, 3), np.float32)
-    monkeypatch.setattr(loading, "triangulate", lambda *_: (none, none))  # takes seconds
+    monkeypatch.setattr(loading, "triangulate", lambda *_: (none, none))  # would take seconds
     folder = shared / "data" / "plush_raw"
     binary = load_scene(folder, format="colmap")
     text = load_scene(folder / "sparse_text")
@@ -267,8 +270,8 @@ def test_plush_loads_three_ways(shared, monkeypatch):
             np.testing.assert_array_equal(ours.weight, theirs.weight)
 
 
-def test_points_of_plush_are_drawn_where_they_were_measured(shared):
-    """Undistorted, the model's points fall on what the undistorted photographs show there."""
+def test_points_of_plush_project_to_where_they_were_measured(shared):
+    """The model's points match the undistorted photographs where they project."""
     scene = load_scene(shared / "data" / "plush_raw", format="colmap")
     points, colors = scene.points[::8], scene.rgb[::8]
     differences = {shift: [] for shift in [(0, 0), (4, 0), (-4, 0), (0, 4), (0, -4)]}
@@ -290,7 +293,7 @@ def test_closest_of_plush_are_nearer(shared, tmp_path):
     assert (len(scene.train), len(scene.test), len(scene.test_far)) == (76, 10, 11)
     ratios = scene.metadata["times_nearer"]
     assert len(ratios) == 10 and min(ratios) > 1.5
-    assert "10 nearest of 97 photographs are test, 1.9" in scene.metadata["notes"][1]
+    assert "test is the 10 nearest of 97 photographs, 1.9" in scene.metadata["notes"][1]
     with pytest.raises(SceneError, match=r"closest needs points.*load the COLMAP model"):
         load_scene(folder, split="closest")
     # A truncated file of the real model.
@@ -298,5 +301,5 @@ def test_closest_of_plush_are_nearer(shared, tmp_path):
     data = (folder / "sparse/0/images.bin").read_bytes()
     (tmp_path / "sparse/0").chmod(0o755)
     (tmp_path / "sparse/0/images.bin").write_bytes(data[: len(data) // 2])
-    with pytest.raises(SceneError, match=r"images\.bin is truncated, it ends in record \d+ of 97"):
+    with pytest.raises(SceneError, match=r"images\.bin is truncated in record \d+ of 97"):
         load_scene(tmp_path)

@@ -9,9 +9,9 @@ from tiny_runs import TINY
 
 from experiments import run as program
 from experiments import sweep
-from experiments.methods.presets import PRESETS
+from experiments.methods import METHODS
 from experiments.training import flags as training_flags
-from experiments.training.stages import config
+from experiments.training.settings import plain_config, settings_of
 from jaxcloseup.splats.adaptive import AdaptiveConfig
 
 
@@ -100,14 +100,16 @@ def test_a_folder_that_cannot_be_made_is_one_sentence(parsed_flags, capture_fold
 
 
 def test_flags_override_the_preset(parsed_flags):
-    given = {"preset": "paper", "closeup_steps": 7, "compute_dtype": "bfloat16"}
-    with flagsaver.flagsaver(method="nerf", **given):
+    settings = ["closeup_steps=7", "compute_dtype=bfloat16", "rgb_tolerance=0.1", "chunk=none"]
+    with flagsaver.flagsaver(method="nerf", preset="paper", set=settings, downscale=3):
         preset = training_flags.preset_from_flags()
-    assert preset.closeup_steps == 7
-    assert preset.field.compute_dtype == "bfloat16"
-    assert preset.baseline_steps == PRESETS["nerf"]["paper"].baseline_steps == 200_000
-    assert config(preset)["depth_tolerance"] == "inf"
-    json.dumps(config(preset), allow_nan=False)
+    assert preset.closeup_steps == 7 and preset.downscale == 3
+    assert preset.field.compute_dtype == "bfloat16" and preset.labels.rgb_tolerance == 0.1
+    before = METHODS["nerf"].presets["paper"]
+    assert preset.baseline_steps == before.baseline_steps == 200_000
+    assert before.labels.rgb_tolerance == 0.05
+    assert plain_config(preset)["labels"]["depth_tolerance"] == "inf"
+    json.dumps(plain_config(preset), allow_nan=False)
 
 
 def test_an_unknown_stage_is_refused(parsed_flags):
@@ -125,26 +127,50 @@ def test_a_preset_of_the_other_method_is_one_sentence(parsed_flags, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("method", "flag", "value"),
+    ("method", "text", "message"),
     [
-        ("nerf", "density", "classic"),
-        ("nerf", "color_ridge", 0.1),
-        ("nerf", "capacity", 500),
-        ("surfels", "compute_dtype", "bfloat16"),
+        ("nerf", "capacity=500", "method nerf has no setting capacity: choose one of .*, width"),
+        ("surfels", "compute_dtype=bfloat16", "method surfels has no setting compute_dtype"),
+        ("surfels", "num_rays=4", "method surfels has no setting num_rays"),
+        ("surfels", "capacity", "must be name=value"),
+        ("surfels", "capacity=many", "capacity must be a whole number between 1 and inf"),
+        ("surfels", "capacity=0", "capacity must be between 1 and inf"),
+        ("surfels", "depth=deep", "depth must be median or expected"),
+        ("surfels", "means_lr=0.1", "means_lr must be two numbers between 0 and inf"),
+        ("surfels", "color_ridge=much", "color_ridge must be a number between 0 and inf or none"),
+        ("surfels", "gated=perhaps", "gated must be true or false"),
+        ("surfels", "density=adaptive", "has no setting density: choose one of .*density.growth"),
     ],
 )
-def test_a_flag_of_the_other_method_is_one_sentence(parsed_flags, tmp_path, method, flag, value):
-    out = str(tmp_path / "out")
+def test_a_setting_that_makes_no_sense_is_one_sentence(
+    parsed_flags, tmp_path, method, text, message
+):
+    out = tmp_path / "out"
     with (
-        flagsaver.flagsaver(method=method, output_dir=out, **{flag: value}),
-        pytest.raises(SystemExit, match=f"--{flag} is for --method=(?!{method})"),
+        flagsaver.flagsaver(method=method, output_dir=str(out), set=[text]),
+        pytest.raises(SystemExit, match=f"--set={text}.*{message}") as error,
     ):
         program.main(["run"])
+    assert "\n" not in error.value.code and not out.exists()
+
+
+def test_settings_of_nested_records_have_their_path(parsed_flags):
+    settings = ["density.growth=1.2", "raster.tile=16", "capacity=300", "means_lr=0.1:0.01"]
+    with flagsaver.flagsaver(method="surfels", set=settings):
+        field = training_flags.preset_from_flags().field
+    assert (field.density.growth, field.raster.tile, field.capacity) == (1.2, 16, 300)
+    assert field.means_lr == (0.1, 0.01)
+
+
+def test_help_lists_every_setting(parsed_flags):
+    shown = flags.FLAGS["set"].help
+    for method in METHODS.values():
+        for name in settings_of(method.presets["quick"]):
+            assert name in shown
 
 
 def test_surfels_can_be_cloned_and_split(parsed_flags):
-    with flagsaver.flagsaver(method="surfels", density="classic", capacity=300, color_ridge=0.01):
+    with flagsaver.flagsaver(method="surfels", preset="quick_adaptive", set=["capacity=300"]):
         field = training_flags.preset_from_flags().field
     assert isinstance(field.density, AdaptiveConfig)
-    assert field.color_ridge == 0.01 and field.capacity == 300
-    assert field.opacity_weight == 0
+    assert field.capacity == 300 and field.opacity_weight == 0

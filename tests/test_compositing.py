@@ -19,7 +19,7 @@ def gray(density, depth, length=1.0):
 
 
 @pytest.mark.parametrize("shape", [(), (2, 3)])
-def test_against_the_loop(key, shape):
+def test_compositing_matches_the_oracle(key, shape):
     key_rgb, key_density, key_depth, key_length = jax.random.split(key, 4)
     rgb = jax.random.uniform(key_rgb, (*shape, 9, 3))
     density = jnp.maximum(3 * jax.random.normal(key_density, (*shape, 9)), 0)
@@ -41,7 +41,7 @@ def test_constant_fog_absorbs_exponentially(length):
     np.testing.assert_allclose(alpha, 1 - np.exp(-0.4 * 3 * length), rtol=1e-5)
 
 
-def test_an_opaque_wall_is_where_it_is():
+def test_an_opaque_wall_has_its_own_depth():
     depth = jnp.linspace(1.0, 2.0, 11)
     seen = gray(jnp.where(depth >= 1.45, 1e4, 0), depth)
     for value in (seen.depth, seen.expected_depth, seen.median_depth):
@@ -60,7 +60,7 @@ def test_two_slabs_share_the_light():
     np.testing.assert_allclose(seen.median_depth, 3)
 
 
-def test_nothing_is_seen_of_nothing():
+def test_empty_space_has_no_alpha_and_no_depth():
     seen = gray(jnp.zeros(4), jnp.arange(1.0, 5))
     for value in (seen.alpha, seen.depth, seen.expected_depth, seen.median_depth):
         np.testing.assert_array_equal(value, 0)

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from tiny_capture import POSE, write_image, write_json
 
-from jaxcloseup.captures.distortion import read_distortion, undistort, undistortion
+from jaxcloseup.captures.distortion import read_distortion, undistort, undistortion_map
 from jaxcloseup.scenes import load_scene
 
 
@@ -27,7 +27,7 @@ LENSES = {
 
 
 def bend(x, y, model, coefficients):
-    """Where a ray (x, y, 1) meets the image plane of a lens, in focal lengths; written out."""
+    """Distort a ray (x, y, 1) to the image plane, in focal lengths; the formulas written out."""
     k1, k2, k3, k4, k5, k6, p1, p2 = (
         coefficients.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
     )
@@ -45,7 +45,7 @@ def bend(x, y, model, coefficients):
 
 
 def straighten(u, v, model, coefficients):
-    """The ray of a bent position: the inverse of `bend`, by going back and forth."""
+    """Invert `bend` by fixed-point iteration."""
     x, y = np.zeros_like(u), np.zeros_like(v)
     for _ in range(400):
         bent_x, bent_y = bend(x, y, model, coefficients)
@@ -55,13 +55,13 @@ def straighten(u, v, model, coefficients):
 
 
 def colors(x, y):
-    """uint8 `[..., 3]` of a ray, smooth over several pixels."""
+    """Colors uint8 `[..., 3]` of rays (x, y, 1), smooth over several pixels."""
     waves = np.stack([np.sin(5 * x + 1), np.cos(6 * y - x), np.sin(4 * x * y + 3 * y)], -1)
     return np.rint(127.5 + 120 * waves).astype(np.uint8)
 
 
 def grid():
-    """Pixel centers as positions on the image plane, in focal lengths."""
+    """Pixel centers on the image plane, in focal lengths."""
     fx, fy, cx, cy = INTRINSICS
     column, row = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     return (column - cx) / fx, (row - cy) / fy
@@ -71,7 +71,7 @@ def grid():
 def test_rays_keep_their_colors(model):
     lens = LENSES[model]
     distortion = read_distortion("lens", {"camera_model": model, **lens})
-    remap = undistortion(distortion, INTRINSICS, WIDTH, HEIGHT)
+    remap = undistortion_map(distortion, INTRINSICS, WIDTH, HEIGHT)
     photograph = colors(*straighten(*grid(), model, lens))
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     image, weight = undistort(photograph, mask, remap)
@@ -87,22 +87,22 @@ def test_rays_keep_their_colors(model):
     assert well_inside.mean() > 0.6
     error = image[well_inside].astype(int) - colors(*grid())[well_inside]
     assert abs(error).max() <= 2 and abs(error).mean() < 0.5
-    # It is not that the lens bends too little to be seen.
+    # The distortion is large enough to be visible.
     assert abs(photograph.astype(int) - colors(*grid())).max() > 10
 
 
 def test_directions_beyond_the_fold_are_not_shown():
-    """r (1 - 0.5 r^2) turns back at r = sqrt(2/3); from there on the photograph comes again."""
+    """r (1 - 0.5 r^2) peaks at r = sqrt(2/3); beyond it, the photograph would repeat."""
     distortion = read_distortion("lens", {"k1": -0.5})
-    remap = undistortion(distortion, (20.0, 20.0, 30.0, 22.0), WIDTH, HEIGHT)
+    remap = undistortion_map(distortion, (20.0, 20.0, 30.0, 22.0), WIDTH, HEIGHT)
     column, row = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     radius = np.hypot(column - 30, row - 22) / 20
     np.testing.assert_array_equal(remap.inside, radius < np.sqrt(2 / 3))
 
 
-def test_masks_are_bent_with_their_photographs():
+def test_masks_are_undistorted_with_their_photographs():
     distortion = read_distortion("lens", {"camera_model": "RADIAL", **LENSES["RADIAL"]})
-    remap = undistortion(distortion, INTRINSICS, WIDTH, HEIGHT)
+    remap = undistortion_map(distortion, INTRINSICS, WIDTH, HEIGHT)
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[:, 40:] = 255
     weight = undistort(np.zeros((HEIGHT, WIDTH, 3), np.uint8), mask, remap)[1]
@@ -113,12 +113,12 @@ def test_masks_are_bent_with_their_photographs():
 @pytest.mark.parametrize(
     "lens", [{}, {"camera_model": "OPENCV", "k1": 0.0, "p2": 0}, {"camera_model": "PINHOLE"}]
 )
-def test_a_pinhole_is_left_alone(lens):
+def test_a_pinhole_has_no_distortion(lens):
     assert read_distortion("lens", lens) is None
 
 
-def test_transforms_with_a_bent_lens(tmp_path):
-    """Loaded, photographs are those of a pinhole with the file's own focal lengths and center."""
+def test_transforms_with_a_distorted_lens(tmp_path):
+    """Loading gives pinhole photographs with the file's focal lengths and principal point."""
     fx, fy, cx, cy = INTRINSICS
     lens = LENSES["OPENCV"]
     write_image(tmp_path / "a.png", colors(*straighten(*grid(), "OPENCV", lens)))
@@ -131,11 +131,11 @@ def test_transforms_with_a_bent_lens(tmp_path):
     assert set(np.unique(weight)) <= {0.0, 1.0} and weight.mean() > 0.8
     inner = np.s_[8:-8, 8:-8]
     assert abs(rgb.astype(int) - colors(*grid()))[inner].max() <= 2
-    # Integer pixel centers in the file mean a principal point half a pixel further.
+    # With integer pixel centers in the file, the principal point lies half a pixel further.
     about |= {"cx": cx - 0.5, "cy": cy - 0.5}
     write_json(tmp_path / "transforms.json", [{**pose, **about, **lens}])
     shifted = load_scene(tmp_path, half_pixel=True)
     np.testing.assert_array_equal(shifted.train.rgb[0], rgb)
-    # An instant-ngp file calls a fisheye by a flag.
+    # instant-ngp's files mark a fisheye with a flag.
     write_json(tmp_path / "transforms.json", [{**pose, **about, "is_fisheye": True}])
     assert not np.array_equal(load_scene(tmp_path).train.rgb[0], rgb)

@@ -6,7 +6,7 @@ from jaxcloseup.volume.encodings import positional_encoding
 
 
 @pytest.mark.parametrize("shape", [(3, 7), (2, 1)])
-def test_encoding_is_numpys(key, shape):
+def test_encoding_matches_numpy(key, shape):
     x = jax.random.uniform(key, shape, minval=-1, maxval=1)
     wide = np.asarray(x, np.float64)
     parts = [wide]
@@ -19,6 +19,6 @@ def test_encoding_is_numpys(key, shape):
     np.testing.assert_allclose(ours[:low], np.concatenate(parts)[:low], atol=5e-7)
 
 
-def test_no_octaves_is_the_input(key):
+def test_zero_octaves_return_the_input(key):
     x = jax.random.normal(key, (3, 2))
     np.testing.assert_array_equal(positional_encoding(x, 0), x)

@@ -1,4 +1,4 @@
-"""Surfels as 3-D Gaussians, against the definition of a covariance."""
+"""Surfels converted to 3-D Gaussians, against the definition of a covariance."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +8,7 @@ from splat_scenes import random_scene, to_surfels
 from jaxcloseup.artifacts.gaussians import as_gaussians
 
 
-def test_covariances_are_those_of_thin_ellipsoids():
+def test_covariances_match_thin_ellipsoids():
     scene = random_scene(2)
     found = as_gaussians(to_surfels(scene), jnp.ones(16, bool))
     for i in range(16):
@@ -20,14 +20,14 @@ def test_covariances_are_those_of_thin_ellipsoids():
     np.testing.assert_allclose(found.opacities, 1 / (1 + np.exp(-scene["opacity_logits"])), 1e-5)
 
 
-def test_colors_are_the_constant_ones_in_range():
+def test_colors_are_the_clipped_constant_ones():
     surfels = to_surfels(random_scene(3))
     sh = jnp.zeros((16, 4, 3)).at[:, 1:].set(9.0).at[:, 0].set(jnp.array([-9.0, 0.0, 9.0]))
     found = as_gaussians(surfels.replace(sh=sh), jnp.ones(16, bool))
     np.testing.assert_allclose(found.rgb, [[0, 0.5, 1]] * 16, atol=1e-6)
 
 
-def test_only_living_and_finite_ones_are_kept():
+def test_only_alive_and_finite_surfels_are_kept():
     surfels = to_surfels(random_scene(4))
     broken = surfels.replace(log_scales=surfels.log_scales.at[1, 0].set(jnp.nan))
     found = as_gaussians(broken, jnp.arange(16) != 0)

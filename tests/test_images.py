@@ -35,7 +35,7 @@ def test_to_uint8():
     np.testing.assert_array_equal(to_uint8(values), np.stack([expected] * 3, -1))
     np.testing.assert_array_equal(to_uint8(jnp.asarray(values)), to_uint8(values))
     assert to_uint8(np.full((2, 2, 3), np.inf)).tolist() == [[[255] * 3] * 2] * 2
-    with pytest.raises(ValueError, match=r"this one is \(2, 3, 4\)"):
+    with pytest.raises(ValueError, match=r"got \(2, 3, 4\)"):
         to_uint8(np.zeros((2, 3, 4)))
 
 
@@ -43,7 +43,7 @@ def test_write_png(tmp_path, image):
     path = tmp_path / "new" / "folder é" / "a.png"
     write_png(path, image)
     loaded = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)[..., ::-1]
-    # What is read back is what the metrics were computed on.
+    # The file holds the same values as the metrics see.
     np.testing.assert_array_equal(loaded, np.rint(np.asarray(quantize(jnp.asarray(image))) * 255))
     write_png(path, np.full((2, 3, 3), 7, np.uint8))
     assert cv2.imdecode(np.fromfile(path, np.uint8), -1).shape == (2, 3, 3)
@@ -84,8 +84,8 @@ def test_colorize_depth():
     valid[1, 3] = False
     colors = colorize_depth(depth, near=1, far=4, valid=valid)
     assert colors.dtype == np.uint8 and colors.shape == (2, 4, 3)
-    # Turbo: dark red, then green to the blue side of the middle (1/2 is a third of [1/4, 1]), then
-    # dark blue; nothing is black.
+    # Turbo runs from dark red through green (1/2 is at a third of [1/4, 1]) to dark blue; invalid
+    # pixels are black.
     red, green, blue = colors[0, :3].astype(int).T
     assert red[0] > 100 > green[0] and blue[0] < 20
     assert green[1] > 200 > red[1]
@@ -109,7 +109,7 @@ def test_colorize_depth_is_robust():
 def test_colorize_error():
     error = np.linspace(0, 0.5, 9)[None]
     colors = colorize_error(error).astype(int)
-    assert (np.diff(colors.sum(-1)[0, :5]) > 0).all()  # brighter with error, to 0.25
+    assert (np.diff(colors.sum(-1)[0, :5]) > 0).all()  # brighter up to an error of 0.25
     assert (colors[0, 4:] == colors[0, 4]).all() and colors[0, 0].sum() < 10
     np.testing.assert_array_equal(colorize_error(-error), colors)
     np.testing.assert_array_equal(colorize_error(np.repeat(error[..., None], 3, -1)), colors)
@@ -143,7 +143,7 @@ def test_colorize_normals():
     np.testing.assert_allclose(colorize_normals(normal)[0].astype(int), expected, atol=1)
 
 
-def test_support_is_drawn_in_steps_with_unseen_pixels_apart():
+def test_support_is_drawn_in_steps_with_unseen_pixels_in_magenta():
     footprint = np.array([[0.5, 1, 1.5, 2, 3.9, 8, 9, 100, np.inf]])
     count = np.array([[12, 9, 8, 4, 3, 2, 1, 1, 0]])
     picture = colorize_support(count, footprint)
@@ -157,6 +157,6 @@ def test_support_is_drawn_in_steps_with_unseen_pixels_apart():
         assert [colors[group] for group in groups] == row.tolist()
         steps = [sum(colors[group]) for group in "abcde"]
         assert steps == sorted(steps, reverse=True) and len(set(steps)) == 5
-    # The legend shows the same colors, in the same order.
+    # The legend shows the same colors in the same order.
     legend = picture[-12, 8:360:60].tolist()
     assert legend == [sharp[i].tolist() for i in (0, 2, 4, 5, 6, 8)]

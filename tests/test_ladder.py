@@ -8,14 +8,8 @@ import numpy as np
 import plane
 import pytest
 
-from experiments.evaluation.ladder import (
-    MAGNIFICATIONS,
-    gains_over,
-    ladder_in_short,
-    ladder_targets,
-    zoom_curves,
-)
-from experiments.reporting.plots import Curve, line_plot
+from experiments.evaluation.ladder import MAGNIFICATIONS, ladder_in_short, ladder_targets
+from experiments.reporting.plots import Curve, gains_over, line_plot, zoom_curves
 from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_rays
 from jaxcloseup.scene import Surface
 from jaxcloseup.scenes import Scene

@@ -1,13 +1,15 @@
-"""Imports point one way only: geometry knows nothing, the experiments know everything."""
+"""Imports point one way only, modules stay short, and only methods know types of fields."""
 
 import ast
 import pathlib
+import re
 
 import pytest
 
 
 ROOT = pathlib.Path(__file__).parents[1]
-PACKAGE = ROOT / "jaxcloseup"
+PACKAGE, EXPERIMENTS = ROOT / "jaxcloseup", ROOT / "experiments"
+MODULES = sorted([*PACKAGE.rglob("*.py"), *EXPERIMENTS.rglob("*.py")])
 MAY_IMPORT = {
     "version": set(),
     "files": set(),
@@ -19,19 +21,39 @@ MAY_IMPORT = {
     "photographs": {"geometry"},
     "scene": {"geometry", "photographs"},
     "rendered_loss": {"numerics", "field", "photographs"},
+    "label_rules": {"field", "photographs"},
     "metrics": {"numerics"},
     "lpips": {"numerics", "torch_file"},
     "volume": {"numerics", "geometry", "field"},
     "splats": {"numerics", "geometry", "field", "metrics"},
     "pseudo": {"numerics", "geometry", "field", "photographs"},
     "support": {"numerics", "geometry", "photographs"},
-    "train": {"numerics", "geometry", "field", "photographs", "pseudo", "rendered_loss"},
+    "train": {
+        *("numerics", "geometry", "field", "photographs"),
+        *("pseudo", "label_rules", "rendered_loss"),
+    },
     "captures": {"files", "ply", "numerics", "geometry", "photographs", "scene"},
     "procedural": {"files", "numerics", "geometry", "photographs", "scene"},
     "scenes": {"captures", "procedural", "scene"},
     "artifacts": {"files", "ply", "numerics", "geometry", "photographs", "splats"},
 }
+# The rooms of `experiments`, and which others each may use; programs at the top may use all.
+ROOMS = {
+    "methods": set(),
+    "evaluation": {"methods"},
+    "training": {"methods", "evaluation", "command_line"},
+    "reporting": {"methods", "evaluation", "training"},
+    "viewing": {"methods", "evaluation", "training"},
+    "benchmarks": {"methods", "evaluation", "training", "reporting"},
+    "command_line": set(),
+}
 LIBRARIES_OF_GEOMETRY = {"jax", "chex", "flax", "typing", "jaxcloseup"}
+LONGEST_MODULE, LONGEST_FUNCTION, MOST_PROGRAMS = 400, 80, 8
+# What tells one type of field from another.
+FIELD_TYPES = re.compile(
+    r"isinstance\([^)]*(Surfel|Nerf|Mcmc|Adaptive|Buffers|Aux)"
+    r"|aux, [\"']|\.aux\.|buffers\.(?!shape)\w+|hasattr\([^)]*(params|buffers|aux)"
+)
 
 
 def imported(path):
@@ -42,17 +64,55 @@ def imported(path):
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
             yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
 @pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda p: str(p.name))
-def test_imports_point_one_way(path):
+def test_imports_of_the_library_point_one_way(path):
     layer = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
     if layer == "__init__":
         return
     for name in imported(path):
         first, *rest = name.split(".")
         assert first not in ("absl", "experiments"), f"{path} imports {name}"
-        if first == "jaxcloseup":
+        if first == "jaxcloseup" and rest:
             assert rest[0] in MAY_IMPORT[layer] | {layer}, f"{path} imports {name}"
         if layer == "geometry":
             assert first in LIBRARIES_OF_GEOMETRY, f"{path} imports {name}"
+
+
+@pytest.mark.parametrize("path", sorted(EXPERIMENTS.rglob("*.py")), ids=lambda p: str(p.name))
+def test_imports_of_the_experiments_point_one_way(path):
+    room = path.relative_to(EXPERIMENTS).parts[0].removesuffix(".py")
+    if room not in ROOMS:
+        return
+    for name in imported(path):
+        first, *rest = name.split(".")
+        if first == "experiments" and rest:
+            assert rest[0] in ROOMS[room] | {room}, f"{path} imports {name}"
+        if room == "training":
+            assert first != "matplotlib", f"{path} plots"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.name))
+def test_only_methods_and_their_fields_know_types_of_fields(path):
+    room = path.relative_to(ROOT).parts[1]
+    if room in ("volume", "splats", "methods", "benchmarks"):
+        return
+    found = FIELD_TYPES.findall(path.read_text(encoding="utf-8"))
+    assert not found, f"{path} asks what type a field is: {found}"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.name))
+def test_modules_and_functions_stay_short(path):
+    text = path.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= LONGEST_MODULE
+    if path.is_relative_to(EXPERIMENTS):
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                lines = node.end_lineno - node.lineno + 1
+                assert lines < LONGEST_FUNCTION, f"{path}: {node.name} has {lines} lines"
+
+
+def test_programs_stay_few():
+    assert len(list(EXPERIMENTS.glob("*.py"))) <= MOST_PROGRAMS

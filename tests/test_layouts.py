@@ -1,4 +1,4 @@
-"""The layouts of Blender's datasets and of the paper's: colors meet the rays of loaded cameras."""
+"""The layouts of Blender's and the paper's datasets: photographs match the loaded cameras' rays."""
 
 import warnings
 
@@ -12,13 +12,13 @@ from jaxcloseup.scenes import load_scene
 
 
 def differences(views):
-    """The greatest difference, in levels, of each photograph from what its camera should see."""
+    """Largest difference, in levels of 0 to 255, of each photograph from its expected colors."""
     expected = [seen(views.cameras, i) for i in range(len(views))]
     return np.abs(np.asarray(views.rgb) - expected).max((1, 2, 3))
 
 
 def test_blender(tmp_path):
-    """An angle of view, no suffixes, transparency; depth and normals lie beside, unlisted."""
+    """Blender's files have an angle of view, no suffixes, alpha, and unlisted depth images."""
     angle = 0.9
     focal = SIZE[0] / 2 / np.tan(angle / 2)
     lens = {"fx": focal, "fy": focal, "cx": SIZE[0] / 2, "cy": SIZE[1] / 2}
@@ -46,7 +46,7 @@ def test_blender(tmp_path):
 
 
 def test_the_paper(tmp_path):
-    """Whole numbers are pixels' centers, each frame has a lens, and a video has no photographs."""
+    """The paper's files have integer pixel centers, a lens per frame, and an ignored video file."""
     for count, split in ((3, "train"), (2, "test")):
         frames = []
         for i in range(count):
@@ -61,4 +61,4 @@ def test_the_paper(tmp_path):
         scene = load_scene(tmp_path, half_pixel=True)
     assert (scene.near, scene.far, scene.test_far) == (1.0, 9.0, None)
     assert (differences(scene.train) < 1.2).all() and (differences(scene.test) < 1.2).all()
-    assert (differences(load_scene(tmp_path).test) > 4).all()  # half a pixel away
+    assert (differences(load_scene(tmp_path).test) > 4).all()  # half a pixel off

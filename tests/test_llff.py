@@ -19,7 +19,7 @@ def test_known_cameras(capture):
     np.testing.assert_allclose(scene.train.cameras.camtoworld, poses[1:], atol=1e-6)
     np.testing.assert_allclose(scene.train.cameras.intrinsics, [[9, 9, 4, 3]] * 2)
     np.testing.assert_allclose([scene.near, scene.far], [0.9 * 1.8, 22])
-    # Something ahead, right of the axis and below it, is drawn right of the middle and below it.
+    # A point ahead, right of the axis and below it, projects right of the center and below it.
     point = poses[1] @ [1, 0.5, 3, 1]
     pixel, depth = reference.project(scene.train.cameras.camtoworld[0], [9, 9, 4, 3], point[None])
     np.testing.assert_allclose(pixel[0], [7, 4.5], atol=1e-5)
@@ -34,11 +34,11 @@ def change(rows, column, value):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda rows: rows[:, :15], "holds 3 x 15: it must be N x 17"),
-        (lambda rows: rows[0], "holds 17: it must be N x 17"),
-        (lambda rows: rows[:0], "holds 0 x 17: it must be N x 17"),
-        (lambda rows: rows[:2], r"has 2 poses and .*images 3 photographs"),
-        (lambda rows: rows.astype(str), "not numbers"),
+        (lambda rows: rows[:, :15], "has shape 3 x 15 instead of N x 17"),
+        (lambda rows: rows[0], "has shape 17 instead of N x 17"),
+        (lambda rows: rows[:0], "has shape 0 x 17 instead of N x 17"),
+        (lambda rows: rows[:2], r"has 2 poses but .*images has 3 photographs"),
+        (lambda rows: rows.astype(str), "instead of real numbers"),
         (lambda rows: change(rows, 3, np.nan), r"row of 1\.png: pose holds a value .* not finite"),
         (lambda rows: change(rows, 0, 5.0), r"row of 1\.png: pose is not rigid"),
         (lambda rows: change(rows, 14, -9.0), r"1\.png: focal length must be greater than 0"),
@@ -59,12 +59,12 @@ def test_wrong_rows(capture, make, message):
 def test_not_a_numpy_file(capture, data):
     whole = (capture / "poses_bounds.npy").read_bytes()
     (capture / "poses_bounds.npy").write_bytes(whole[:-9] if data is None else data)
-    with pytest.raises(SceneError, match=r"poses_bounds\.npy is not a whole NumPy file"):
+    with pytest.raises(SceneError, match=r"poses_bounds\.npy is truncated or not a NumPy file"):
         load_scene(capture)
 
 
-def test_hidden_files_are_no_photographs(capture):
-    (capture / "images/._0.png").write_bytes(b"what macOS keeps about a file")
+def test_hidden_files_are_not_photographs(capture):
+    (capture / "images/._0.png").write_bytes(b"metadata of macOS")
     assert len(load_scene(capture).train) == 2
 
 

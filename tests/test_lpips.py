@@ -1,4 +1,4 @@
-"""LPIPS against values of the reference implementation, and weights as PyTorch writes them."""
+"""LPIPS against the reference implementation, and weights as PyTorch writes them."""
 
 import json
 import pathlib
@@ -19,7 +19,7 @@ GOLDEN = pathlib.Path(__file__).parents[2] / "shared" / "golden" / "lpips_golden
 
 @pytest.fixture(scope="module")
 def random_weights():
-    """Weights of both backbones as the golden values were made with."""
+    """Weights of both backbones, drawn as they were for the golden values."""
 
     def draw(backbone):
         rng = np.random.default_rng(20250315)
@@ -51,7 +51,7 @@ def test_equals_the_reference_implementation(random_weights, backbone):
         assert abs(float(found) - row["lpips"]) < 1e-4
 
 
-def test_batches_are_their_images_one_by_one(random_weights):
+def test_a_batch_equals_its_images_one_by_one(random_weights):
     rng = np.random.default_rng(0)
     a, b = (
         jnp.stack(images)
@@ -65,8 +65,8 @@ def test_batches_are_their_images_one_by_one(random_weights):
     np.testing.assert_array_equal(lpips(weights, a, a), 0)
 
 
-def test_gradients_are_finite_where_no_feature_is(random_weights):
-    """Far below every bias all rectified features are 0."""
+def test_gradients_are_finite_where_all_features_are_zero(random_weights):
+    """Biases far below 0 make all features 0."""
     weights = random_weights["alex"]
     kernel, bias = weights.convolutions[0]
     dead = weights.replace(convolutions=((kernel, bias - 1e3), *weights.convolutions[1:]))
@@ -94,7 +94,7 @@ def test_tensors_are_read_as_pytorch_wrote_them(name):
 
 
 @pytest.mark.parametrize("name", ["tensors_zip.pth", "tensors_legacy.pth"])
-def test_cut_files_are_refused(tmp_path, name):
+def test_truncated_files_are_refused(tmp_path, name):
     data = (DATA / name).read_bytes()
     for size in (0, 10, len(data) // 2, len(data) - 8):
         path = tmp_path / "cut.pth"
@@ -103,7 +103,7 @@ def test_cut_files_are_refused(tmp_path, name):
             read_tensors(path)
 
 
-def test_a_file_runs_no_code(tmp_path):
+def test_a_file_cannot_run_code(tmp_path):
     path = tmp_path / "evil.pth"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("evil/data.pkl", b"cos\nsystem\n(S'true'\ntR.")
@@ -111,7 +111,7 @@ def test_a_file_runs_no_code(tmp_path):
         read_tensors(path)
 
 
-def test_what_is_missing_is_named(tmp_path, monkeypatch):
+def test_errors_name_the_file_that_is_missing(tmp_path, monkeypatch):
     with pytest.raises(LpipsError, match=r"vgg16-\*\.pth"):
         load_lpips("vgg", tmp_path)
     monkeypatch.setenv("JAXCLOSEUP_LPIPS", str(tmp_path))

@@ -10,6 +10,7 @@ from absl.testing import flagsaver
 from experiments import sweep
 from experiments.training import manifest
 from experiments.training.manifest import about_scene, git_commit, hash_data
+from experiments.training.sweep import SweepOutcome
 from jaxcloseup.scenes import load_scene
 
 
@@ -94,7 +95,7 @@ def test_a_sweep_leaves_a_manifest(capture_folder, tmp_path, monkeypatch):
     def stub(scene, preset, arms, seeds, folder, *, seconds, **options):
         begun.update(json.loads((tmp_path / "out" / "manifest.json").read_text()))
         seconds["baseline_0"] = 1.5
-        return {}, []
+        return SweepOutcome({}, {}, {})
 
     monkeypatch.setattr(sweep, "run_sweep", stub)
     monkeypatch.setattr(sweep, "write_sweep", lambda *_: None)

@@ -16,7 +16,7 @@ def single(folder):
 
 
 def weights(scene):
-    """Mean weight of each photograph by its name, of all splits."""
+    """Mean weight of each photograph in all splits, by name."""
     found = {}
     for split, names in scene.names.items():
         views = getattr(scene, split)
@@ -45,7 +45,7 @@ def test_some_masks_are_noted(tmp_path, caplog):
     with caplog.at_level("INFO", "jaxcloseup"):
         scene = load_scene(tmp_path)
     assert weights(scene) == pytest.approx({"000": 1, "001": 3 / 8, "002": 1})
-    assert f"{tmp_path.name}: 1 of 3 photographs have a mask; the others are kept whole" in (
+    assert f"{tmp_path.name}: 1 of 3 photographs have a mask; the others are used whole" in (
         caplog.messages
     )
 
@@ -54,9 +54,9 @@ def test_no_mask_fits(tmp_path):
     single_file(tmp_path, 3)
     (tmp_path / "masks").mkdir()
     expected = (
-        r"masks holds no mask of any of the 3 photographs: for \d+\.png neither \d+\.png\.png"
+        r"masks holds no mask for any of the 3 photographs: for \d+\.png, name the mask \d+\.png"
     )
-    with pytest.raises(SceneError, match=expected + r" nor \d+\.mask\.png nor \d+ with a pict"):
+    with pytest.raises(SceneError, match=expected + r"\.png, \d+\.mask\.png or \d+ with an image"):
         load_scene(tmp_path)
     write_image(tmp_path / "masks/mask_001.png", HALF)
     with pytest.raises(SceneError, match=expected):
@@ -72,13 +72,13 @@ def test_folders_of_photographs_have_folders_of_masks(tmp_path):
     np.testing.assert_allclose(scene.test.weight.mean(), 1)
     write_image(tmp_path / "masks/a.png", HALF)
     (tmp_path / "masks/train/a.png").unlink()
-    with pytest.raises(SceneError, match=r"masks/a\.png may be the mask of .*train/a\.png and of"):
+    with pytest.raises(SceneError, match=r"masks/a\.png matches both .*train/a\.png and .*test/a"):
         load_scene(tmp_path)
 
 
 @pytest.mark.parametrize("beside", ["ngp/masks", "masks"])
 def test_photographs_outside_the_folder(tmp_path, beside):
-    """A photograph is not taken for its own mask."""
+    """A photograph is not used as its own mask."""
     write_image(tmp_path / "images/a.png")
     pose = {"file_path": "../images/a.png", "transform_matrix": POSE.tolist(), "fl_x": 9.0}
     write_json(tmp_path / "ngp/transforms.json", [pose])
@@ -86,8 +86,8 @@ def test_photographs_outside_the_folder(tmp_path, beside):
     assert weights(load_scene(tmp_path / "ngp"))["a"] == pytest.approx(3 / 8)
 
 
-def test_a_mask_is_bent_with_its_photograph(tmp_path):
-    """A mask beside the photographs weighs what the same one named by its frame does."""
+def test_a_mask_is_undistorted_with_its_photograph(tmp_path):
+    """A mask found by name gives the same weights as one that the frame names."""
     lens = {"fl_x": 30.0, "cx": 24.0, "cy": 20.0, "w": 48, "h": 40, "k1": -0.2, "p1": 0.01}
     mask = np.zeros((40, 48), np.uint8)
     mask[5:30, 10:40] = 255
@@ -113,7 +113,7 @@ def test_masks_that_leave_nothing(tmp_path):
 @pytest.mark.parametrize("make", [single, llff_capture, colmap_capture])
 @pytest.mark.parametrize("name", ["{0.name}.png", "{0.stem}.mask.png"])
 def test_masks_beside_photographs(tmp_path, make, name):
-    """They are no photographs themselves."""
+    """Masks beside photographs are not loaded as photographs."""
     if make is colmap_capture:
         pytest.importorskip("pycolmap")
     make(tmp_path)
@@ -123,11 +123,11 @@ def test_masks_beside_photographs(tmp_path, make, name):
     assert "3 of 3 photographs have a mask" in scene.metadata["notes"][-1]
     np.testing.assert_allclose(list(weights(scene).values()), 3 / 8)
     write_image(tmp_path / "masks/unlike.png", HALF)
-    with pytest.raises(SceneError, match="masks holds no mask of any of the 3 photographs"):
+    with pytest.raises(SceneError, match="masks holds no mask for any of the 3 photographs"):
         load_scene(tmp_path)
 
 
-def test_what_is_listed_is_no_mask(tmp_path):
+def test_a_listed_photograph_is_not_a_mask(tmp_path):
     names = ["a.png", "a.png.png", "b.mask.png"]
     for name in names:
         write_image(tmp_path / "images" / name, HALF)
@@ -140,7 +140,7 @@ def test_what_is_listed_is_no_mask(tmp_path):
     assert len(scene.train) == 3 and (np.asarray(scene.train.weight) == 1).all()
 
 
-def test_a_mask_of_nothing_is_a_photograph(tmp_path):
+def test_a_mask_without_a_photograph_is_a_photograph(tmp_path):
     llff_capture(tmp_path)
     (tmp_path / "images/1.png").rename(tmp_path / "images/1.mask.png")
     scene = load_scene(tmp_path, downscale=1)
@@ -155,20 +155,20 @@ def test_inverted_masks(tmp_path):
     write_image(tmp_path / "masks/train/a.png", HALF)
     scene = load_scene(tmp_path, invert_masks=True)
     np.testing.assert_array_equal(scene.train.weight[0], 1 - np.asarray(HALF) / 255)
-    assert (np.asarray(scene.train.weight[1]) == 1).all()  # without a mask nothing is inverted
+    assert (np.asarray(scene.train.weight[1]) == 1).all()  # photographs without a mask stay whole
     for name in "ab":
         write_image(tmp_path / f"masks/train/{name}.png", np.full_like(HALF, 255))
-    with pytest.raises(SceneError, match="black is what counts, so leave out invert_masks if"):
+    with pytest.raises(SceneError, match="invert_masks keeps black pixels; leave it out if"):
         load_scene(tmp_path, invert_masks=True)
 
 
 def test_alpha_as_a_mask(tmp_path):
-    """Colors are the file's own, and what is transparent colors nothing when it shrinks."""
+    """Colors are the file's own, and transparent pixels do not bleed when the image shrinks."""
     image = np.full((HEIGHT, WIDTH, 4), [200, 100, 50, 255], np.uint8)
     image[:, 3:, :3], image[:, 3:, 3] = 7, 0
     image[0, 0, 3] = 128
     single_file(tmp_path, 1)
-    with pytest.raises(SceneError, match="no photograph is transparent anywhere: leave out alpha"):
+    with pytest.raises(SceneError, match="no photograph has transparent pixels: leave out alpha"):
         load_scene(tmp_path, alpha_mode="mask")
     write_image(tmp_path / "images/000.png", image)
     scene = load_scene(tmp_path, alpha_mode="mask")

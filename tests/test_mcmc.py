@@ -1,4 +1,4 @@
-"""Surfels that move: what is conserved, what is forgotten, what keeps still."""
+"""MCMC density control: copies keep the light, dead surfels move, noise stays in the plane."""
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +8,7 @@ from reference_splats import rotation_of
 from splat_scenes import COUNT, HEIGHT, NEAR, WIDTH, random_scene, render, to_camera, to_surfels
 
 from jaxcloseup.splats import RasterizeConfig
-from jaxcloseup.splats.mcmc import McmcConfig, relocate, split_opacity, wander
+from jaxcloseup.splats.mcmc import McmcConfig, add_position_noise, relocate, split_opacity
 
 
 CONFIG = McmcConfig(growth=1.5)
@@ -21,10 +21,10 @@ def logit(opacity):
 
 @pytest.mark.parametrize("opacity", [0.02, 0.5, 0.9])
 @pytest.mark.parametrize("copies", [1, 2, 3, 10, 51])
-def test_copies_take_as_much_light_as_the_original(opacity, copies):
+def test_copies_absorb_as_much_light_as_the_original(opacity, copies):
     each, smaller = split_opacity(jnp.array([opacity]), jnp.array([copies]))
     each, smaller = float(each[0]), float(smaller[0])
-    # Of n discs on top of each other at distance r, integrated over their plane.
+    # Light that n coincident discs absorb at distance r, integrated over their plane.
     radius = np.linspace(0, 10, 20_001)
     through = (1 - each * np.exp(-0.5 * (radius / smaller) ** 2)) ** copies
     taken = np.trapezoid((1 - through) * 2 * np.pi * radius, radius)
@@ -38,14 +38,14 @@ def scene_with_dead(dead):
     return to_surfels(scene)
 
 
-def test_the_dead_join_the_living(key):
+def test_dead_surfels_join_living_ones(key):
     before = scene_with_dead([0, 5, 6])
     alive = jnp.arange(COUNT) < 10
     after, now_alive, changed = move(key, before, alive, config=CONFIG)
-    assert now_alive.sum() == 15  # half as many more
+    assert now_alive.sum() == 15  # growth by one half
     opacity = jax.nn.sigmoid(after.opacity_logits)
     assert np.all(opacity[now_alive] > CONFIG.min_opacity)
-    # Everyone stands where someone living stood.
+    # Every surfel now has the position of a surfel that was alive before.
     living = [i for i in range(10) if i not in (0, 5, 6)]
     source = [
         [i for i in living if np.array_equal(before.means[i], mean)]
@@ -65,7 +65,7 @@ def test_the_dead_join_the_living(key):
         assert bool(changed[row]) == (n > 1)
 
 
-def test_a_few_grow_too(key):
+def test_tiny_counts_grow_by_one(key):
     alive = jnp.arange(COUNT) < 2
     _, now, _ = move(key, scene_with_dead([]), alive, config=McmcConfig(growth=1.1))
     assert now.sum() == 3
@@ -86,7 +86,7 @@ def test_donors_are_drawn_by_their_opacity():
     assert joined[1] / joined.sum() == pytest.approx(0.75, abs=0.05)
 
 
-def test_nothing_happens_where_all_are_dead_or_none_is(key):
+def test_nothing_changes_when_all_or_none_are_dead(key):
     scene = random_scene(3)
     full = jnp.ones(COUNT, bool)
     for opacity in (0.001, 0.7):
@@ -113,12 +113,12 @@ def test_the_image_hardly_changes(key):
     assert images[0]["alpha"].shape == (HEIGHT, WIDTH)
 
 
-def test_the_faint_wander_in_their_plane(key):
+def test_noise_moves_faint_surfels_in_their_plane(key):
     scene = random_scene(4)
     scene["opacity_logits"] = logit(np.where(np.arange(COUNT) < 8, 0.006, 0.9))
     surfels = to_surfels(scene)
     alive = jnp.arange(COUNT) < 12
-    move_means = jax.jit(wander, static_argnames="config")
+    move_means = jax.jit(add_position_noise, static_argnames="config")
     moves = np.stack(
         [
             move_means(k, surfels, alive, jnp.float32(1e-3), config=McmcConfig(noise=100)).means

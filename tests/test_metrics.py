@@ -40,7 +40,7 @@ def test_psnr_closed_forms():
     np.testing.assert_allclose(psnr(image, image + 0.1), 20, rtol=1e-5)
     np.testing.assert_allclose(psnr(image, image + 0.5), -20 * np.log10(0.5), rtol=1e-5)
     assert psnr(image, image) == jnp.inf
-    # Half of the pixels are off by 0.1, and three quarters of the weight is on them.
+    # Half of the pixels differ by 0.1, and they have three quarters of the weight.
     target = image.at[:, :2].add(0.1)
     weight = jnp.ones((3, 4)).at[:, :2].set(3)
     np.testing.assert_allclose(psnr(image, target), 20 + 10 * np.log10(2), rtol=1e-5)
@@ -95,7 +95,7 @@ def test_cc_psnr_agrees_with_least_squares(pair, weight):
 
 @pytest.mark.parametrize("ridge", [1e-4, 0.1, 1e6])
 def test_a_ridge_holds_colors_back(pair, weight, ridge):
-    """Least squares with the distance from no change as further rows."""
+    """The oracle is least squares with extra rows for the distance from the identity."""
     image, target = (np.asarray(x, np.float64).reshape(-1, 3) for x in pair)
     share = weight.ravel() / weight.sum()
     mean = share @ image
@@ -118,7 +118,7 @@ def test_cc_psnr_of_degenerate_colors(pair):
 
 
 @pytest.mark.parametrize("name", METRICS)
-def test_weights_of_zero(pair, weight, name):
+def test_zero_weight_everywhere_gives_nan(pair, weight, name):
     assert jnp.isnan(METRICS[name](*pair, weight=np.zeros_like(weight)))
 
 
@@ -151,7 +151,7 @@ def test_jit_and_vmap(pair, weight, name):
     np.testing.assert_allclose(batched(images, targets, weights), single, rtol=1e-4)
 
 
-def test_wrong_inputs(pair, weight):
+def test_wrong_inputs_are_refused(pair, weight):
     with pytest.raises(ValueError, match="SSIM needs 11 pixels a side"):
         ssim(pair[0][:10], pair[1][:10])
     for metric in METRICS.values():

@@ -13,8 +13,9 @@ from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.photographs import Batch
 from jaxcloseup.rendered_loss import rendered_loss
 from jaxcloseup.volume.encodings import positional_encoding
-from jaxcloseup.volume.nerf import NerfAux, NerfConfig, nerf
+from jaxcloseup.volume.nerf import NerfConfig, nerf
 from jaxcloseup.volume.networks import apply_network, init_network
+from jaxcloseup.volume.renderer import VolumeAux
 
 
 TINY = NerfConfig(
@@ -32,7 +33,7 @@ SIZE = 8
 
 
 def camera(x=0.3):
-    """One that looks along z from (x, 0, -2)."""
+    """A camera that looks along z from (x, 0, -2)."""
     pose = jnp.array([[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, -2]], float)
     return Camera(pose, jnp.array([8.0, 8, 4, 4]), SIZE, SIZE)
 
@@ -76,7 +77,7 @@ def loss_and_gradient(**changes):
     return jax.jit(jax.value_and_grad(loss))
 
 
-def test_the_network_is_the_oracles(key):
+def test_the_network_matches_the_oracle(key):
     tiny = field(depth=4, skip_after=1)
     shapes = jax.eval_shape(tiny.init, key, *[jnp.zeros((1, 3))] * 2)[0]["fine"]
     numbers = np.random.default_rng(2)
@@ -100,7 +101,7 @@ def test_the_default_network_has_the_documented_shapes():
     assert [w.shape for w in shapes["view"]["weights"]] == [(128, 256), (128, 27)]
 
 
-def test_initial_weights_are_glorots():
+def test_initial_weights_are_glorot_uniform():
     init = functools.partial(
         init_network,
         depth=2,
@@ -124,14 +125,14 @@ def test_shapes():
         rgb=(8, 8, 3),
         depth=(8, 8),
         alpha=(8, 8),
-        aux=NerfAux(coarse_rgb=(8, 8, 3), median_depth=(8, 8), expected_depth=(8, 8)),
+        aux=VolumeAux(coarse_rgb=(8, 8, 3), median_depth=(8, 8), expected_depth=(8, 8)),
     )
     assert jax.tree.map(jnp.shape, image) == expected
     assert np.all((image.depth > 1) & (image.depth < 3))
     np.testing.assert_allclose(image.aux.expected_depth, image.alpha * image.depth, rtol=1e-5)
 
 
-def test_an_image_is_its_pixels_whatever_the_chunks():
+def test_an_image_equals_its_pixels_in_chunks_of_any_size():
     pixels = pixel_grid(SIZE, SIZE).reshape(-1, 2)
     ours = renderer(chunk=None)(params(), camera(), pixels, None)
     ours = jax.tree.map(lambda x: x.reshape(SIZE, SIZE, *x.shape[1:]), ours)
@@ -162,14 +163,14 @@ def test_scaled_coordinates_move_the_network_not_the_depth():
     np.testing.assert_allclose(ours.depth[0], 2 * expected.depth, rtol=1e-3)
 
 
-def test_a_key_perturbs():
+def test_a_key_perturbs_the_samples():
     render = functools.partial(renderer(), params(), camera(), None)
     first, again, other = (render(jax.random.key(seed)).rgb for seed in (0, 0, 1))
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 1e-3
 
 
-def test_background_shows_where_nothing_is():
+def test_background_shows_through_empty_space():
     pixels = jnp.array([[2.5, 3.5]])
     white = renderer(background=1.0)(params(), camera(), pixels, None).rgb[0]
     seen = jax.tree.map(lambda x: x[3, 2], whole_image())
@@ -177,7 +178,7 @@ def test_background_shows_where_nothing_is():
 
 
 def test_gradient_is_the_finite_difference(key):
-    """Of each network by its own loss: moving the coarse one also moves the fine one's samples."""
+    """Each network against its own loss, because moving the coarse one moves the fine samples."""
     with jax.enable_x64(True):
         wide, view = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), (params(), camera()))
         pixels = jnp.array([[2.5, 3.5], [6.5, 1.5], [4.5, 4.5]], jnp.float64)
@@ -210,7 +211,7 @@ def test_gradient_is_the_finite_difference(key):
             assert abs(slope) > 1e-4
 
 
-def test_no_weight_no_loss_no_gradient():
+def test_zero_weight_gives_zero_loss_and_gradient():
     value, gradient = loss_and_gradient()(params(), jnp.zeros((SIZE, SIZE)))
     assert value == 0
     assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(gradient))
@@ -219,7 +220,7 @@ def test_no_weight_no_loss_no_gradient():
 def test_loss_is_a_weighted_mean():
     rgb = jnp.array([[0.1, 0.2, 0.3], [1.0, 1.0, 1.0]])
     ones = jnp.ones(2)
-    rendering = Rendering(rgb, ones, ones, NerfAux(rgb + 0.1, ones, ones))
+    rendering = Rendering(rgb, ones, ones, VolumeAux(rgb + 0.1, ones, ones))
     target = jnp.array([[0.2, 0.2, 0.3], [0.0, 0.0, 0.0]])
     value, metrics = field().loss(rendering, target, jnp.array([3.0, 1.0]))
     fine = (3 * 0.01 / 3 + 1 * 1) / 4
@@ -229,7 +230,7 @@ def test_loss_is_a_weighted_mean():
 
 
 def test_learns_a_toy_scene():
-    """In chunks: 64 pixels, 24 at a time; in bfloat16, which is the harder."""
+    """64 pixels in chunks of 24, in bfloat16, which is harder than float32."""
     tiny = field(compute_dtype="bfloat16")
     state = params()
     pixels = pixel_grid(SIZE, SIZE).reshape(-1, 2)

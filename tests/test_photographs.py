@@ -11,7 +11,7 @@ def make_views():
     return views.replace(weight=views.weight.at[1, 3:].set(0))
 
 
-def test_drawn_pixels_carry_the_color_weight_and_camera_of_their_place(key):
+def test_drawn_pixels_have_the_color_weight_and_camera_of_their_place(key):
     views = make_views()
     batch = jax.jit(sample_pixels, static_argnames="count")(key, views, count=500)
     column, row = np.asarray(batch.pixels).T
@@ -25,7 +25,7 @@ def test_drawn_pixels_carry_the_color_weight_and_camera_of_their_place(key):
     assert row.max() > plane.HEIGHT - 2
 
 
-def test_a_drawn_photograph_is_one_of_them(key):
+def test_a_drawn_photograph_is_one_of_the_views(key):
     views = make_views()
     batch = sample_image(key, views)
     view = int(batch.cameras.position[0]) + 1

@@ -101,13 +101,13 @@ def test_cameras_that_look_at_the_anchor_turn_about_it(key, camera):
     np.testing.assert_allclose(pixels, jnp.broadcast_to(jnp.array([5.5, 2.5]), (100, 2)), atol=1e-3)
     assert jnp.all((depth[2, 5] / z >= 2 - 1e-4) & (depth[2, 5] / z <= 8 + 1e-4))
     np.testing.assert_array_equal(orbit.rotation, still.rotation)
-    # The distance is that of the camera that turns about itself, the side another one.
+    # Both cameras are equally far from the anchor, but on different sides of it.
     far = [jnp.linalg.norm(one.position - anchor[None], axis=1) for one in (orbit, still)]
     np.testing.assert_allclose(*far, rtol=1e-4)
     assert jnp.linalg.norm(orbit.position - still.position, axis=1).max() > 0.5
 
 
-def test_typical_anchors_only_when_asked(key, camera):
+def test_anchor_tolerance_rejects_untypical_depths(key, camera):
     depth = jnp.full((HEIGHT, WIDTH), 2.0).at[:, 0].set(6)
     typical = draw(key, 200, camera, depth, settings(anchor_tolerance=0.3, max_angle=0.0), None)
     anywhere = draw(key, 200, camera, depth, settings(max_angle=0.0), None)

@@ -1,4 +1,4 @@
-"""The built-in scenes: cameras against exact geometry, views against each other, the cache."""
+"""The built-in scenes: cameras against exact geometry, consistency between views, the cache."""
 
 import itertools
 
@@ -21,7 +21,7 @@ DOWNSCALE = 20  # 48 x 27
 
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory):
-    """An empty cache of its own."""
+    """An empty cache for this module."""
     with pytest.MonkeyPatch.context() as patch:
         root = tmp_path_factory.mktemp("cache")
         patch.setenv("XDG_CACHE_HOME", str(root))
@@ -43,7 +43,7 @@ def truth(scene):
 
 @pytest.mark.parametrize("name", loading.PROCEDURAL_SCENES)
 def test_cameras(name, monkeypatch):
-    """Every camera stands in free space, and close-ups are close, turned and supported."""
+    """Cameras stand in free space; close-ups are near, rotated and seen by training views."""
     monkeypatch.setattr(modeling, "draw_texture", lambda name: np.zeros((1024, 1024, 3)))
     model = SCENES[name]()
     world = modeling.build_world(model, lambda *scene: np.ones((8, 4)))
@@ -71,11 +71,11 @@ def test_cameras(name, monkeypatch):
             nearest = min(nearest, distance)
             views += sees(world.solids, other, intrinsics, subject)
             cosine = (np.trace(other[:, :3].T @ pose[:, :3]) - 1) / 2
-            assert np.rad2deg(np.arccos(np.clip(cosine, -1, 1))) > 3  # turned from every view
+            assert np.rad2deg(np.arccos(np.clip(cosine, -1, 1))) > 3  # rotated from every view
         np.testing.assert_allclose(magnification, nearest / own)
         assert views >= 3
         assert sees(world.solids, pose, intrinsics, subject)
-        # Free space all the way from the nearest training view's side of the subject.
+        # Nothing blocks the line from the subject to the camera.
         back = cast_rays(
             world.solids, subject + 1e-3 * (pose[:, 3] - subject), pose[:, 3] - subject
         )
@@ -83,7 +83,7 @@ def test_cameras(name, monkeypatch):
 
 
 def sees(solids, pose, intrinsics, point):
-    """Whether a view shows a surface point: in its frame, and nothing before it."""
+    """Whether a view shows a surface point: it lies in the image and is not occluded."""
     pixels, depths = reference.project(pose, intrinsics, [point])
     inside = depths[0] > 0 and (pixels[0] > 0).all() and (pixels[0] < [960, 540]).all()
     return inside and abs(cast_rays(solids, pose[:, 3], point - pose[:, 3]).depth - 1) < 5e-3
@@ -104,7 +104,7 @@ def test_a_capture_is_complete(scene):
         )
         assert float(jnp.std(views.rgb.astype(jnp.float32))) > 20
     assert len(scene.metadata["magnification"]) == 12
-    # Close-ups really are nearer than the far views.
+    # Close-ups are nearer than the far views by the stated magnification.
     subjects = np.array(scene.metadata["subjects"])
     away = np.asarray(scene.train.cameras.position)[None] - subjects[:, None]
     own = np.linalg.norm(np.asarray(scene.test.cameras.position) - subjects, axis=-1)
@@ -130,7 +130,7 @@ def test_photographs_are_what_the_surface_shows(scene, truth):
 
 
 def test_two_views_agree(scene, truth):
-    """A pixel lifted with its depth finds itself in another view, in depth and in color."""
+    """A pixel lifted by its depth lands in another view at the same depth and color."""
     lift, project = jax.jit(pixels_to_points), jax.jit(points_to_pixels)
     grid = pixel_grid(27, 48)
     shown, errors = [], []
@@ -163,11 +163,11 @@ def test_points_lie_on_the_surface_with_its_color(scene, truth):
 
 
 def test_zoom_agrees_with_the_plain_view_and_shows_more(scene, truth):
-    """Pixels are means over their area: 16 times as many rays, and finer textures, agree."""
+    """Pixels are means over their area, so averaging a 4 times finer view gives the same image."""
     errors, hidden = [], []
     for i, surface in truth[::4]:
         for left, top in ((2, 2), (18, 10), (34, 18)):
-            # 12 x 6 pixels, four times larger on the same sensor.
+            # 12 x 6 pixels, magnified four times on the same sensor.
             intrinsics = jnp.array([160.0, 160.0, 4 * (24 - left), 4 * (13.5 - top)])
             camera = camera_at(scene.train.cameras, i).replace(intrinsics=intrinsics)
             zoom = np.asarray(scene.surface(camera).rgb)[:24]
@@ -178,7 +178,7 @@ def test_zoom_agrees_with_the_plain_view_and_shows_more(scene, truth):
     assert np.mean(hidden) > 3 * np.mean(errors)
 
 
-def test_realism_touches_training_photographs_only(scene):
+def test_realism_affects_only_training_photographs(scene):
     options = {"noise": 0.05, "exposure_jitter": 0.1, "pose_noise": 0.01}
     real, again = (
         loading.procedural_scene("counter", downscale=DOWNSCALE, **options) for _ in range(2)
@@ -218,12 +218,12 @@ def test_the_cache_is_used_and_survives_damage(scene, cache, monkeypatch):
         again = loading.procedural_scene("counter", downscale=DOWNSCALE)
     jax.tree.map(np.testing.assert_array_equal, again.train, scene.train)
 
-    # From scratch, the same to the last bit: textures, light, cameras, photographs and points.
+    # Redrawing gives identical bits: textures, light, cameras, photographs and points.
     stored[0].write_bytes(stored[0].read_bytes()[:1000])
     for light in cache.glob("counter-light-*.npz"):
         light.write_text("not an archive")
     loading._world.cache_clear()
-    with pytest.warns(UserWarning, match="ignoring the unreadable cache"):
+    with pytest.warns(UserWarning, match="ignoring the unreadable cache file"):
         rebuilt = loading.procedural_scene("counter", downscale=DOWNSCALE)
     for split in ("train", "test", "test_far"):
         jax.tree.map(np.testing.assert_array_equal, getattr(rebuilt, split), getattr(scene, split))
@@ -231,12 +231,12 @@ def test_the_cache_is_used_and_survives_damage(scene, cache, monkeypatch):
     np.testing.assert_array_equal(rebuilt.rgb, scene.rgb)
 
 
-def test_an_unwritable_cache_costs_a_warning(tmp_path, monkeypatch):
+def test_an_unwritable_cache_only_warns(tmp_path, monkeypatch):
     blocked = tmp_path / "file"
     blocked.write_text("in the way")
     monkeypatch.setenv("XDG_CACHE_HOME", str(blocked))
-    with pytest.warns(UserWarning, match="cannot keep"):
-        made = loading._kept("anything", lambda: {"value": np.arange(3)})
+    with pytest.warns(UserWarning, match="cannot write the cache file"):
+        made = loading._cached("anything", lambda: {"value": np.arange(3)})
     np.testing.assert_array_equal(made["value"], [0, 1, 2])
 
 
@@ -247,14 +247,14 @@ def test_sizes_round_up_and_focal_lengths_follow():
 
 
 def test_bad_requests():
-    with pytest.raises(ValueError, match="no built-in scene 'cellar'; there are counter"):
+    with pytest.raises(ValueError, match="no built-in scene 'cellar': choose one of counter"):
         loading.procedural_scene("cellar")
     with pytest.raises(ValueError, match="positive integer"):
         loading.procedural_scene("counter", downscale=0)
 
 
 def test_a_new_camera_reuses_the_compiled_render(scene):
-    """One compilation an image size, whatever the camera."""
+    """Each image size compiles once, for any camera."""
     before = loading._render_surface._cache_size()
     camera = camera_at(scene.test.cameras, 0)
     moved = Camera(camera.camtoworld + 0.01, camera.intrinsics, 27, 48)
@@ -262,7 +262,7 @@ def test_a_new_camera_reuses_the_compiled_render(scene):
     assert loading._render_surface._cache_size() == before
 
 
-def test_a_surface_first_asked_for_inside_a_trace_serves_later_traces(scene):
+def test_a_surface_first_rendered_inside_a_trace_serves_later_traces(scene):
     loading._world.cache_clear()
     camera = camera_at(scene.test.cameras, 0)
     for _ in range(2):

@@ -1,4 +1,4 @@
-"""Boxes of discs against the pixels that a ray sees them in."""
+"""Boxes and homographies of discs against rays that meet them."""
 
 import jax
 import numpy as np
@@ -19,7 +19,7 @@ def project(surfels, camera):
     discs, normals = to_camera(surfels, camera)
     opacity = jax.nn.sigmoid(surfels.opacity_logits)
     found = project_discs(discs, opacity, normals, camera, near=NEAR)
-    return found.box, found.opacity, found.anchor, found.rows, found.low_pass
+    return found.box, found.opacity, found.anchor, found.homography, found.low_pass
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_no_visible_pixel_is_outside_its_box(kwargs, seed):
     assert np.all(opacity[(alpha > 0).any(1)] > 0)
 
 
-def test_boxes_are_no_larger_than_the_rim():
+def test_boxes_are_tight_around_the_rim():
     scene = random_scene(4, depth=(0.3, 4.0), log_scale=(-5.0, -1.5), count=DISCS)
     reach = reference.depth_reach(scene, IDENTITY)
     box, *_ = project(to_surfels(scene), make_camera(intrinsics=INTRINSICS, size=SIZE))
@@ -69,8 +69,8 @@ def test_boxes_are_no_larger_than_the_rim():
     assert checked > DISCS // 2
 
 
-def test_rays_see_what_the_rows_say():
-    """u, v and 1/z of the homography against the intersection, wherever the anchor lies."""
+def test_homographies_agree_with_rays():
+    """u, v and z from the homography equal those of the intersection, wherever the anchor lies."""
     scene = random_scene(3, depth=(-1.0, 2.0), log_scale=(-1.0, 1.0), count=DISCS)
     camera = make_camera(intrinsics=INTRINSICS, size=SIZE)
     _, opacity, anchor, rows, _ = map(np.asarray, project(to_surfels(scene), camera))
@@ -92,7 +92,7 @@ def test_rays_see_what_the_rows_say():
 
 
 def test_the_low_pass_of_discs_behind_the_camera_is_out_of_sight():
-    """It once showed them in the middle pixel of images with odd sides."""
+    """An anchor at a pixel's center would draw them in the middle of images with odd sides."""
     height, width = size = (47, 63)
     scene = random_scene(5, depth=(-1.0, -0.5), log_scale=(0.0, 1.0), count=DISCS)
     camera = make_camera(intrinsics=INTRINSICS, size=size)

@@ -9,6 +9,7 @@ from jaxcloseup.geometry.poses import PoseSettings
 from jaxcloseup.pseudo import (
     PseudoSettings,
     best_source,
+    label_sources,
     label_views,
     make_label,
     sample_virtual_camera,
@@ -276,7 +277,7 @@ def test_target_views_are_labeled_from_their_best_source(capture):
     views, depths, closeup = capture
     targets = [closeup, plane.camera_above(-0.9, 0.0, 2.0)]
     stacked, exact = plane.make_views(targets)
-    labels = label_views(stacked.cameras, exact, views, depths, settings())
+    labels = label_views(stacked.cameras, exact, label_sources(views, depths), settings())
     assert labels.rgb.shape == stacked.rgb.shape
     for i, camera in enumerate(targets):
         source = best_source(camera, views, depths, depth=exact[i])

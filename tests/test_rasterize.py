@@ -1,4 +1,4 @@
-"""Images and derivatives of surfels against a NumPy splatter, and what must not matter to them."""
+"""Images and derivatives of surfels against a NumPy splatter, and their invariances."""
 
 import jax
 import jax.numpy as jnp
@@ -37,7 +37,7 @@ def oracle(scene, camtoworld=IDENTITY, intrinsics=INTRINSICS, size=(HEIGHT, WIDT
 
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("precision", ["float32", "float64"])
-def test_images_are_those_of_rays_and_planes(name, precision):
+def test_images_agree_with_rays_that_meet_planes(name, precision):
     expected = oracle(SCENES[name])
     with jax.enable_x64(precision == "float64"):
         images = render(to_surfels(SCENES[name], precision), to_camera(dtype=precision))
@@ -50,7 +50,7 @@ def test_images_are_those_of_rays_and_planes(name, precision):
 
 
 def pose(twist):
-    """Camera-to-world of Euler angles and a position, in NumPy."""
+    """Camera-to-world matrix `[3, 4]` from Euler angles and a position `twist[6]`, in NumPy."""
     (cx, cy, cz), (sx, sy, sz) = np.cos(twist[:3]), np.sin(twist[:3])
     x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
     y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
@@ -71,7 +71,7 @@ def pullback(surfels, twist, intrinsics, cotangents):
 
 @pytest.fixture(scope="module", params=["in front", "through the camera"])
 def jacobian(request):
-    """Central differences `[parameter, ...]` of every image of the oracle, by parameter name."""
+    """Central differences of every image of the oracle in every parameter, by parameter name."""
     scene = SCENES[request.param]
     at = dict(scene, pose=np.zeros(6), intrinsics=INTRINSICS)
     reach, step = reference.depth_reach(scene, IDENTITY), 1e-7
@@ -93,7 +93,7 @@ def jacobian(request):
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
-def test_every_derivative_is_a_finite_difference(jacobian, precision):
+def test_derivatives_agree_with_finite_differences(jacobian, precision):
     scene, differences = jacobian
     rng = np.random.default_rng(3)
     weights = {name: rng.normal(size=(HEIGHT, WIDTH)) for name in OUTPUTS}
@@ -119,7 +119,7 @@ def test_every_derivative_is_a_finite_difference(jacobian, precision):
 
 
 def test_float32_keeps_the_digits_of_small_splats():
-    """Of splats about a pixel wide, whose gradients are small differences of large sums."""
+    """Gradients of splats about a pixel wide are small differences of large sums."""
     scene = random_scene(10, depth=(1.0, 2.0), log_scale=(-3.5, -2.2))
     rng = np.random.default_rng(0)
     cotangents = {
@@ -138,7 +138,7 @@ def test_float32_keeps_the_digits_of_small_splats():
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
-def test_tiles_do_not_matter(precision):
+def test_tile_sizes_do_not_change_the_image(precision):
     scene = random_scene(5, depth=(0.1, 2.0), log_scale=(-4.0, 0.0))
     with jax.enable_x64(precision == "float64"):
         images = [
@@ -153,7 +153,7 @@ def test_tiles_do_not_matter(precision):
         ]
     for other in images[1:]:
         for name in OUTPUTS:
-            # Float32 rounds depth and its spread, which are not of order 1, by more than the rest.
+            # Depth and distortion are not of order 1, so float32 rounds them more coarsely.
             if precision == "float64":
                 atol, rtol = 1e-12, 0
             else:
@@ -163,7 +163,7 @@ def test_tiles_do_not_matter(precision):
 
 @pytest.mark.parametrize("name", ["in front", "far and small"])
 def test_tiles_and_crops_agree_to_a_millionth(name):
-    """All outputs, in float32, where nothing is cut by the near plane."""
+    """Float32 keeps this precision in all outputs when the near plane cuts no disc."""
     surfels = to_surfels(SCENES[name])
     whole = render(surfels, to_camera())
     for tile, chunk, block in ((16, 3, 1), (32, 8, 2)):
@@ -180,7 +180,7 @@ def test_tiles_and_crops_agree_to_a_millionth(name):
                 np.testing.assert_allclose(crop[output], expected, atol=1e-6, rtol=0)
 
 
-def test_same_bits_every_time_and_in_any_order():
+def test_bits_do_not_depend_on_the_run_or_the_order():
     scene = SCENES["in front"]
     order = np.random.default_rng(0).permutation(COUNT)
     cotangents = {
@@ -198,8 +198,8 @@ def test_same_bits_every_time_and_in_any_order():
 
 
 @pytest.mark.parametrize(("precision", "tolerance"), [("float32", 4e-6), ("float64", 1e-12)])
-def test_crops_are_the_image(precision, tolerance):
-    """Up to the rounding of a principal point that is subtracted and added again."""
+def test_crops_agree_with_the_image(precision, tolerance):
+    """They differ by the rounding of the shifted principal point only."""
     scene = random_scene(6, depth=(0.1, 2.0), log_scale=(-4.0, 0.0))
     with jax.enable_x64(precision == "float64"):
         surfels = to_surfels(scene, precision)
@@ -214,12 +214,12 @@ def test_crops_are_the_image(precision, tolerance):
                     np.testing.assert_allclose(crop[name], expected, atol=tolerance, rtol=0)
 
 
-def test_rigid_motion_of_everything_changes_nothing():
+def test_a_rigid_motion_of_scene_and_camera_changes_nothing():
     scene = random_scene(7, depth=(0.1, 2.0), log_scale=(-4.0, 0.0))
     scene["sh"][:, 1:] = 0
     motion = pose(np.array([0.4, -0.7, 1.9, 0.3, -0.2, 0.5]))
     turn = motion[:, :3]
-    # The quaternion of `turn`, from its axis and angle.
+    # Quaternion of `turn` from its axis and angle.
     angle = np.arccos((np.trace(turn) - 1) / 2)
     skew = (turn - turn.T) / (2 * np.sin(angle))
     w, v = np.cos(angle / 2), np.sin(angle / 2) * np.array([skew[2, 1], skew[0, 2], skew[1, 0]])
@@ -236,7 +236,7 @@ def test_rigid_motion_of_everything_changes_nothing():
 
 
 def facing_discs(z, scale, opacity_logit):
-    """`COUNT` discs that face the camera on its axis."""
+    """`COUNT` discs on the camera's axis that face the camera."""
     scene = random_scene(0)
     scene["means"] = np.stack([0 * z, 0 * z, z], axis=1).astype(np.float32).astype(np.float64)
     scene["log_scales"] = np.full((COUNT, 2), np.log(scale))
@@ -259,7 +259,7 @@ def test_one_disc_facing_the_camera_is_a_gaussian():
     assert np.all(images["distortion"] == 0)
 
 
-def test_tilted_plane_has_its_own_depth():
+def test_a_tilted_disc_has_the_depth_of_its_plane():
     scene = facing_discs(np.full(COUNT, 2.0), 40.0, 0.0)
     tilt = np.array([np.cos(0.5), np.sin(0.5) * 0.6, np.sin(0.5) * 0.8, 0])
     scene["quaternions"][:] = tilt
@@ -281,7 +281,7 @@ def test_distortion_keeps_its_digits_on_a_converged_surface():
     np.testing.assert_allclose(images["distortion"], expected["distortion"], rtol=5e-3, atol=1e-11)
 
 
-def test_discs_behind_are_not_there_and_both_sides_are_seen():
+def test_discs_behind_are_invisible_and_both_sides_are_visible():
     scene = random_scene(8)
     turned = dict(scene)
     w, x, y, z = scene["quaternions"].T
@@ -295,7 +295,7 @@ def test_discs_behind_are_not_there_and_both_sides_are_seen():
     assert np.all(render(to_surfels(scene), to_camera())["alpha"] == 0)
 
 
-def test_cameras_batch():
+def test_cameras_can_be_batched():
     twists = jnp.array([[0.0] * 6, [0.05, -0.1, 0.2, 0.1, 0.0, -0.2]])
     surfels, intrinsics = to_surfels(SCENES["in front"]), jnp.asarray(INTRINSICS, jnp.float32)
     keys = jax.random.split(jax.random.key(0), len(OUTPUTS))
@@ -362,13 +362,13 @@ def test_volumetric_gaussians_share_the_kernel():
     opacity, color = rng.uniform(0.2, 1, COUNT), rng.uniform(0, 1, (COUNT, 3))
 
     root = np.linalg.cholesky(np.linalg.inv(ellipse)).swapaxes(1, 2)
-    rows = np.zeros((COUNT, 3, 3))
-    rows[:, :2, 1:] = root / z[:, None, None]
-    rows[:, 2, 0] = 1 / z
+    homography = np.zeros((COUNT, 3, 3))
+    homography[:, :2, 1:] = root / z[:, None, None]
+    homography[:, 2, 0] = 1 / z
     reach = 3.34 * np.sqrt(np.diagonal(ellipse, axis1=1, axis2=2))
     footprints = Footprints(
         anchor=center,
-        rows=rows,
+        homography=homography,
         opacity=opacity,
         low_pass=np.full(COUNT, 1e9),
         inverse_depth=np.tile([0.0, np.inf], (COUNT, 1)),
@@ -386,7 +386,7 @@ def test_volumetric_gaussians_share_the_kernel():
     alpha[alpha < 1 / 255] = 0
     nearest = np.argsort(z)
     depth = np.broadcast_to(z[:, None], alpha.shape)
-    sums, total, expected_depth, median, _ = reference.composite(
+    sums, total, expected_depth, median, _ = reference.blend(
         alpha[nearest], depth[nearest], color[nearest]
     )
     np.testing.assert_allclose(image.payload, sums.reshape(HEIGHT, WIDTH, 3), atol=2e-5)

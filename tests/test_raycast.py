@@ -1,4 +1,4 @@
-"""Ray casting against intersections computed face by face in float64, and filtered textures."""
+"""Ray casting against float64 intersections face by face, and filtered textures."""
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ def random_rotation(rng):
 
 @pytest.fixture(scope="module")
 def clutter():
-    """Solids of every kind in a big room, thin and fat, straight and tapered, sorted by kind."""
+    """Solids of every kind in a big room, thin and thick, straight and tapered, sorted by kind."""
     rng = np.random.default_rng(0)
     solids = [("box", np.column_stack([4 * np.eye(3), np.zeros(3)]), 0.0)]
     for kind in KINDS:
@@ -39,7 +39,7 @@ def as_solids(solids):
 
 
 def check_against_reference(solids, origins, directions):
-    """Compare every ray, but for those that graze an edge; return how many were compared."""
+    """Compare every ray that does not graze an edge; return how many were compared."""
     hits = raycast.cast_rays(as_solids(solids), origins, directions)
     compared = 0
     for i, (origin, direction) in enumerate(zip(origins, directions, strict=True)):
@@ -50,7 +50,7 @@ def check_against_reference(solids, origins, directions):
         if index < 0:
             assert np.isinf(hits.depth[i])
             continue
-        # Single precision is about a micrometer across the surface: more along a grazing ray.
+        # Single precision is about a micrometer across the surface, and more along a grazing ray.
         tolerance = 2e-6 / abs(normal @ direction)
         np.testing.assert_allclose(hits.depth[i], depth, rtol=1e-6, atol=tolerance)
         np.testing.assert_allclose(hits.normal[i], normal, atol=2e-3)
@@ -74,7 +74,7 @@ def test_each_primitive_from_outside_inside_and_past(kind):
     solids = [(kind, shape, 0.35 if kind == "cylinder" else 0.0)]
     near, far = rng.normal(0, 0.1, (60, 3)) + shape[:, 3], rng.normal(0, 3, (120, 3))
     origins = np.concatenate([near, far])
-    # Past it, at it, and with the smallest of angles to its faces.
+    # Rays that miss, rays that hit, and rays nearly parallel to the faces.
     aims = shape[:, 3] + rng.normal(0, 0.25, (180, 3))
     aims[:20] = origins[:20] + rng.normal(size=(20, 2)) @ shape[:, :2].T + 0.003 * shape[:, 2]
     assert check_against_reference(solids, origins, aims - origins) > 120
@@ -100,7 +100,7 @@ def test_faces_and_charts():
         ("box", np.column_stack([np.diag([1.0, 2.0, 3.0]), [0, 0, 0]]), 0.0),
         ("cylinder", np.column_stack([np.eye(3), [10, 0, 0]]), 0.5),
     ])  # fmt: skip
-    # From outside each side of the box, a quarter of its size off the middle; then the cylinder.
+    # Rays hit each side of the box, a quarter of its size off the middle, then the cylinder.
     sign, axis = np.tile([-1.0, 1.0], 3), np.repeat(np.arange(3), 2)
     at = 0.5 * np.array([1.0, 2.0, 3.0]) * np.ones((6, 3))
     at[np.arange(6), axis] = 5 * sign
@@ -111,7 +111,7 @@ def test_faces_and_charts():
     hits = raycast.cast_rays(solids, origins, directions)
     np.testing.assert_array_equal(hits.face, [0, 1, 2, 3, 4, 5, 6, 8, 7])
     np.testing.assert_allclose(hits.chart[:6], 0.75, atol=1e-6)
-    # The side chart starts at -x and goes round by +y; caps are charted in their own radius.
+    # The side's chart starts at -x and goes around via -y; a cap's chart scales with its radius.
     expected = [[0.25, 0.5], [0.5 + 0.75 / 3, 0.5], [0.5 + 0.25, 0.5]]
     np.testing.assert_allclose(hits.chart[6:], expected, atol=1e-5)
 
@@ -151,11 +151,11 @@ def test_textures_are_periodic_pyramids_of_means():
 
     levels = jnp.zeros(50)
     np.testing.assert_allclose(sample(centers - 3, levels - 1), image[rows, columns], atol=2e-3)
-    # Half way between two texels, across the border as well.
+    # Halfway between two texels, also across the border.
     right = image[rows, (columns + 1) % size]
     halfway = sample(centers + np.array([0.5 / size, 1]), levels)
     np.testing.assert_allclose(halfway, (image[rows, columns] + right) / 2, atol=2e-3)
-    # Two levels up, texels are means of 4 x 4 (rounded to bytes twice); between levels, both blend.
+    # Two levels up, texels are means of 4 x 4, rounded twice; between levels, the two blend.
     means = image.reshape(size // 4, 4, size // 4, 4, 3).mean((1, 3))
     coarse = (np.stack([columns // 4, rows // 4], -1) + 0.5) / (size // 4)
     at_two = sample(coarse, levels + 2)

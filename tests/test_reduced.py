@@ -1,4 +1,4 @@
-"""Photographs reduced before, in `images_2`, and those kept once they were reduced here."""
+"""Already shrunk photographs in `images_2`, and the cache of photographs shrunk here."""
 
 import cv2
 import numpy as np
@@ -30,8 +30,8 @@ def load(folder, **options):
 
 
 @pytest.mark.parametrize("size", [(4, 3), (5, 4)])
-def test_photographs_reduced_before_are_taken(tmp_path, size):
-    """Of whatever rounding; the principal point and the focal lengths are of their size."""
+def test_shrunk_photographs_are_used(tmp_path, size):
+    """Either rounding of the size is accepted, and the intrinsics follow the actual size."""
     write_capture(tmp_path, ("sub/a.png", "b.png", "c.png"))
     mask = np.zeros((7, 9), np.uint8)
     mask[:, :5] = 255
@@ -47,14 +47,12 @@ def test_photographs_reduced_before_are_taken(tmp_path, size):
     )
     np.testing.assert_allclose(weight.mean((1, 2)), [1, 5 / 9, 1], atol=2e-3)
     assert scene.names["train"] == ["a", "b", "c"]
-    assert scene.metadata["notes"][-1].endswith(
-        "reduced before, in images_2, and are taken from there"
-    )
-    assert (load(tmp_path)[0][1] == picture(1)).all()  # at full size they do not count
+    assert scene.metadata["notes"][-1].endswith("using the shrunk photographs in images_2")
+    assert (load(tmp_path)[0][1] == picture(1)).all()  # not used at full size
 
 
 @pytest.mark.parametrize("make", [llff_capture, colmap_capture])
-def test_every_format_has_them(tmp_path, make):
+def test_every_format_uses_shrunk_photographs(tmp_path, make):
     if make is colmap_capture:
         pytest.importorskip("pycolmap")
     make(tmp_path)
@@ -63,7 +61,7 @@ def test_every_format_has_them(tmp_path, make):
     assert (load(tmp_path, downscale=2)[0] == 77).all()
 
 
-def test_all_of_them_or_none(tmp_path):
+def test_shrunk_photographs_are_used_only_if_complete(tmp_path):
     write_capture(tmp_path, ("a.png", "a.jpg", "c.png"))
     expected = load(tmp_path, downscale=2)[0]
     small = np.zeros((3, 4, 3), np.uint8)
@@ -71,29 +69,29 @@ def test_all_of_them_or_none(tmp_path):
         write_image(tmp_path / "images_2" / name, small)
     rgb, _, scene = load(tmp_path, downscale=2)
     np.testing.assert_array_equal(rgb, expected)
-    lacks = "images_2 is not used, since it lacks 2 of 3 photo_reading, such as a."
+    lacks = "images_2 is not used, because it lacks 2 of 3 photographs, such as a."
     assert lacks in scene.metadata["notes"][-1]
     write_image(tmp_path / "images_2/a.jpg", small)
     assert (load(tmp_path, downscale=2)[0] == 0).all()
     frames = [{"file_path": "images/c.png", "transform_matrix": POSE.tolist()}]
     write_json(tmp_path / "transforms_train.json", frames, fl_x=7.0)
     rgb, _, scene = load(tmp_path, downscale=2)
-    assert rgb.any() and "since w and h of the whole photographs are" in scene.metadata["notes"][-1]
+    assert rgb.any() and "because the capture gives no w and h" in scene.metadata["notes"][-1]
 
 
-def test_a_size_that_no_rounding_gives(tmp_path):
+def test_a_size_that_no_rounding_explains(tmp_path):
     write_capture(tmp_path)
     for name in "abc":
         write_image(
             tmp_path / f"images_2/{name}.png", np.zeros((3, 6 if name == "b" else 4, 3), "u1")
         )
     with pytest.raises(
-        SceneError, match=r"images_2/b\.png is 6 x 3 pixels, which is not 9 x 7 red"
+        SceneError, match=r"images_2/b\.png is 6 x 3 pixels, which is not 9 x 7 div"
     ):
         load_scene(tmp_path, downscale=2)
 
 
-# What is kept
+# The cache.
 
 
 @pytest.fixture
@@ -111,7 +109,7 @@ def capture(tmp_path, cache):
 
 @pytest.fixture
 def decoded(monkeypatch):
-    """The names of the pictures that are decoded."""
+    """Collects the names of the images that are decoded."""
     names, read = [], photo_reading.read_image
 
     def count(path, **options):
@@ -123,7 +121,7 @@ def decoded(monkeypatch):
 
 
 @pytest.mark.parametrize("options", [{"downscale": 2}, {"split": "zoom", "zoom": 2}])
-def test_what_is_kept_is_what_was_made(capture, cache, decoded, options):
+def test_the_cache_returns_what_was_made(capture, cache, decoded, options):
     first = load_scene(capture, **options)
     made = len(decoded)
     again = load_scene(capture, **options)
@@ -136,7 +134,7 @@ def test_what_is_kept_is_what_was_made(capture, cache, decoded, options):
     assert first.metadata == again.metadata
 
 
-def test_damage_is_never_trusted(capture, cache, decoded):
+def test_damaged_cache_files_are_made_again(capture, cache, decoded):
     expected = load(capture, downscale=2)
     for path in sorted(cache.iterdir()):
         whole = path.read_bytes()
@@ -153,8 +151,8 @@ def test_damage_is_never_trusted(capture, cache, decoded):
             np.testing.assert_array_equal(found[1], expected[1])
 
 
-def test_everything_that_matters_is_in_the_key(capture, decoded, monkeypatch):
-    """Each change makes what has never been made; the half pixel matters to bent lenses alone."""
+def test_the_key_covers_everything_that_matters(capture, decoded, monkeypatch):
+    """Each change decodes again; `half_pixel` matters only for distorted lenses."""
     write_image(capture / "images/a.png", np.dstack([picture(0), picture(1)[..., :1]]))
     frames = [
         {"file_path": f"images/{name}.png", "transform_matrix": POSE.tolist()} for name in "ab"
@@ -185,8 +183,8 @@ def test_everything_that_matters_is_in_the_key(capture, decoded, monkeypatch):
         assert len(decoded) == count, options
 
 
-def test_a_principal_point_near_the_corner_is_not_the_middle(capture, decoded):
-    """The half that is given is not half of a size that is not known before decoding."""
+def test_a_given_principal_point_is_not_confused_with_the_default(capture, decoded):
+    """Before decoding the size is unknown, so the key must not mistake 0.5 for its middle."""
     frames = [{"file_path": "images/a.png", "transform_matrix": POSE.tolist()}]
     for center in ({"cx": 0.5, "cy": 0.5}, {}):
         write_json(capture / "transforms_train.json", frames, fl_x=7.0, k1=-0.1, **center)
@@ -195,7 +193,7 @@ def test_a_principal_point_near_the_corner_is_not_the_middle(capture, decoded):
         assert decoded == ["a.png"]
 
 
-def test_a_cache_that_cannot_be_written_is_none(capture, monkeypatch, tmp_path):
+def test_an_unwritable_cache_is_ignored(capture, monkeypatch, tmp_path):
     expected = load(capture, downscale=2)[0]
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))

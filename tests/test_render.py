@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import pathlib
+import shutil
 
 import cv2
 import jax
@@ -14,12 +16,17 @@ from test_camera_paths import path_file
 from tiny_runs import KEPT
 
 from experiments import render as program
-from experiments.methods.presets import PRESETS, with_classic_density
-from experiments.training.loop import Programs
-from experiments.training.stages import config
-from experiments.training.stored_run import load_run_scene, preset_from_config, read_run
-from experiments.viewing import frames
+from experiments.methods import METHODS
+from experiments.training import fine_tuning
+from experiments.training.programs import Programs
+from experiments.training.settings import plain_config
+from experiments.training.setup import LabelStart
+from experiments.training.stored_config import preset_from_config
+from experiments.training.stored_run import load_run_scene, read_run
 from jaxcloseup.scenes import load_scene
+
+
+OLD_RUN = pathlib.Path(__file__).parent / "data" / "run_0_1_0"  # and its capture
 
 
 @pytest.fixture
@@ -82,10 +89,11 @@ def test_a_camera_path_may_be_fine_tuned_for(render, tmp_path, capsys):
 
 
 def test_nothing_is_fine_tuned_where_the_gate_lets_no_labels_in(capture_folder, monkeypatch):
-    monkeypatch.setattr(frames, "weigh_labels", lambda *data: (data[-1], {"weight": 0.0}))
-    monkeypatch.setattr(frames, "print_gate", lambda _: None)
+    monkeypatch.setattr(fine_tuning, "weigh_labels", lambda *data: (data[-1], {"weight": 0.0}))
+    monkeypatch.setattr(fine_tuning, "print_gate", lambda _: None)
     programs = Programs(dataclasses.replace(KEPT, gated=True), load_scene(str(capture_folder)))
-    assert frames.fine_tune(programs, "state", None, None, most=None) == "state"
+    start = LabelStart("state", None)
+    assert fine_tuning.fine_tune(programs, start, None, most=None) == "state"
 
 
 MISTAKES = {
@@ -117,6 +125,11 @@ MISTAKES = {
     "farther": (
         {"views": None, "from": "0", "pixel": ["3", "4"], "magnification": 0.9},
         "--magnification=0.9 must be 1 or more",
+    ),
+    "no setting": ({"set": ["sharpness=3"]}, "--set=sharpness=3: .* no setting sharpness"),
+    "another shape": (
+        {"set": ["capacity=9"]},
+        "--set changes the shape .*--run=.* was trained with other",
     ),
     "no camera path": ({"views": None, "camera_path": "no.json"}, "no.json cannot be read"),
 }
@@ -183,19 +196,48 @@ def test_runs_that_are_none_are_one_sentence(render, tmp_path):
         render(run=str(tmp_path / "empty"), views="test")
 
 
-@pytest.mark.parametrize("method", list(PRESETS))
+@pytest.mark.parametrize("method", list(METHODS))
 def test_presets_come_back_from_their_json(method):
-    for name, preset in PRESETS[method].items():
-        presets = [preset]
-        if method == "surfels":
-            field = with_classic_density(preset.field, name)
-            presets += [dataclasses.replace(preset, field=field), KEPT]
-        for one in presets:
-            assert preset_from_config(json.loads(json.dumps(config(one)))) == one
+    presets = list(METHODS[method].presets.values()) + [KEPT] * (method == KEPT.method)
+    for preset in presets:
+        stored = json.loads(json.dumps(plain_config(preset)))
+        assert preset_from_config(stored) == (preset, {})
 
 
 def test_a_preset_of_another_form_names_the_field():
-    stored = config(KEPT)
+    stored = plain_config(KEPT)
     field = stored["field"] | {"glow": 1}
-    with pytest.raises(ValueError, match=r"config\.field differs in glow"):
+    with pytest.raises(ValueError, match=r"config\.field has glow, which this version does not"):
         preset_from_config(stored | {"field": field})
+    with pytest.raises(ValueError, match="there is no method voxels"):
+        preset_from_config(stored | {"method": "voxels"})
+
+
+def test_a_setting_that_a_run_lacks_has_its_default():
+    stored = plain_config(KEPT)
+    del stored["field"]["ssim_weight"], stored["labels"]["look_at"]
+    preset, absent = preset_from_config(stored)
+    assert preset == KEPT and absent == {"ssim_weight": 0.2, "look_at": False}
+
+
+def test_a_run_of_version_0_1_0_renders_as_it_did(render, tmp_path, capsys):
+    stored = shutil.copytree(OLD_RUN / "run", tmp_path / "run")
+    out = render(run=str(stored), data=str(OLD_RUN / "capture"), views="test")
+    said = capsys.readouterr().out
+    assert "version 0.1.0 had no setting for look_at=False" in said
+    image, as_it_was = (
+        cv2.imread(str(file)).astype(int)
+        for file in (out / "rgb" / "0.png", OLD_RUN / "baseline_test_0.png")
+    )
+    assert np.abs(image - as_it_was).max() <= 1  # machines round differently
+    preset = read_run(stored).preset
+    assert preset.field.color_ridge == 0.01 and preset.field.steps_per_target == 2
+    assert preset.train.label_rule == "paper" and preset.labels.label_loss_weight == 0.05
+
+
+def test_settings_change_what_is_fine_tuned(render, tmp_path, capsys):
+    entry = json.loads(path_file(tmp_path).read_text())["camera_path"][0]
+    file = path_file(tmp_path, camera_path=[entry])
+    given = ["steps_per_target=1", "label_loss_weight=0.5"]
+    render(target=str(file), set=given)
+    assert "pixels to be rendered; 1 steps" in capsys.readouterr().out

@@ -8,14 +8,14 @@ import pytest
 from jaxcloseup.field import RadianceField, Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.photographs import Batch
-from jaxcloseup.rendered_loss import rendered_loss
+from jaxcloseup.rendered_loss import judge, rendered_loss
 
 
 CAMERA = Camera(jnp.eye(4)[:3], jnp.array([8.0, 8, 4, 4]), 8, 8)
 
 
 def _render(params, buffers, camera, pixels, key):
-    """Colors that depend on the pixel and its camera, through weights that are trained."""
+    """Colors that depend on the pixel and its camera through trainable weights."""
     x = pixels / 8 + camera.position[..., :2].reshape(-1, 2) + buffers
     rgb = jnp.tanh(x @ params["first"]) @ params["second"]
     if key is not None:
@@ -80,7 +80,7 @@ def test_every_chunk_draws_its_own_numbers():
     assert np.all(metrics["spread"] > 0.3)
 
 
-def test_no_weight_no_loss_no_gradient():
+def test_zero_weight_gives_zero_loss_and_gradient():
     (loss, _), gradient = differentiate(*problem(True, jnp.zeros(10)), None, 4)
     assert loss == 0
     assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(gradient))
@@ -97,3 +97,15 @@ def test_a_sum_of_losses_scales_their_gradients():
     alone = differentiate(params, buffers, batch, None, None)[1]
     np.testing.assert_allclose(gradient["first"], 0.5 * alone["first"] + 3, rtol=1e-5)
     np.testing.assert_allclose(gradient["second"], 0.5 * alone["second"], rtol=1e-5)
+
+
+def test_a_renderings_overflow_is_among_its_metrics():
+    rgb, weight = jnp.full((4, 3), 0.5), jnp.ones(4)
+    rendering = Rendering(rgb, weight, weight)
+    loss, metrics = judge(FIELD, rendering, 0 * rgb, weight)
+    assert set(metrics) == {"root"}
+    full = rendering._replace(overflow=jnp.int32(7))
+    same_loss, metrics = judge(FIELD, full, 0 * rgb, weight)
+    assert same_loss == loss
+    assert metrics["overflow"] == 7
+    assert metrics["overflow"].dtype == jnp.float32

@@ -13,21 +13,21 @@ from tiny_runs import TINY, TINY_SURFELS
 from experiments.evaluate import evaluate_folders
 from experiments.evaluation.audit import blur_to_footprint
 from experiments.evaluation.scores import NO_PERCEPTUAL, Target, score, summarize
-from experiments.methods.presets import (
-    QUICK_SURFELS,
-    initial_points,
-    pseudo_settings,
-)
-from experiments.reporting.report import write_json
+from experiments.methods import pseudo_settings
+from experiments.methods.surfels import QUICK as QUICK_SURFELS
+from experiments.run import run
 from experiments.training.gate import AGREEMENT, verdict, weigh_labels
-from experiments.training.loop import Programs, TrainingError, run_stage
-from experiments.training.stages import run
+from experiments.training.loop import TrainingError, run_stage
+from experiments.training.programs import Programs
+from experiments.training.setup import initial_points
 from experiments.training.stored_run import choose_stage, load_run_scene, read_run, restore
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.artifacts.images import to_uint8
 from jaxcloseup.artifacts.surfel_ply import read_surfels
 from jaxcloseup.field import Rendering
+from jaxcloseup.files import write_json
 from jaxcloseup.photographs import camera_at
+from jaxcloseup.pseudo import label_sources
 from jaxcloseup.scenes import load_scene
 from jaxcloseup.train import init_state
 
@@ -102,7 +102,7 @@ def run_surfels(capture_folder, output_dir, **options):
 def test_surfels_run_through_all_stages_from_random_points(capture_folder, tmp_path, capsys):
     stages = ["closeup", "test_time"]
     results = run_surfels(capture_folder, tmp_path, to_run=stages)
-    assert "room for" not in capsys.readouterr().out
+    assert "growing to" not in capsys.readouterr().out
     assert json.loads((tmp_path / "results.json").read_text()) == results
     stages = results["stages"]
     use_labels = results["gate"]["weight"] > 0
@@ -136,7 +136,7 @@ def test_no_step_is_taken_on_a_truncated_image(capture_folder, capsys):
             after, metrics = programs.run("photographs", state, scene.train, count=3)
         assert "overflow" not in metrics
         states.append(after)
-    assert "room for 2 times more" in capsys.readouterr().out
+    assert "growing to 2 times the preset's" in capsys.readouterr().out
     assert states[0].step == states[1].step == 3
     for small, large in zip(*(jax.tree.leaves(s.params) for s in states), strict=True):
         np.testing.assert_allclose(small, large, atol=1e-5)
@@ -154,8 +154,8 @@ def test_labels_weigh_what_they_deserve(off):
         depth = jnp.asarray(off * depth, jnp.float32)
         return Rendering(jnp.full(rgb.shape, 0.5), depth, jnp.ones(depth.shape))
 
-    settings = pseudo_settings(QUICK_SURFELS)
-    changed, found = weigh_labels(views, off * depths, render, settings)
+    settings = pseudo_settings(QUICK_SURFELS.labels)
+    changed, found = weigh_labels(label_sources(views, off * depths), render, settings)
     low, high = AGREEMENT
     expected = np.clip((found["agreement"] - low) / (high - low), 0, 1)
     assert found["weight"] == pytest.approx(expected)

@@ -14,7 +14,7 @@ def capture(tmp_path):
     return llff_capture(tmp_path)
 
 
-def test_split_of_a_file(capture):
+def test_split_file(capture):
     lists = {"train": ["1.png", "2.png"], "test": ["0.png"], "unused": []}
     (capture / "split.json").write_text(json.dumps(lists))
     assert load_scene(capture).names == {"train": ["1", "2"], "test": ["0"]}
@@ -22,7 +22,7 @@ def test_split_of_a_file(capture):
     assert load_scene(capture).names == {"train": ["0"], "test_far": ["2"]}
     assert load_scene(capture, split="every8").names["train"] == ["1", "2"]
     (capture / "split.json").write_text(json.dumps({"train": ["1.png"], "why": "because"}))
-    with pytest.warns(UnknownKeyWarning, match=r"split\.json: these fields are not read: why"):
+    with pytest.warns(UnknownKeyWarning, match=r"split\.json: these fields are ignored: why"):
         load_scene(capture)
 
 
@@ -32,7 +32,7 @@ def test_split_of_a_file(capture):
         ("[", "is not readable as JSON"),
         ("[]", "is not an object"),
         ('{"train": "0.png"}', "train must be a list"),
-        ('{"test": ["7.png"]}', "test names '7.png', which no frame has as its name"),
+        ('{"test": ["7.png"]}', "test names '7.png', which is no frame's name"),
         ('{"test": ["0.png", "1.png", "2.png"]}', "every frame is held out: leave some for train"),
     ],
 )
@@ -43,7 +43,7 @@ def test_wrong_split_files(capture, text, message):
 
 
 def test_every_eighth_of_separate_files(tmp_path):
-    """Photographs of all files count, each of them once."""
+    """The photographs of all files count, each once."""
     pose = np.eye(4).tolist()
     frames = [{"file_path": f"{i:02d}.png", "transform_matrix": pose, "fx": 9.0} for i in range(10)]
     for i in range(10):
@@ -65,8 +65,8 @@ def test_closest_photographs_are_held_out(tmp_path):
     np.testing.assert_allclose(scene.metadata["times_nearer"], [np.median(train) / 4])
 
 
-def test_a_longer_lens_is_as_good_as_standing_nearer(tmp_path):
-    """Of a transforms.json, points inside the image count as seen."""
+def test_a_longer_lens_counts_as_nearer(tmp_path):
+    """For a transforms.json, points inside the image count as seen."""
     pose = {"transform_matrix": np.diag([1.0, -1, -1, 1]).tolist(), "w": WIDTH, "h": HEIGHT}
     frames = [{"file_path": f"{i}.png", "fx": 9.0 + 3 * (i == 3), **pose} for i in range(5)]
     for i in range(5):
@@ -86,7 +86,7 @@ def test_closest_needs_photographs_and_points(capture):
     for i in (1, 2):
         (capture / f"images/{i}.png").unlink()
     np.save(capture / "poses_bounds.npy", llff_rows(1)[0])
-    with pytest.raises(SceneError, match="closest needs 2 photographs"):
+    with pytest.raises(SceneError, match="closest needs at least 2 photographs"):
         load_scene(capture, split="closest")
     with pytest.raises(SceneError, match="split 'nearest' is unknown: choose one of given, every8"):
         load_scene(capture, split="nearest")

@@ -14,7 +14,7 @@ support = jax.jit(find_support)
 
 @pytest.fixture(scope="module")
 def capture():
-    """Photographs from several heights, with a lens of other focal lengths and a masked strip."""
+    """Photographs from several heights; one has other focal lengths, one a masked strip."""
     heights = ((-1.0, 4.0), (0.0, 3.0), (1.0, 6.0), (0.4, 2.0))
     cameras = [plane.camera_above(x, 0.1 * x, z, tilt=0.1 * x) for x, z in heights]
     views, depths = plane.make_views(cameras)
@@ -26,7 +26,7 @@ def capture():
 
 
 def flat_depth(cameras, i):
-    """Exact depth of a photograph of the plane whose focal lengths are not the plane's."""
+    """Exact depth of photograph `i`, whatever its focal lengths."""
     fx, fy, cx, cy = np.asarray(cameras.intrinsics[i], np.float64)
     pose = np.asarray(cameras.camtoworld[i], np.float64)
     x, y = np.moveaxis(np.asarray(GRID, np.float64), -1, 0)
@@ -35,7 +35,7 @@ def flat_depth(cameras, i):
 
 
 def oracle(camera, depth, views):
-    """Counts, footprints, and how near to a border any projection is, in pixels; float64."""
+    """Counts, footprints, and the distance of the nearest border in pixels, in float64."""
     fx, fy, cx, cy = np.asarray(camera.intrinsics, np.float64)
     pose = np.asarray(camera.camtoworld, np.float64)
     count = np.zeros(depth.shape, int)
@@ -61,7 +61,7 @@ def oracle(camera, depth, views):
     return count, finest, clearance
 
 
-def test_counts_and_footprints_are_those_of_the_definition(capture):
+def test_counts_and_footprints_match_the_definition(capture):
     views, depths = capture
     camera = plane.camera_above(0.8, 0.0, 5.0, tilt=0.1)
     depth = np.float32(plane.photograph(camera)[1])
@@ -76,7 +76,7 @@ def test_counts_and_footprints_are_those_of_the_definition(capture):
     assert np.isinf(np.asarray(found.footprint)[3:6, 4:9]).all()
 
 
-def test_a_footprint_is_the_ratio_of_distances_times_that_of_focal_lengths():
+def test_a_footprint_is_the_ratio_of_distances_times_the_ratio_of_focal_lengths():
     views, depths = plane.make_views([plane.camera_above(0.0, 0.0, 4.0)])
     near = plane.camera_above(0.0, 0.0, 1.0)
     near = near.replace(intrinsics=near.intrinsics * jnp.array([2.0, 2, 1, 1]))
@@ -85,12 +85,12 @@ def test_a_footprint_is_the_ratio_of_distances_times_that_of_focal_lengths():
     np.testing.assert_allclose(found.footprint, 4 * 2, rtol=1e-6)
 
 
-def test_what_nobody_saw_has_no_support(capture):
+def test_unseen_surfaces_have_no_support(capture):
     views, depths = capture
     wide = plane.camera_above(0.0, 0.0, 6.0)
     depth = jnp.asarray(plane.photograph(wide)[1], jnp.float32)
     assert support(wide, GRID, depth, views, depths).count.max() == 4
-    # In front of the plane, where no photograph's depth confirms it; and nothing at all.
+    # Points in front of the plane, which no depth map confirms, and undefined depth.
     for wrong in (0.7 * depth, 0 * depth):
         found = support(wide, GRID, wrong, views, depths)
         assert found.count.max() == 0
@@ -99,7 +99,7 @@ def test_what_nobody_saw_has_no_support(capture):
     assert found.count.max() == 0
 
 
-def test_the_count_is_that_of_support(capture):
+def test_count_seen_equals_the_count_of_find_support(capture):
     views, depths = capture
     data = plane.camera_above(0.2, 0.1, 5.0), GRID, jnp.full(GRID.shape[:2], 5.0), views, depths
     np.testing.assert_array_equal(jax.jit(count_seen)(*data), support(*data).count)

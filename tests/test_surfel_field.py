@@ -1,24 +1,27 @@
-"""Surfels as a field: its loss, its schedules, and that training finds a surface."""
+"""Surfels as a field: loss, schedules, training that finds a surface, and overflow."""
 
 import dataclasses
 import functools
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import plane
 import pytest
-from splat_scenes import random_scene, to_camera, to_surfels
+from splat_scenes import COUNT, SCENES, random_scene, to_camera, to_surfels
 
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.metrics import psnr
 from jaxcloseup.splats import RasterizeConfig
 from jaxcloseup.splats.field import (
+    SurfelBuffers,
     SurfelConfig,
     camera_extent,
     surfel_field,
     surfel_optimizer,
+    with_expected_depth,
 )
 from jaxcloseup.splats.mcmc import McmcConfig
 from jaxcloseup.splats.surfels import random_points
@@ -35,7 +38,7 @@ CONFIG = SurfelConfig(
     means_lr=(2e-3, 2e-4),
     sh_lr=2e-2,
     rotation_lr=1e-2,
-    decay_steps=STEPS,
+    means_lr_steps=STEPS,
     density=McmcConfig(every=25, start=25, stop=150, growth=1.1),
     raster=RasterizeConfig(capacity=2**13, near=0.2, tile=8, chunk=4, block=12),
 )
@@ -94,7 +97,7 @@ def test_training_finds_the_plane(trained, capture):
         assert psnr(image.rgb, views.rgb[i]) > 26
         before = render(start.params, start.buffers, camera).depth
         errors.append([np.abs(d - depths[i]) / depths[i] for d in (before, image.depth)])
-        # They start at random, and three seconds of training turn them half of the way.
+        # Normals start at random; this short training turns them half of the way.
         upwards = [
             np.mean(render(s.params, s.buffers, camera).aux.surfels.normal[..., 2])
             for s in (start, state)
@@ -104,8 +107,8 @@ def test_training_finds_the_plane(trained, capture):
     assert after < 0.7 * before
 
 
-def test_colors_of_an_image_may_change_as_a_whole(trained, capture):
-    """A photograph in other light costs three tenths of what it does without the affine change."""
+def test_an_image_may_change_its_colors_by_an_affine_map(trained, capture):
+    """A photograph in other light costs 0.3 times its loss without the affine map."""
     state, camera = trained[2], jax.tree.map(lambda leaf: leaf[0], capture[0].cameras)
     image = render(state.params, state.buffers, camera)
     change = jnp.array([[0.8, 0.1, 0.0], [0.0, 0.7, 0.1], [0.1, 0.0, 0.9]])
@@ -133,15 +136,15 @@ def test_schedules_follow_the_step(trained):
         assert state.buffers.degree == degree
         assert state.buffers.regularize == regularize
     assert start.buffers.alive.sum() == 250
-    # Relocations at 50, 75, 100, 125, the last one before 150.
+    # Relocations come at 50, 75, 100 and 125, before `stop` at 150.
     assert middle.buffers.alive.sum() == int(int(int(250 * 1.1) * 1.1) * 1.1)
     assert end.buffers.alive.sum() == int(int(middle.buffers.alive.sum()) * 1.1)
     assert start.step == 0
     assert end.step == STEPS
 
 
-def test_what_is_saved_goes_on_to_the_same_bits(trained, capture, run, tmp_path):
-    """Through relocations, and with surfels that were born before and after."""
+def test_a_saved_state_continues_to_the_same_bits(trained, capture, run, tmp_path):
+    """The steps after the checkpoint include relocations and growth."""
     start, middle, end, _ = trained
     Checkpoints(tmp_path, {}).save("baseline", STEPS // 2, middle, {})
     _, kept, _ = Checkpoints(tmp_path, {}).load("baseline", start)
@@ -153,8 +156,8 @@ def test_what_is_saved_goes_on_to_the_same_bits(trained, capture, run, tmp_path)
         np.testing.assert_array_equal(now, before)
 
 
-def test_late_surfels_wander_as_little_as_they_learn(trained):
-    """The noise follows the learning rate of the means."""
+def test_late_noise_is_as_small_as_late_learning_rates(trained):
+    """The position noise follows the learning rate of the means."""
     state = trained[2].replace(step=jnp.int32(STEPS + 1))
     moves = []
     for late_lr_scale in (1.0, 0.1):
@@ -167,8 +170,8 @@ def test_late_surfels_wander_as_little_as_they_learn(trained):
     assert np.linalg.norm(moves[1]) == pytest.approx(0.1 * np.linalg.norm(moves[0]), rel=1e-2)
 
 
-def test_the_optimizer_forgets_surfels_that_moved(trained):
-    """Adam's moments of rows that a relocation changed are zero, of the others they are not."""
+def test_the_optimizer_forgets_surfels_that_changed(trained):
+    """Adam's moments are 0 in rows that a relocation changed, and unchanged in other rows."""
     state = trained[1]
     state = state.replace(step=jnp.int32(50))
     moved = jax.jit(FIELD.adapt)(jax.random.key(1), state)
@@ -186,7 +189,7 @@ def test_the_optimizer_forgets_surfels_that_moved(trained):
     assert moved.opt_state[0].count == state.opt_state[0].count
 
 
-def test_first_step_moves_everything_by_its_learning_rate():
+def test_the_first_step_moves_every_parameter_by_its_learning_rate():
     surfels = to_surfels(random_scene(0))
     gradient = jax.tree.map(lambda leaf: jnp.where(leaf > 0, 3.0, -0.5), surfels)
     with jax.numpy_dtype_promotion("standard"):
@@ -197,16 +200,16 @@ def test_first_step_moves_everything_by_its_learning_rate():
         "quaternions": 1e-2,
         "opacity_logits": 5e-2,
     }
-    for name, rate in expected.items():
+    for name, learning_rate in expected.items():
         sign = np.sign(getattr(gradient, name))
-        np.testing.assert_allclose(getattr(updates, name), -rate * sign, rtol=1e-5)
+        np.testing.assert_allclose(getattr(updates, name), -learning_rate * sign, rtol=1e-5)
     size = np.abs(updates.sh)
     np.testing.assert_allclose(size[:, 0], 2e-2, rtol=1e-5)
     np.testing.assert_allclose(size[:, 1:], 2e-2 / 20, rtol=1e-5)
 
 
 def test_late_steps_are_smaller():
-    config = dataclasses.replace(CONFIG, decay_steps=1, late_lr_scale=0.1)
+    config = dataclasses.replace(CONFIG, means_lr_steps=1, late_lr_scale=0.1)
     optimizer = surfel_optimizer(config, extent=EXTENT)
     surfels = to_surfels(random_scene(0))
     with jax.numpy_dtype_promotion("standard"):
@@ -214,7 +217,7 @@ def test_late_steps_are_smaller():
         late, _ = optimizer.update(surfels, state, surfels)
     for name in ("log_scales", "quaternions", "opacity_logits", "sh"):
         np.testing.assert_allclose(getattr(late, name), 0.1 * getattr(first, name), rtol=1e-4)
-    # The means' rate has fallen to its last value besides.
+    # The learning rate of the means has also decayed to its last value.
     np.testing.assert_allclose(late.means, 0.01 * first.means, rtol=1e-4)
 
 
@@ -225,7 +228,7 @@ def image(trained, capture):
     return render(state.params, state.buffers, camera)
 
 
-def test_what_weighs_nothing_does_not_count(image, capture):
+def test_pixels_of_weight_zero_do_not_count(image, capture):
     target = capture[0].rgb[1]
     weight = jnp.ones(target.shape[:2]).at[:, 20:].set(0)
     value, gradient = judge(image.rgb, image, target, weight)
@@ -237,7 +240,7 @@ def test_what_weighs_nothing_does_not_count(image, capture):
 
 
 @pytest.mark.parametrize("kind", ["nothing", "the border"])
-def test_no_weight_is_no_loss_and_no_nan(image, capture, kind):
+def test_without_weight_the_loss_is_zero_and_not_nan(image, capture, kind):
     weight = jnp.zeros(capture[0].rgb.shape[1:3])
     if kind == "the border":
         weight = weight.at[0].set(1)
@@ -247,7 +250,7 @@ def test_no_weight_is_no_loss_and_no_nan(image, capture, kind):
     assert np.isfinite(gradient).all()
 
 
-def test_degree_zero_looks_alike_from_everywhere(trained, capture):
+def test_degree_zero_ignores_higher_harmonics(trained, capture):
     state = trained[2]
     camera = jax.tree.map(lambda leaf: leaf[0], capture[0].cameras)
     bands = state.params.replace(sh=state.params.sh.at[:, 1:].add(0.5))
@@ -257,31 +260,67 @@ def test_degree_zero_looks_alike_from_everywhere(trained, capture):
     assert np.any(render(bands, state.buffers, camera).rgb != plain)
 
 
-def test_depth_is_the_median_or_the_mean(trained, capture):
+def test_depth_is_the_median_or_expected_depth(trained, capture):
     state = trained[2]
     camera = jax.tree.map(lambda leaf: leaf[0], capture[0].cameras)
     image = render(state.params, state.buffers, camera)
-    mean = render(state.params, state.buffers.replace(expected=jnp.float32(1)), camera)
+    buffers = with_expected_depth(state.buffers, True)
+    chex.assert_trees_all_equal_shapes_and_dtypes(buffers, state.buffers)
+    mean = render(state.params, buffers, camera)
     np.testing.assert_array_equal(image.depth, image.aux.surfels.median_depth)
     assert np.any(mean.depth != image.depth)
     assert np.median(np.abs(mean.depth / image.depth - 1)) < 0.05
-    # Which of them a new field has is a matter of its configuration.
+    stacked = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), buffers)
+    np.testing.assert_array_equal(with_expected_depth(stacked, False).expected, [0, 0])
+    # The config chooses the depth of a new field.
     other = surfel_field(dataclasses.replace(CONFIG, depth="expected"), extent=EXTENT)
     for field, flag in ((FIELD, 0), (other, 1)):
         _, buffers = field.init(jax.random.key(0), jnp.eye(3), jnp.eye(3))
         assert buffers.expected == flag
 
 
-def test_settings_that_cannot_be_are_refused():
+def test_without_density_control_only_the_schedule_changes(trained):
+    state = trained[0].replace(step=jnp.int32(80))
+    field = surfel_field(dataclasses.replace(CONFIG, density=None), extent=EXTENT)
+    after = field.adapt(jax.random.key(1), state)
+    jax.tree.map(np.testing.assert_array_equal, after.params, state.params)
+    assert (after.buffers.degree, after.buffers.regularize) == (1, 1)
+
+
+def test_a_field_with_more_capacity_renders_what_overflowed():
+    """A caller doubles the capacity until everything fits, with the same parameters and buffers."""
+    params, camera = to_surfels(SCENES["in front"]), to_camera()
+    zero = jnp.float32(0)
+    buffers = SurfelBuffers(jnp.ones(COUNT, bool), jnp.int32(1), zero, zero)
+
+    def render_with(capacity):
+        raster = dataclasses.replace(CONFIG.raster, capacity=capacity)
+        field = surfel_field(dataclasses.replace(CONFIG, raster=raster), extent=EXTENT)
+        return jax.jit(field.render)(params, buffers, camera, None, None)
+
+    capacity = 40
+    image = render_with(capacity)
+    assert image.overflow > 0
+    while int(image.overflow) > 0:
+        capacity *= 2
+        image = render_with(capacity)
+    assert 40 < capacity < CONFIG.raster.capacity
+    jax.tree.map(np.testing.assert_array_equal, image, render_with(CONFIG.raster.capacity))
+    np.testing.assert_array_equal(image.normal, image.aux.surfels.normal)
+
+
+def test_invalid_settings_are_refused():
     with pytest.raises(ValueError, match="depth"):
         surfel_field(dataclasses.replace(CONFIG, depth="mean"), extent=EXTENT)
     with pytest.raises(ValueError, match="extent"):
         surfel_field(CONFIG, extent=0.0)
+    with pytest.raises(TypeError, match="density must be None or one of McmcConfig"):
+        surfel_field(dataclasses.replace(CONFIG, density="classic"), extent=EXTENT)
     with pytest.raises(ValueError, match="whole images"):
         FIELD.render(to_surfels(random_scene(0)), None, to_camera(), jnp.zeros((5, 2)), None)
 
 
-def test_extent_is_the_reach_of_the_cameras():
+def test_extent_is_the_largest_distance_to_the_mean_camera():
     poses = np.tile(np.eye(4)[:3], (3, 1, 1))
     poses[:, 0, 3] = [-1, 0, 4]
     cameras = Camera(jnp.asarray(poses, jnp.float32), jnp.ones((3, 4)), 4, 4)

@@ -1,4 +1,4 @@
-"""Surfels to PLY and back, and what another program reads in the file."""
+"""Surfels to PLY and back, and the layout that other programs read."""
 
 import struct
 
@@ -14,7 +14,7 @@ from jaxcloseup.ply import PlyError
 
 
 def by_hand(path):
-    """Header lines and columns of a float-only little-endian PLY file, by `struct` alone."""
+    """Read the names and columns of a float-only little-endian PLY file with `struct` alone."""
     data = path.read_bytes()
     header, body = data.split(b"end_header\n", 1)
     lines = header.decode("ascii").splitlines()
@@ -40,7 +40,7 @@ def test_round_trip_is_exact(tmp_path, num_scales, degree):
     jax.tree.map(np.testing.assert_array_equal, read_surfels(path), expected)
 
 
-def test_the_file_is_what_viewers_expect(tmp_path):
+def test_the_file_has_the_layout_that_viewers_expect(tmp_path):
     surfels = to_surfels(random_scene(2))
     write_surfels(tmp_path / "s.ply", surfels, jnp.ones(16, bool))
     names, columns = by_hand(tmp_path / "s.ply")
@@ -53,7 +53,7 @@ def test_the_file_is_what_viewers_expect(tmp_path):
         normal = [columns[name][row] for name in ("nx", "ny", "nz")]
         rotation = rotation_of(np.asarray(surfels.quaternions[row], float))
         np.testing.assert_allclose(normal, rotation[:, 2], atol=1e-6)
-        # Channel by channel: red of the three bands, then green.
+        # Channel by channel: three coefficients of red, then of green.
         assert columns["f_rest_1"][row] == surfels.sh[row, 2, 0]
         assert columns["f_rest_3"][row] == surfels.sh[row, 1, 1]
         thin = np.log(1e-3) + float(surfels.log_scales[row].min())
@@ -61,7 +61,7 @@ def test_the_file_is_what_viewers_expect(tmp_path):
         assert columns["opacity"][row] == surfels.opacity_logits[row]
 
 
-def test_what_is_not_finite_is_left_out_and_counted(tmp_path):
+def test_surfels_that_are_not_finite_are_dropped_and_counted(tmp_path):
     surfels = to_surfels(random_scene(3))
     surfels = surfels.replace(means=surfels.means.at[jnp.array([2, 5])].set(jnp.nan))
     alive = jnp.ones(16, bool).at[5].set(False)
@@ -69,7 +69,7 @@ def test_what_is_not_finite_is_left_out_and_counted(tmp_path):
     assert len(read_surfels(tmp_path / "s.ply").means) == 14
 
 
-def test_columns_are_found_by_their_numbers(tmp_path):
+def test_columns_are_read_by_their_numbers(tmp_path):
     surfels = to_surfels(random_scene(4))
     write_surfels(tmp_path / "s.ply", surfels, jnp.ones(16, bool))
     names, columns = by_hand(tmp_path / "s.ply")
@@ -81,12 +81,12 @@ def test_columns_are_found_by_their_numbers(tmp_path):
     jax.tree.map(np.testing.assert_array_equal, read_surfels(tmp_path / "t.ply"), surfels)
 
 
-def test_other_point_clouds_are_refused_in_a_sentence(tmp_path):
+def test_other_point_clouds_are_refused(tmp_path):
     path = tmp_path / "p.ply"
     header = "ply\nformat ascii 1.0\nelement vertex 1\n"
     properties = "".join(f"property float {axis}\n" for axis in "xyz")
     path.write_text(f"{header}{properties}end_header\n1 2 3\n")
-    with pytest.raises(PlyError, match=r"p.ply does not hold splats"):
+    with pytest.raises(PlyError, match=r"p.ply lacks the properties of splats"):
         read_surfels(path)
-    with pytest.raises(ValueError, match="num_scales is 2 or 3"):
+    with pytest.raises(ValueError, match="num_scales must be 2 or 3, got 4"):
         write_surfels(path, to_surfels(random_scene(0)), jnp.ones(16, bool), num_scales=4)

@@ -1,4 +1,4 @@
-"""Initial surfels, their colors, and the losses on their images."""
+"""Initial surfels, their colors, and the regularizers of their images."""
 
 import cv2
 import jax
@@ -66,8 +66,8 @@ def test_harmonics_are_orthonormal():
     np.testing.assert_allclose(basis.T @ (measure[:, None] * basis), np.eye(16), atol=1e-10)
 
 
-def test_harmonics_turn_within_their_degree():
-    """A turned direction mixes each degree's functions by an orthogonal matrix."""
+def test_rotations_mix_harmonics_within_a_degree():
+    """Rotating directions mixes the functions of each degree by an orthogonal matrix."""
     directions = np.random.default_rng(1).normal(size=(60, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     turn = rotation_of([0.3, -0.5, 0.7, 0.2])
@@ -82,7 +82,7 @@ def test_harmonics_turn_within_their_degree():
 
 
 @pytest.mark.parametrize("degree", range(4))
-def test_colors_are_the_written_out_polynomials(degree):
+def test_colors_agree_with_written_out_polynomials(degree):
     rng = np.random.default_rng(degree)
     sh = rng.normal(size=((degree + 1) ** 2, 3))
     direction = np.array([0.48, -0.6, 0.64])
@@ -100,7 +100,7 @@ def test_an_unknown_degree_is_refused():
         sh_basis(jnp.zeros(3), 4)
 
 
-def test_depth_of_a_plane_has_its_normal():
+def test_normals_of_a_plane_are_exact():
     turn = rotation_of([0.9, 0.2, -0.3, 0.1])
     camtoworld = np.concatenate([turn, [[1.0], [2.0], [-0.5]]], axis=1)
     normal = np.array([0.3, -0.4, -0.85])  # in the camera's frame, towards it
@@ -121,8 +121,8 @@ def test_depth_of_a_plane_has_its_normal():
     assert np.all(np.isfinite(gradient))
 
 
-def test_normals_in_float32_are_those_of_a_sobel_filter():
-    """On a bumpy map, against points differenced by OpenCV."""
+def test_float32_normals_agree_with_opencv():
+    """OpenCV takes the differences of points on a bumpy depth map."""
     camera = to_camera()
     x, y = np.meshgrid(np.arange(32) + 0.5, np.arange(24) + 0.5)
     depth = 2 + 0.1 * np.sin(x / 3) * np.cos(y / 4)
@@ -136,7 +136,7 @@ def test_normals_in_float32_are_those_of_a_sobel_filter():
     assert np.all(expected[..., 2] < 0)
 
 
-def test_losses():
+def test_regularizers_agree_with_arithmetic():
     normal = jnp.zeros((2, 2, 3)).at[0, 0].set(jnp.array([0.0, 0.6, -0.3]))
     surface = jnp.zeros((2, 2, 3)).at[0].set(jnp.array([0.0, 0.6, -0.8]))
     alpha = jnp.array([[0.5, 1.0], [1.0, 1.0]])

@@ -21,26 +21,27 @@ from absl.testing import flagsaver
 from tiny_runs import TINY, TINY_SURFELS
 
 from experiments import sweep
-from experiments.methods.presets import initial_points, pseudo_settings
+from experiments.methods import pseudo_settings
 from experiments.reporting.pictures import comparisons
 from experiments.reporting.tables import paired_bootstrap, rows, write_sweep
 from experiments.training import sweep as sweep_stages
 from experiments.training.arms import make_arm
-from experiments.training.loop import Programs
-from experiments.training.stages import rendered_depths
+from experiments.training.programs import Programs
+from experiments.training.setup import initial_points, start_labels
 from experiments.training.sweep import run_sweep, stack_arms
-from jaxcloseup.geometry.union_warp import block_sources
 from jaxcloseup.scenes import load_scene
 from jaxcloseup.train import init_state
 
 
 ARMS = ["control", "labels", "diverse", "rgb_tolerance=0.5+magnification=2:3"]
-TINY_STEPS = dataclasses.replace(TINY, closeup_steps=2, test_time_steps=2)
+TINY_STEPS = dataclasses.replace(
+    TINY, field=dataclasses.replace(TINY.field, target_steps=2), closeup_steps=2
+)
 
 
 @functools.cache
 def begin(preset, capture_folder):
-    """Programs, and for each arm its settings, state, depths and sources after a few steps."""
+    """Programs, the start of labels after a few steps, and the settings of each arm."""
     scene = load_scene(str(capture_folder))
     programs = Programs(preset, scene)
     points = initial_points(jax.random.key(1), scene)
@@ -48,10 +49,8 @@ def begin(preset, capture_folder):
         jax.random.key(0), *points, field=programs.field, optimizer=programs.optimizer
     )
     state, _ = programs.run("photographs", state, scene.train, count=3)
-    depths = rendered_depths(functools.partial(programs.render, state), scene.train.cameras, scene)
-    sources = jax.jit(block_sources)(scene.train.cameras, depths, scene.train.weight)
-    settings = [make_arm(name, pseudo_settings(preset)).settings for name in ARMS]
-    return programs, scene.train, [(s, state, depths, sources) for s in settings]
+    start = start_labels(programs, state, seed=0)
+    return programs, start, [make_arm(name, preset).settings for name in ARMS]
 
 
 # SSIM's derivative jumps where a window is flat, on whichever side of 0 rounding falls.
@@ -83,15 +82,15 @@ def assert_same_step(arm, alone, before):
 @pytest.mark.parametrize("preset", [TINY_STEPS, TINY_SMOOTH], ids=["nerf", "surfels"])
 def test_an_arm_is_the_run_alone(preset, capture_folder):
     with jax.numpy_dtype_promotion("standard"):
-        programs, views, arms = begin(preset, capture_folder)
-        states, *data = stack_arms(arms, len(jax.devices()))
-        together, metrics = programs.run("arms", states, views, *data, count=1)
-        for i, (settings, state, depths, sources) in enumerate(arms):
+        programs, start, arms = begin(preset, capture_folder)
+        state, sources = start
+        stacked = stack_arms(arms, [start] * len(arms), len(jax.devices()))
+        together, metrics = programs.run("arms", *stacked, count=1)
+        for i, settings in enumerate(arms):
             if ARMS[i] == "control":
-                alone, _ = programs.run("photographs", state, views, count=1)
+                alone, _ = programs.run("photographs", state, sources.views, count=1)
             else:
-                data = views, depths, settings, sources
-                alone, _ = programs.run("virtual", state, *data, count=1)
+                alone, _ = programs.run("random_closeups", state, sources, settings, count=1)
             arm = jax.tree.map(lambda leaf, i=i: leaf[i], together.replace(step=alone.step[None]))
             assert_same_step(arm.replace(step=alone.step), alone, state)
             assert int(together.step) == int(alone.step)
@@ -105,12 +104,13 @@ def test_an_arm_is_the_run_alone(preset, capture_folder):
 
 def test_an_arm_that_diverges_takes_no_other_down(capture_folder, capsys):
     with jax.numpy_dtype_promotion("standard"):
-        programs, views, arms = begin(TINY_STEPS, capture_folder)
-        broken = (arms[1][0].replace(label_loss_weight=jnp.float32(jnp.nan)), *arms[1][1:])
+        programs, start, arms = begin(TINY_STEPS, capture_folder)
+        broken = arms[1].replace(label_loss_weight=jnp.float32(jnp.nan))
         both = []
         for second in (arms[1], broken):
-            states, *data = stack_arms([arms[0], second, arms[2]], len(jax.devices()))
-            both.append(programs.run("arms", states, views, *data, count=2))
+            settings = [arms[0], second, arms[2]]
+            stacked = stack_arms(settings, [start] * 3, len(jax.devices()))
+            both.append(programs.run("arms", *stacked, count=2))
     (healthy, _), (after, metrics) = both
     assert metrics["skipped"][:3] == [0, 2, 0]  # then copies of the last, one a device
     assert "skipped, not finite" in capsys.readouterr().out
@@ -118,21 +118,20 @@ def test_an_arm_that_diverges_takes_no_other_down(capture_folder, capsys):
         pick = functools.partial(jax.tree.map, lambda leaf, i=i: leaf[i])
         jax.tree.map(np.testing.assert_array_equal, pick(after.params), pick(healthy.params))
     first = jax.tree.map(lambda leaf: leaf[1], after.params)
-    jax.tree.map(np.testing.assert_array_equal, first, arms[1][1].params)
+    jax.tree.map(np.testing.assert_array_equal, first, start.state.params)
 
 
 def sweep_tiny(scene, folder, arms=("baseline", "control", "diverse", "test_time"), seeds=2, **kw):
     kw |= {"names": {"method": "nerf", "preset": "tiny"}, "max_parallel": 3}
     with jax.numpy_dtype_promotion("standard"):
-        found, pictures = run_sweep(scene, TINY_STEPS, arms, seeds, folder, **kw)
-    return (found, pictures) if "compare" in kw else found
+        return run_sweep(scene, TINY_STEPS, arms, seeds, folder, **kw)
 
 
 def test_a_sweep_cut_off_and_resumed_ends_the_same(capture_folder, tmp_path, monkeypatch, capsys):
     scene = load_scene(str(capture_folder))
     programs = Programs(TINY_STEPS, scene)  # compiled once for both
     monkeypatch.setattr(sweep_stages, "Programs", lambda preset, scene: programs)
-    whole = sweep_tiny(scene, tmp_path / "sweep")
+    whole = sweep_tiny(scene, tmp_path / "sweep").scores
     assert list(whole) == ["baseline", "control", "diverse", "test_time"]
     assert all(list(of_arm) == ["0", "1"] for of_arm in whole.values())
     psnr = {arm: whole[arm]["0"]["splits"]["test"]["psnr"] for arm in whole}
@@ -144,8 +143,9 @@ def test_a_sweep_cut_off_and_resumed_ends_the_same(capture_folder, tmp_path, mon
         shutil.rmtree(tmp_path / "sweep" / stage)
     capsys.readouterr()
     compare = tmp_path / "compare"
-    again, pictures = sweep_tiny(scene, tmp_path / "sweep", compare=compare)
-    assert again == whole
+    again = sweep_tiny(scene, tmp_path / "sweep")
+    assert again.scores == whole
+    pictures = comparisons(compare, again.shown, again.renderings)
     assert capsys.readouterr().out.count("resumed") == 3  # both baselines and the first arms
 
     # Truth, four arms and the error of the last, of the one close-up and the one ordinary view.
@@ -220,26 +220,28 @@ def test_the_interval_is_that_of_the_mean():
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("warm", "--arms=warm is not an arm: name baseline"),
-        ("rgb_tolerance=high", "not an arm"),
-        ("sharpness=3", "sharpness takes no such value; settings are .*rgb_tolerance"),
-        ("magnification=3", "magnification is a range"),
-        ("pose=1", "pose takes no such value"),
-        ("replace=1", "replace takes no such value"),
-        ("rgb_tolerance=nan", "rgb_tolerance takes no such value"),
-        ("magnification=8:2", "magnification is a range"),
-        ("magnification=0:4", "magnification lies between 1 and inf"),
-        ("label_loss_weight=1.5", "label_loss_weight lies between 0 and 1"),
-        ("rate=-1", "rate lies between 0 and inf"),
-        ("rate=1+rate=2", "sets rate twice"),
-        ("mask+", "is not an arm"),
-        ("baseline+rate=2", "baseline has no fine-tuning"),
+        ("warm", r"--arms=warm: warm is neither an arm \(baseline.* nor a setting of labels"),
+        ("rgb_tolerance=high", "rgb_tolerance must be a number between 0 and inf"),
+        ("sharpness=3", "sharpness=3 is neither an arm .*rgb_tolerance.*with --set"),
+        ("capacity=300", "capacity=300 is neither an arm .*with --set"),
+        ("magnification=3", "magnification must be two numbers between 1 and inf, as in 2:4"),
+        ("pose=1", "pose=1 is neither"),
+        ("replace=1", "replace=1 is neither"),
+        ("rgb_tolerance=nan", "rgb_tolerance must be between 0 and inf"),
+        ("magnification=8:2", "magnification must be two numbers .*, rising"),
+        ("magnification=0:4", "magnification must be two numbers between 1 and inf"),
+        ("label_loss_weight=1.5", "label_loss_weight must be between 0 and 1"),
+        ("lr_scale=-1", "lr_scale must be between 0 and inf"),
+        ("lr_scale=1+lr_scale=2", "sets lr_scale twice"),
+        ("use_mask=perhaps", "use_mask must be true or false"),
+        ("mask+", "is neither an arm"),
+        ("baseline+lr_scale=2", "baseline has no fine-tuning"),
         ("oracle+depth_error=0.5", "oracle takes no other depth"),
     ],
 )
 def test_a_name_that_is_no_arm_is_one_sentence(name, message):
     with pytest.raises(ValueError, match=message):
-        make_arm(name, pseudo_settings(TINY))
+        make_arm(name, TINY)
 
 
 @pytest.fixture
@@ -254,11 +256,12 @@ def parsed_flags():
     [
         ({"arms": ["control", "control"]}, "--arms=control,control must name one or more"),
         ({"scenes": []}, "--scenes= must name one or more"),
-        ({"arms": ["warm"]}, "--arms=warm is not an arm"),
+        ({"arms": ["warm"]}, "--arms=warm: warm is neither an arm"),
         ({"method": "nerf", "arms": ["label_loss_weight=0.3"]}, "this preset pools the losses"),
-        ({"method": "nerf", "arms": ["expected_depth=1"]}, "a NeRF has expected depth only"),
-        ({"arms": ["expected_depth=2"]}, "expected_depth is 0"),
-        ({"arms": ["depth_error=-1"]}, "depth_error is a part"),
+        ({"method": "nerf", "arms": ["expected_depth=1"]}, "nerf has no setting expected_depth"),
+        ({"arms": ["expected_depth=2"]}, "expected_depth must be true or false or none"),
+        ({"arms": ["depth_error=-1"]}, "depth_error is a share"),
+        ({"set": ["capacity=0"]}, "--set=capacity=0: capacity must be between 1 and inf"),
         ({"arms": ["depth_error=0+expected_depth=1"]}, "do not go together"),
         ({"scenes": ["nowhere"]}, "nowhere"),
     ],
@@ -274,31 +277,34 @@ def test_flags_that_make_no_sense_are_one_sentence(parsed_flags, tmp_path, chang
 
 
 def test_names_change_settings():
-    settings = make_arm("rgb_tolerance=0.5+magnification=2:3", pseudo_settings(TINY)).settings
+    settings = make_arm("rgb_tolerance=0.5+magnification=2:3", TINY).settings
     assert float(settings.rgb_tolerance) == 0.5
     np.testing.assert_array_equal(settings.pose.magnification, [2, 3])
     assert float(settings.label_loss_weight) == 0.5
-    assert float(make_arm("control", pseudo_settings(TINY)).settings.label_loss_weight) == 0
-    arm = make_arm("expected_depth=1+look_at=1+num_sources=3", pseudo_settings(TINY))
-    assert arm.expected_depth is True
+    assert float(make_arm("control", TINY).settings.label_loss_weight) == 0
+    arm = make_arm("expected_depth=1+look_at=1+num_sources=3", TINY_SURFELS)
+    assert arm.labels.expected_depth is True
     assert (arm.settings.pose.look_at, arm.settings.num_sources) == (1, 3)
-    assert make_arm("diverse", pseudo_settings(TINY)).expected_depth is None
-    assert make_arm("depth_error=0", pseudo_settings(TINY)).in_turn
-    arm = make_arm("resolved+magnification=2:3", pseudo_settings(TINY))
+    ours, theirs = make_arm("diverse", TINY).settings, pseudo_settings(TINY.labels)
+    chex.assert_trees_all_equal(ours, theirs)
+    assert make_arm("diverse", TINY).labels.expected_depth is None
+    assert make_arm("depth_error=0", TINY).in_turn
+    arm = make_arm("resolved+magnification=2:3", TINY)
     assert arm.in_turn and arm.kind == "resolved"
     assert arm.settings.pose.magnification.tolist() == [2, 3]
-    both = make_arm("mask+rate=2", pseudo_settings(TINY)).settings
-    mask = make_arm("mask", pseudo_settings(TINY)).settings
-    chex.assert_trees_all_equal(both, mask.replace(rate=jnp.float32(2)))
+    both = make_arm("mask+lr_scale=2", TINY).settings
+    mask = make_arm("mask", TINY).settings
+    chex.assert_trees_all_equal(both, mask.replace(lr_scale=jnp.float32(2)))
 
 
 def test_an_arm_may_have_labels_from_the_other_depth(capture_folder, tmp_path):
     scene = load_scene(str(capture_folder))
     arms = ["diverse", "expected_depth=0", "expected_depth=1"]
     names = {"method": "surfels", "preset": "tiny"}
-    preset = dataclasses.replace(TINY_SMOOTH, label_loss_weight=0.5)
+    labels = dataclasses.replace(TINY_SMOOTH.labels, label_loss_weight=0.5)
+    preset = dataclasses.replace(TINY_SMOOTH, labels=labels)
     with jax.numpy_dtype_promotion("standard"):
-        found, _ = run_sweep(scene, preset, arms, 1, tmp_path, names=names)
+        found = run_sweep(scene, preset, arms, 1, tmp_path, names=names).scores
     as_ever, median, expected = (found[arm]["0"]["splits"]["test"]["psnr"] for arm in arms)
     assert as_ever == median
     assert as_ever != expected
@@ -309,7 +315,7 @@ jax.distributed.initialize("127.0.0.1:" + sys.argv[2], 2, int(sys.argv[3]))
 assert len(jax.devices()) == 2 * len(jax.local_devices())
 folder = pathlib.Path(sys.argv[1])
 scene = test_sweep.load_scene(str(folder / "capture"))
-found = test_sweep.sweep_tiny(scene, folder / "sweep", ("control", "diverse"), 1)
+found = test_sweep.sweep_tiny(scene, folder / "sweep", ("control", "diverse"), 1).scores
 (folder / ("host" + sys.argv[3] + ".json")).write_text(json.dumps(found))
 """
 
@@ -344,7 +350,7 @@ def test_arms_are_spread_over_hosts(capture_folder, tmp_path):
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     scene = load_scene(str(capture_folder))
-    whole = sweep_tiny(scene, tmp_path / "alone", ("control", "diverse"), 1)
+    whole = sweep_tiny(scene, tmp_path / "alone", ("control", "diverse"), 1).scores
     for process in [start(HOSTS, tmp_path, port, i) for i in range(2)]:
         finish(process)
     hosts = [json.loads((tmp_path / f"host{i}.json").read_text()) for i in range(2)]

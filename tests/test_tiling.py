@@ -39,7 +39,7 @@ def expected_lists(box, order):
 
 
 @pytest.mark.parametrize("capacity", [512, 60])
-def test_lists_hold_what_touches_a_tile_nearest_first(capacity):
+def test_lists_hold_the_splats_of_a_tile_nearest_first(capacity):
     box, order = random_boxes()
     make = functools.partial(tile_lists, height=HEIGHT, width=WIDTH, tile=TILE, block=BLOCK)
     make = jax.jit(functools.partial(make, capacity=capacity))
@@ -47,7 +47,7 @@ def test_lists_hold_what_touches_a_tile_nearest_first(capacity):
     expected = expected_lists(box, order)
     total = sum(map(len, expected))
     assert lists.overflow == max(total - capacity, 0)
-    if lists.overflow > 0:  # what is missing is what lies farthest
+    if lists.overflow > 0:  # pairs of the farthest splats are missing
         pairs = sorted((order[i], i, t) for t, found in enumerate(expected) for i in found)
         kept = {(t, i) for _, i, t in pairs[:capacity]}
         expected = [[i for i in found if (t, i) in kept] for t, found in enumerate(expected)]
@@ -63,7 +63,7 @@ def test_lists_hold_what_touches_a_tile_nearest_first(capacity):
 
 
 @pytest.mark.parametrize("ranks", [1000, 2**20])
-def test_pairs_sort_alike_packed_or_not(ranks):
+def test_packed_and_unpacked_pairs_sort_alike(ranks):
     rng = np.random.default_rng(1)
     tiles = 2**13
     tile, rank = rng.integers(0, tiles, 300), rng.integers(0, ranks, 300)
@@ -73,7 +73,7 @@ def test_pairs_sort_alike_packed_or_not(ranks):
     np.testing.assert_array_equal(found[1], rank[order])
 
 
-def test_countless_pairs_are_still_overflow():
+def test_more_pairs_than_int32_are_overflow():
     box = jnp.tile(jnp.array([[0.0, 0.0, 4096.0, 4096.0]]), (9000, 1))
     make = functools.partial(tile_lists, height=4096, width=4096, tile=8, block=64, capacity=64)
     assert jax.jit(make)(box, jnp.ones(9000)).overflow == 2**31 - 1

@@ -16,13 +16,13 @@ DEPTH = 5.0
 
 @pytest.fixture(scope="module")
 def views():
-    """Four photographs of a textured plane, z = 5 of the world, and their OpenCV poses."""
+    """Four photographs of the textured plane z = 5, and their OpenCV poses."""
     rng = np.random.default_rng(0)
     noise = rng.integers(0, 256, (90, 120, 3), np.uint8)
     texture = cv2.GaussianBlur(
         cv2.resize(noise, (480, 360), interpolation=cv2.INTER_CUBIC), (0, 0), 1
     )
-    # A texel is 0.025 wide, as is a pixel at that distance; the middle one lies at x = y = 0.
+    # A texel is 0.025 wide, like a pixel at that distance; the middle one lies at x = y = 0.
     plane = np.array([[0.025, 0, -6.0], [0, 0.025, -4.5], [0, 0, DEPTH]])
     images, poses = [], []
     for i in range(4):
@@ -45,7 +45,7 @@ def test_points_lie_on_a_plane(views):
     assert rgb.min() >= 0 and rgb.max() <= 1
 
 
-def test_masked_features_do_not_count(views):
+def test_masked_features_are_ignored(views):
     images, poses = views
     masks = [np.zeros((HEIGHT, WIDTH), np.uint8) for _ in images]
     lenses = np.array([LENS] * 4)
@@ -56,15 +56,15 @@ def test_masked_features_do_not_count(views):
     assert len(points) and (column < 0.1).all()
 
 
-def test_one_place_gives_no_points(views):
+def test_one_position_gives_no_points(views):
     images, poses = views
     masks = [np.full((HEIGHT, WIDTH), 255, np.uint8)] * 2
     points, _ = triangulate(images[:2], masks, poses[[0, 0]], np.array([LENS] * 2))
     assert points.shape == (0, 3)
 
 
-def test_a_capture_without_points_gets_some(tmp_path, views):
-    """From training photographs only, and near and far from them."""
+def test_a_capture_without_points_gets_triangulated_ones(tmp_path, views):
+    """The points come from training photographs only, and give near and far."""
     frames = []
     for i, (image, pose) in enumerate(zip(*views, strict=True)):
         write_image(tmp_path / f"{i}.png", image)
@@ -83,7 +83,7 @@ def test_a_capture_without_points_gets_some(tmp_path, views):
     assert np.median(np.abs(again.points[:, 2] - DEPTH)) < 0.05
 
 
-def test_a_handful_of_points_is_none(tmp_path, views, monkeypatch):
+def test_too_few_points_are_dropped(tmp_path, views, monkeypatch):
     few = np.ones((99, 3), np.float32)
     monkeypatch.setattr(loading, "triangulate", lambda *_: (few, few))
     write_image(tmp_path / "a.png", views[0][0])

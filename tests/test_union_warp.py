@@ -80,7 +80,7 @@ def test_chosen_pixels_with_repeats_read_the_whole_image(capture, key):
     np.testing.assert_allclose(result.depth, depth[index[:, 1], index[:, 0]], rtol=1e-5)
 
 
-def test_an_excluded_view_leaves_nothing(capture):
+def test_an_excluded_view_has_no_sources(capture):
     cameras, depths, rgb, weight, virtual = capture
     sources = block(cameras, depths, weight)
     result = warp(sources, cameras, rgb, virtual, pixel_grid(HEIGHT, WIDTH), exclude=1)
@@ -101,7 +101,7 @@ def test_spheres_hold_their_points_and_culling_loses_none(capture):
 
 
 def test_virtual_cameras_batch_under_vmap(capture):
-    """Whether a warp equals the one before it, in part or in whole, or not."""
+    """Some warps equal their predecessor; some differ in the camera or in the excluded view."""
     cameras, depths, rgb, weight, virtual = capture
     sources = block(cameras, depths, weight)
     shifts, excludes = [0.0, 0.0, 0.2, 0.2, 0.0], [-1, -1, -1, 1, -1]

@@ -9,7 +9,7 @@ from jaxcloseup.artifacts.video import write_video
 
 
 def frames(height, width, count=7):
-    """Smooth images that brighten."""
+    """Smooth images that grow brighter."""
     y, x = np.mgrid[:height, :width]
     image = np.stack([x / width, y / height, 0.5 + 0 * x], -1)
     return [0.3 + 0.4 * image + 0.03 * i for i in range(count)]
@@ -47,7 +47,7 @@ def test_webm_by_opencv_keeps_every_frame(tmp_path, opencv_only, size):
     check(write_video(tmp_path / "new" / "a", images, fps=12), ".webm", images)
 
 
-def test_avi_where_there_is_no_webm(tmp_path, opencv_only, monkeypatch):
+def test_avi_without_webm(tmp_path, opencv_only, monkeypatch):
     monkeypatch.delitem(video._OPENCV, ".webm")
     images = frames(64, 96)
     check(write_video(tmp_path / "a.b", images, fps=12), ".avi", images)
@@ -60,22 +60,22 @@ def test_mp4_with_the_extra(tmp_path):
 
 
 @pytest.mark.parametrize("opened", [0, 2])
-def test_a_video_that_was_cut_short_is_none(tmp_path, monkeypatch, opened):
+def test_a_truncated_video_is_removed(tmp_path, monkeypatch, opened):
     monkeypatch.setattr(video, "_count", lambda path: opened)
-    with pytest.raises(OSError, match=r"a\.\w+ cannot be written \(it was cut short"):
+    with pytest.raises(OSError, match=r"a\.\w+ cannot be written \(frames are missing"):
         write_video(tmp_path / "a", frames(32, 32), fps=12)
     assert not list(tmp_path.iterdir())
 
 
-def test_frames_that_fit_no_video(tmp_path):
+def test_wrong_frames(tmp_path):
     with pytest.raises(ValueError, match="at least one frame"):
         write_video(tmp_path / "a", [], fps=12)
-    with pytest.raises(ValueError, match="have one size"):
+    with pytest.raises(ValueError, match="must have one size"):
         write_video(tmp_path / "a", [*frames(32, 32), *frames(30, 32)], fps=12)
     assert not list(tmp_path.iterdir())
 
 
-def test_an_unwritable_folder_is_one_sentence(tmp_path):
+def test_an_unwritable_folder_is_an_os_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match=r"cannot be written .*: choose another output folder"):
         write_video(tmp_path / "file" / "a", frames(32, 32), fps=12)

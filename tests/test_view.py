@@ -13,7 +13,8 @@ from browser import free_port, open_browser
 from tiny_runs import TINY
 
 from experiments import view as program
-from experiments.training.loop import Programs, TrainingError
+from experiments.training.loop import TrainingError
+from experiments.training.programs import Programs
 from experiments.training.stored_run import load_run_scene, read_run, restore
 
 
@@ -57,8 +58,10 @@ def serve(viser):
 
 
 def test_a_closeup_is_chosen_and_rendered_in_a_browser(serve, kept, monkeypatch):
-    def darker(programs, state, depths, shots, *, most):
-        assert depths.shape == programs.scene.train.weight.shape and shots.names == ["closeup"]
+    def darker(programs, start, cameras, *, most):
+        state = start.state
+        assert start.sources.depths.shape == programs.scene.train.weight.shape
+        assert cameras.intrinsics.shape == (1, 4)
         return state.replace(params=state.params.replace(sh=state.params.sh - 1))
 
     monkeypatch.setattr("experiments.viewing.page.fine_tune", darker)

@@ -1,4 +1,4 @@
-"""`split="zoom"`: photographs of a texture that is a function of the direction of rays."""
+"""`split="zoom"`, on photographs whose colors are a function of the ray direction."""
 
 import warnings
 
@@ -13,7 +13,7 @@ from jaxcloseup.scenes import SceneError, load_scene
 
 @pytest.fixture
 def capture(tmp_path):
-    """19 photographs; 3 are held out and of the rest the 1st and the 9th have close-ups."""
+    """19 photographs: 3 are held out, and the 1st and 9th of the rest have close-ups."""
     poses = [turned(0.05 * i) for i in range(19)]
     frames = [
         frame(f"images/{i:02d}.png", **LENS, transform_matrix=pose.tolist())
@@ -26,8 +26,8 @@ def capture(tmp_path):
 
 
 @pytest.mark.parametrize("zoom", [2, 3, 4])
-def test_rays_of_all_pixels_meet_their_colors(capture, zoom):
-    """No part of a pixel is lost, whatever rests the sides leave."""
+def test_pixels_match_the_colors_along_their_rays(capture, zoom):
+    """Pixels cover exactly `zoom` x `zoom` smaller ones, even if the sides are not multiples."""
     scene = load_scene(capture, split="zoom", zoom=zoom)
     assert scene.names["test_far"] == ["00", "08", "16"] and len(scene.train) == 16
     assert scene.names["test"] == [f"01_zoom{zoom}", f"10_zoom{zoom}"]
@@ -46,11 +46,11 @@ def test_rays_of_all_pixels_meet_their_colors(capture, zoom):
     assert scene.metadata["times_nearer"] == (zoom, zoom)
 
 
-def test_zoom_comes_on_top_of_downscale(capture):
+def test_zoom_multiplies_downscale(capture):
     scene = load_scene(capture, split="zoom", zoom=3, downscale=2)
     offsets = [(x, y) for y in (-0.25, 0.25) for x in (-0.25, 0.25)]
     assert scene.train.rgb.shape[1:] == scene.test.rgb.shape[1:] == (5, 7, 3)
-    # 47 x 35 is no multiple of 2, so that pixels of 2.04 x 2.06 are averaged.
+    # 47 x 35 is not a multiple of 2, so downscaling averages 2.04 x 2.06 pixels.
     for index, rgb in enumerate(np.asarray(scene.test.rgb)):
         assert np.abs(rgb - seen(scene.test.cameras, index, offsets)).mean() < 3
     focal = np.asarray(scene.train.cameras.intrinsics)[0, :2]
@@ -59,7 +59,7 @@ def test_zoom_comes_on_top_of_downscale(capture):
     )
 
 
-def test_a_photograph_is_decoded_once_and_nobody_is_warned(capture, monkeypatch):
+def test_each_photograph_is_decoded_once_without_warnings(capture, monkeypatch):
     from jaxcloseup.captures import photo_reading
 
     read, decode = [], photo_reading.read_image
@@ -75,11 +75,11 @@ def test_a_photograph_is_decoded_once_and_nobody_is_warned(capture, monkeypatch)
     assert sorted(read) == [f"{i:02d}.png" for i in range(19)]
     assert scene.metadata["files"]["test"][0] == scene.metadata["files"]["train"][0]
     note = scene.metadata["notes"][1]
-    assert "16 training photographs are reduced 4 times more" in note
-    assert "every 8th of them, not reduced, 2 in all, is test: 4 times as fine" in note
+    assert "16 training photographs shrink 4 times" in note
+    assert "every 8th of them, unshrunk, 2 in all, 4 times finer" in note
 
 
-def test_the_close_up_is_where_most_detail_counts(tmp_path):
+def test_the_close_up_is_the_crop_with_the_most_weighted_detail(tmp_path):
     rng = np.random.default_rng(0)
     image = np.full((24, 32, 3), 90, np.uint8)
     image[12:18, 8:16] = rng.integers(0, 256, (6, 8, 3))
@@ -101,11 +101,11 @@ def test_the_close_up_is_where_most_detail_counts(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"zoom": 4}, "zoom is of split zoom, and split is given: leave zoom out"),
+        ({"zoom": 4}, "zoom needs split 'zoom', but split is 'given': leave out zoom"),
         ({"split": "zoom", "zoom": 1}, "zoom must be a whole number of at least 2, got 1"),
         ({"split": "zoom", "zoom": 2.5}, "zoom must be a whole number of at least 2, got 2.5"),
         ({"split": "zoom", "zoom": True}, "zoom must be a whole number of at least 2, got True"),
-        ({"split": "zoom", "downscale": 9}, r"47 x 35 pixels, so that downscale 9 times zoom 4 le"),
+        ({"split": "zoom", "downscale": 9}, r"47 x 35 pixels, and downscale 9 times zoom 4 leaves"),
     ],
 )
 def test_wrong_zooms(capture, options, message):

@@ -1,4 +1,4 @@
-"""Writes captures of a few pixels, for tests of what reads them."""
+"""Write captures of a few pixels, for tests of the loaders."""
 
 import json
 
@@ -13,7 +13,7 @@ POSE[:3, 3] = [1, 2, 3]
 
 
 def write_image(path, image=None, value=100):
-    """Save an image given red first, by its suffix; a gray one of 8x6 by default."""
+    """Save an RGB or RGBA image in the format of its suffix; by default gray of 8 x 6 pixels."""
     if image is None:
         image = np.full((HEIGHT, WIDTH, 3), value, np.uint8)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Writes captures with COLMAP models of a few pixels, for tests of what reads them."""
+"""Write captures of a few pixels with COLMAP models or LLFF poses, for tests of the loaders."""
 
 import numpy as np
 from tiny_capture import HEIGHT, WIDTH, write_image
@@ -13,7 +13,7 @@ def image_line(number, name, pose="1 0 0 0 0 0 0", camera=1):
 
 
 def write_model(folder, images, cameras=(PINHOLE,), points=POINTS):
-    """A text model; `images` holds lines, and after each may come one of its observations."""
+    """Write a text model; `images` holds its lines, each image followed by its observations."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "cameras.txt").write_text("# Cameras\n" + "".join(f"{c}\n" for c in cameras))
     (folder / "images.txt").write_text("# Images\n" + "".join(f"{line}\n" for line in images))
@@ -21,14 +21,14 @@ def write_model(folder, images, cameras=(PINHOLE,), points=POINTS):
 
 
 def colmap_capture(folder, count=3, model="sparse/0", depths=None, **changes):
-    """Photographs `000.png` ... in `images/`, each seeing five points that lie ahead.
+    """Write photographs `000.png`, ... in `images/`, each of which sees five points ahead.
 
     Args:
-      folder: where.
-      count: of the photographs.
-      model: the model's folder.
-      depths: of the points from each photograph; 5 by default.
-      changes: for `write_model`.
+      folder: folder of the capture.
+      count: number of photographs.
+      model: folder of the model inside `folder`.
+      depths: depth of the points in each photograph; 5 by default.
+      changes: arguments for `write_model`.
     """
     lines, tracks = [], [[] for _ in POINTS]
     for i in range(count):
@@ -45,7 +45,7 @@ def colmap_capture(folder, count=3, model="sparse/0", depths=None, **changes):
 
 
 def random_pose(rng):
-    """A rotation `[3, 3]` as a matrix and as COLMAP's w, x, y, z, and a position `[3]`."""
+    """Draw a rotation as matrix `[3, 3]` and quaternion (w, x, y, z), and a position `[3]`."""
     quaternion = rng.normal(size=4)
     w, x, y, z = quaternion = quaternion / np.linalg.norm(quaternion)
     rotation = np.array(
@@ -59,7 +59,7 @@ def random_pose(rng):
 
 
 def llff_rows(count, seed=0):
-    """Rows of poses_bounds.npy of random cameras, and these as OpenCV matrices `[3, 4]`."""
+    """Draw random cameras as rows of poses_bounds.npy and as OpenCV poses `[count, 3, 4]`."""
     rng = np.random.default_rng(seed)
     rows, poses = [], []
     for i in range(count):
@@ -73,7 +73,7 @@ def llff_rows(count, seed=0):
 
 
 def llff_capture(folder):
-    """Three photographs with LLFF's file of their cameras."""
+    """Write three photographs with LLFF's file of their cameras."""
     for i in range(3):
         write_image(folder / f"images/{i}.png", value=i)
     np.save(folder / "poses_bounds.npy", llff_rows(3)[0])

@@ -9,21 +9,28 @@ import jax.numpy as jnp
 import numpy as np
 import plane
 
-from experiments.methods.presets import QUICK, QUICK_SURFELS
-from experiments.training.loop import Programs
+from experiments.methods.nerf import QUICK
+from experiments.methods.surfels import QUICK as QUICK_SURFELS
 from experiments.training.manifest import about_scene, write_manifest
-from experiments.training.stages import config
+from experiments.training.programs import Programs
+from experiments.training.settings import plain_config
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.scenes import load_scene
 from jaxcloseup.splats import RasterizeConfig
 from jaxcloseup.train import TrainConfig, init_state
-from jaxcloseup.volume.nerf import NerfConfig
 
 
 TINY = dataclasses.replace(
     QUICK,
-    field=NerfConfig(
-        depth=2, width=16, skip_after=0, direction_width=8, num_coarse=8, num_fine=8, chunk=512
+    field=dataclasses.replace(
+        QUICK.field,
+        depth=2,
+        width=16,
+        skip_after=0,
+        direction_width=8,
+        num_coarse=8,
+        num_fine=8,
+        chunk=512,
     ),
     train=TrainConfig(num_rays=64, num_label_rays=64),
     baseline_steps=30,
@@ -35,13 +42,13 @@ TINY_SURFELS = dataclasses.replace(
     field=dataclasses.replace(
         QUICK_SURFELS.field,
         capacity=600,
-        decay_steps=20,
+        means_lr_steps=20,
         density=None,
+        steps_per_target=2,
         raster=RasterizeConfig(capacity=2**14, tile=8, chunk=4, block=12),
     ),
     baseline_steps=20,
     closeup_steps=2,
-    test_time_steps=2,
     downscale=1,
 )
 KEPT = dataclasses.replace(TINY_SURFELS, gated=False)
@@ -91,7 +98,7 @@ def keep_run(folder, capture_folder):
         state = state.replace(params=state.params.replace(**flat))
     write_manifest(folder, about_scene(scene, {"downscale": 1}) | {"seed": 0})
     size = [plane.WIDTH, plane.HEIGHT]
-    identity = {"scene": scene.name, "config": config(KEPT), "resolution": size, "seed": 0}
+    identity = {"scene": scene.name, "config": plain_config(KEPT), "resolution": size, "seed": 0}
     checkpoints = Checkpoints(folder / "checkpoints", identity | {"version": "1"})
     for stage in ("baseline", "closeup"):
         checkpoints.save(stage, 3, state, {"history": [], "growth": 1})

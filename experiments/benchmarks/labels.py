@@ -16,19 +16,21 @@ import numpy as np
 
 from experiments.evaluation.audit import audit_labels, resolved_by_photographs
 from experiments.evaluation.scores import exact_depths
-from experiments.methods.presets import PRESETS, pseudo_settings
+from experiments.methods import LabelConfig, pseudo_settings
 from experiments.reporting.pictures import label_pictures
 from jaxcloseup.metrics import psnr
 from jaxcloseup.photographs import camera_at, to_float
 from jaxcloseup.procedural.loading import PROCEDURAL_SCENES
-from jaxcloseup.scenes import Scene, load_scene
+from jaxcloseup.pseudo import label_sources
+from jaxcloseup.scene import Scene
+from jaxcloseup.scenes import load_scene
 
 
 DOWNSCALE = 4
 PICTURES = pathlib.Path("outputs/labels")
 MASKS = {
     "paper": {},
-    "no mask": {"use_mask": 0.0},
+    "no mask": {"use_mask": False},
     "paper, depth check 5 %": {"depth_tolerance": 0.05},
 }
 
@@ -41,18 +43,12 @@ def run() -> None:
         scene = load_scene(name, downscale=DOWNSCALE)
         scene = dataclasses.replace(scene, train=jax.device_put(scene.train))
         exact = exact_depths(scene, scene.train.cameras)
+        sources = label_sources(scene.train, exact)
         render_depth = jax.jit(lambda camera, scene=scene: scene.surface(camera).depth)
         for mask, changes in MASKS.items():
-            settings = pseudo_settings(PRESETS["nerf"]["paper"])
-            settings = settings.replace(**{k: jnp.float32(v) for k, v in changes.items()})
-            found = audit_labels(
-                jax.random.key(0),
-                exact,
-                scene=scene,
-                settings=settings,
-                depths=exact,
-                render_depth=render_depth,
-            )
+            settings = pseudo_settings(LabelConfig(**changes))
+            key = jax.random.key(0)
+            found = audit_labels(key, exact, scene, sources, settings, render_depth=render_depth)
             print(
                 f"{name:>8}  {mask:<22}  {found['error']:>6.4f}  {found['kept']:>6.1%}"
                 f"  {found['leaked']:>6.1%}",
@@ -67,8 +63,8 @@ def run() -> None:
             [],
             PICTURES / name,
             scene=scene,
-            settings=pseudo_settings(PRESETS["nerf"]["paper"]),
-            depths=exact,
+            sources=sources,
+            settings=pseudo_settings(LabelConfig()),
             render_depth=render_depth,
         )
     print(f"pictures: {PICTURES}")

@@ -19,8 +19,8 @@ COMMAND = (
     "-m",
     "experiments.run",
     "--scene=table",
-    "--baseline_steps=700",  # relocations, harmonics and regularizers begin before
-    "--closeup_steps=20",
+    "--set=baseline_steps=700",  # relocations, harmonics and regularizers begin before
+    "--set=closeup_steps=20",
     "--save_every=50",
 )
 

@@ -201,7 +201,8 @@ def _render_by_scan(surfels, camera, config, longest):
         splat = jax.tree.map(lambda leaf: leaf[index][:, None], splats)
         d = pixels - splat.anchor
         u, v, w = (
-            splat.rows[..., i, 0] + jnp.sum(splat.rows[..., i, 1:] * d, axis=-1) for i in range(3)
+            splat.homography[..., i, 0] + jnp.sum(splat.homography[..., i, 1:] * d, axis=-1)
+            for i in range(3)
         )
         floor = splat.low_pass * jnp.sum(d * d, axis=-1)
         on_plane = (w > 0) & (u * u + v * v <= floor * w * w)

@@ -17,16 +17,18 @@ from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points, points_to_pixels
 from jaxcloseup.geometry.masks import depth_consistent, in_bounds
 from jaxcloseup.geometry.warp import backward_warp
-from jaxcloseup.photographs import Views, camera_at, to_float
+from jaxcloseup.label_rules import label_depth
+from jaxcloseup.photographs import camera_at, to_float
 from jaxcloseup.pseudo import (
+    LabelSources,
     PseudoLabel,
     PseudoSettings,
     best_source,
+    label_pixels,
     make_label,
     sample_virtual_camera,
 )
 from jaxcloseup.scenes import Scene
-from jaxcloseup.train import label_depth
 
 
 CURVE_POINTS = 20
@@ -82,10 +84,10 @@ def resolved_by_photographs(
 def audit_labels(
     key: jax.Array,
     exact_depths: jax.Array,
-    *,
     scene: Scene,
+    sources: LabelSources,
     settings: PseudoSettings,
-    depths: jax.Array,
+    *,
     render_depth: Callable[[Camera], jax.Array],
     count: int = 16,
 ) -> dict[str, Any]:
@@ -95,10 +97,10 @@ def audit_labels(
       key: random key.
       exact_depths: `[V, H, W]` exact depths of the training views, which decide what is visible.
       scene: a scene with `surface`.
-      settings: of the labels.
-      depths: `[V, H, W]` the depths that labels are made with.
-      render_depth: `camera -> [H, W]`, the virtual depth that labels are made with.
-      count: virtual cameras.
+      sources: the photographs with the depths that labels are made from.
+      settings: how labels are made.
+      render_depth: `camera -> [H, W]`, the virtual depth that labels are made from.
+      count: how many virtual cameras.
 
     Returns:
       `error`, mean absolute difference of kept labels from the blurred truth; `kept`, share of the
@@ -112,10 +114,9 @@ def audit_labels(
     pixels_total = 0
     error = kept = kept_visible = visible_total = 0.0
     for one in jax.random.split(key, count):
-        camera, index = sample(one, scene.train, depths, settings)
+        camera, index = sample(one, sources, settings)
         pixels = pixel_grid(camera.height, camera.width)
-        data = camera, pixels, render_depth(camera), index, scene.train, depths
-        label = label_image(*data, settings)
+        label = label_image(camera, pixels, render_depth(camera), index, sources, settings)
         weight, of_any_color = np.asarray(label.weight)
         truth = scene.surface(camera)
         visible, footprint = _seen_by(
@@ -192,13 +193,13 @@ def error_curve(
     return curve | {"ause": float(np.trapezoid(gap, shares) / largest) if largest else 0.0}
 
 
-def _label_twice(camera, pixels, depth, index, views, depths, settings):
-    """The label, of which `weight` `[2, H, W]` is as settings say and as it is of any color."""
+def _label_twice(camera, pixels, depth, index, sources, settings):
+    """The label with two weights `[2, H, W]`: as settings say, and regardless of color."""
     ways = settings, _of_any_color(settings)
 
     def label(use_mask, rgb_tolerance):
         changed = settings.replace(use_mask=use_mask, rgb_tolerance=rgb_tolerance)
-        return make_label(camera, pixels, depth, index, views, depths, changed)
+        return label_pixels(camera, pixels, depth, index, sources, changed)
 
     # What is not batched, the warps above all, is made once.
     return jax.vmap(label, out_axes=PseudoLabel(None, 0, None, None))(
@@ -212,8 +213,7 @@ def _of_any_color(settings: PseudoSettings) -> PseudoSettings:
 
 
 def audit_left_out(
-    views: Views,
-    depths: jax.Array,
+    sources: LabelSources,
     render: Callable[[Camera], Rendering],
     candidates: Sequence[PseudoSettings],
     *,
@@ -224,8 +224,7 @@ def audit_left_out(
     The model has seen them, so its error is the least that it can be: labels that win here win.
 
     Args:
-      views: training photographs.
-      depths: `[V, H, W]` their rendered z-depth.
+      sources: the training photographs.
       render: `camera -> Rendering` of the model.
       candidates: settings to compare.
       count: photographs to leave out, spread evenly.
@@ -236,10 +235,10 @@ def audit_left_out(
     """
     audit = jax.jit(_left_out)
     sums = np.zeros((len(candidates), 4))
-    for index in _spread(views, count):
-        seen = render(camera_at(views.cameras, index))
+    for index in _spread(sources.views, count):
+        seen = render(camera_at(sources.views.cameras, index))
         for row, settings in enumerate(candidates):
-            sums[row] += audit(index, seen.rgb, label_depth(seen), views, depths, settings)
+            sums[row] += audit(index, seen.rgb, label_depth(seen), sources, settings)
     rows = []
     for label, model, kept, total in sums:
         of_label, of_model = (
@@ -251,8 +250,7 @@ def audit_left_out(
 
 
 def left_out_curve(
-    views: Views,
-    depths: jax.Array,
+    sources: LabelSources,
     render: Callable[[Camera], Rendering],
     settings: PseudoSettings,
     *,
@@ -266,10 +264,9 @@ def left_out_curve(
     label_of = jax.jit(_label_left_out)
     found: list[tuple[np.ndarray, ...]] = []
     total = 0
-    for index in _spread(views, count):
-        seen = render(camera_at(views.cameras, index))
-        data = index, label_depth(seen), views, depths, _of_any_color(settings)
-        label, truth, weight = label_of(*data)
+    for index in _spread(sources.views, count):
+        seen = render(camera_at(sources.views.cameras, index))
+        label, truth, weight = label_of(index, label_depth(seen), sources, _of_any_color(settings))
         inside = np.asarray(label.weight * weight) > 0
         columns = (
             np.abs(label.backward - label.forward).max(axis=-1),
@@ -286,8 +283,9 @@ def _spread(views, count):
     return np.unique(np.linspace(0, len(views) - 1, count).round().astype(int))
 
 
-def _label_left_out(index, depth, views, depths, settings):
+def _label_left_out(index, depth, sources, settings):
     """The label of a training photograph from the others, its colors and its weight."""
+    views, depths = sources.views, sources.depths
     camera, weight = camera_at(views.cameras, index), views.weight[index]
     others = views.replace(weight=views.weight.at[index].set(0))
     source = best_source(camera, others, depths, depth=depth)
@@ -296,9 +294,9 @@ def _label_left_out(index, depth, views, depths, settings):
     return label, to_float(views.rgb[index]), weight
 
 
-def _left_out(index, rgb, depth, views, depths, settings):
+def _left_out(index, rgb, depth, sources, settings):
     """Sums over kept pixels: squared errors of label and model, kept pixels, all pixels."""
-    label, truth, weight = _label_left_out(index, depth, views, depths, settings)
+    label, truth, weight = _label_left_out(index, depth, sources, settings)
     kept = label.weight * weight
 
     def error(image):

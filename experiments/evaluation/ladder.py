@@ -4,14 +4,13 @@ From each held-out ordinary view one camera comes 1, 2, 4, 8 and 16 times nearer
 it sees, without turning, so that all that changes along the ladder is the magnification.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from experiments.evaluation.scores import Target
-from experiments.reporting.plots import Curve
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points
 from jaxcloseup.geometry.poses import closeup_position, sample_anchor
 from jaxcloseup.photographs import camera_at
@@ -70,34 +69,6 @@ def _anchor(key: jax.Array, camera: Camera, depth: jax.Array, seen: jax.Array) -
 def _nearer(camera: Camera, anchor: jax.Array, magnification: float) -> Camera:
     position = closeup_position(anchor, camera.position, magnification)
     return camera.replace(camtoworld=camera.camtoworld.at[:, 3].set(position))
-
-
-def zoom_curves(stages: Mapping[str, Mapping[str, Any]], metric: str = "psnr") -> list[Curve]:
-    """A metric against magnification for each stage that climbed the ladder.
-
-    Args:
-      stages: for each stage its splits, as `results.json` has them.
-      metric: its name.
-    """
-    curves = []
-    for stage, splits in stages.items():
-        rungs = [(m, splits[f"{PREFIX}{m}"][metric]) for m in rungs_of(splits)]
-        known = [(m, value) for m, value in rungs if value is not None]
-        if known:
-            curves.append(Curve(stage, *map(list, zip(*known, strict=True))))
-    return curves
-
-
-def gains_over(curves: Sequence[Curve], base: str) -> list[Curve]:
-    """Curves less that of the stage `base`, where both have points."""
-    named = {curve.name: dict(zip(curve.x, curve.y, strict=True)) for curve in curves}
-    below = named.get(base, {})
-    gains = []
-    for curve in curves:
-        known = [(x, y - below[x]) for x, y in zip(curve.x, curve.y, strict=True) if x in below]
-        if known:
-            gains.append(Curve(curve.name, *map(list, zip(*known, strict=True))))
-    return gains
 
 
 def ladder_in_short(splits: Mapping[str, Any]) -> str:

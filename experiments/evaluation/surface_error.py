@@ -60,10 +60,11 @@ def point_depth_error(depth: np.ndarray, landmarks: Landmarks) -> dict[str, floa
 def surface_error(camera: Camera, rendering: Rendering, surface: Surface) -> dict[str, jax.Array]:
     """Relative errors of depth and angles between normals, in degrees, against the exact surface.
 
-    Normals are the surfels' own, or those of a NeRF's rendered depth.
+    Normals are the rendered ones, or, of fields that render none, those of their depth.
     """
-    surfels = getattr(rendering.aux, "surfels", None)
-    normal = depth_to_normal(camera, rendering.depth) if surfels is None else surfels.normal
+    normal = rendering.normal
+    if normal is None:
+        normal = depth_to_normal(camera, rendering.depth)
     length = jnp.linalg.norm(normal, axis=-1)
     cosine = jnp.sum(normal * surface.normal, axis=-1) / jnp.where(length > 0, length, 1)
     hit = surface.depth > 0

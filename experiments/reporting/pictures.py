@@ -7,31 +7,23 @@ from typing import Any
 import jax
 import numpy as np
 
+from experiments.evaluation.metrics_text import SPLIT_TITLES
 from experiments.evaluation.scores import Target
-from experiments.reporting.report import SPLIT_TITLES, Picture
+from experiments.reporting.report import Picture
 from jaxcloseup.artifacts.images import colorize_depth, colorize_error, side_by_side, write_png
 from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
-from jaxcloseup.pseudo import PseudoSettings, best_source, make_label, sample_virtual_camera
+from jaxcloseup.pseudo import (
+    LabelSources,
+    PseudoSettings,
+    best_source,
+    label_pixels,
+    sample_virtual_camera,
+)
 from jaxcloseup.scenes import Scene
 
 
 SHOWN_LABELS = 6
-
-
-def write_renders(folder: pathlib.Path, renderings: Mapping[str, Rendering], scene: Scene) -> None:
-    """Write `rgb/<name>.png` and `depth/<name>.png`, the depth in color over the scene's range."""
-    for name, rendering in renderings.items():
-        write_png(folder / "rgb" / f"{name}.png", rendering.rgb)
-        depth = colorize_depth(rendering.depth, near=scene.near, far=scene.far)
-        write_png(folder / "depth" / f"{name}.png", depth)
-
-
-def write_truth(folder: pathlib.Path, targets: Mapping[str, Sequence[Target]]) -> None:
-    """Write `<split>/rgb/<name>.png`, what renders are scored against, as anyone may again."""
-    for split, views in targets.items():
-        for target in views:
-            write_png(folder / split / "rgb" / f"{target.name}.png", target.rgb)
 
 
 def comparisons(
@@ -74,27 +66,27 @@ def label_pictures(
     folder: pathlib.Path,
     *,
     scene: Scene,
+    sources: LabelSources,
     settings: PseudoSettings,
-    depths: jax.Array,
     render_depth: Callable[[Camera], jax.Array],
 ) -> list[Picture]:
     """Write pictures of labels: of random virtual views, and of the held-out close-ups."""
-    label_image = jax.jit(make_label)
+    label_image = jax.jit(label_pixels)
     sample = jax.jit(sample_virtual_camera)
     shots: list[tuple[str, Camera, jax.Array, Any, Any]] = []
     for i, one in enumerate(jax.random.split(key, SHOWN_LABELS)):
-        camera, index = sample(one, scene.train, depths, settings)
+        camera, index = sample(one, sources, settings)
         truth = scene.surface(camera).rgb if scene.surface else None
         shots.append((f"virtual_{i}", camera, render_depth(camera), index, truth))
     nearest = jax.jit(best_source)
     for target in targets[:SHOWN_LABELS]:
         depth = render_depth(target.camera)
-        index = nearest(target.camera, scene.train, depths, depth=depth)
+        index = nearest(target.camera, sources.views, sources.depths, depth=depth)
         shots.append((f"closeup_{target.name}", target.camera, depth, index, target.rgb))
     pictures = []
     for name, camera, depth, index, truth in shots:
         pixels = pixel_grid(camera.height, camera.width)
-        label = label_image(camera, pixels, depth, index, scene.train, depths, settings)
+        label = label_image(camera, pixels, depth, index, sources, settings)
         kept = np.where(label.weight[..., None] > 0, label.rgb, 0)
         panels = {"backward warp": label.backward, "forward warp": label.forward, "kept": kept}
         panels["mask"] = np.repeat(np.asarray(label.weight)[..., None], 3, axis=-1)

@@ -1,14 +1,16 @@
 """Line plots as SVG text, to stand inside a page."""
 
 import io
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import matplotlib
 
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
+
+from experiments.evaluation.ladder import PREFIX, rungs_of
 
 
 # Same data, same file: without names drawn at random and without a date. Text stays text.
@@ -70,3 +72,31 @@ def line_plot(
         figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
         plt.close(figure)
     return text.getvalue()[text.getvalue().index("<svg") :]
+
+
+def zoom_curves(stages: Mapping[str, Mapping[str, Any]], metric: str = "psnr") -> list[Curve]:
+    """A metric against magnification for each stage that climbed the ladder.
+
+    Args:
+      stages: for each stage its splits, as `results.json` has them.
+      metric: its name.
+    """
+    curves = []
+    for stage, splits in stages.items():
+        rungs = [(m, splits[f"{PREFIX}{m}"][metric]) for m in rungs_of(splits)]
+        known = [(m, value) for m, value in rungs if value is not None]
+        if known:
+            curves.append(Curve(stage, *map(list, zip(*known, strict=True))))
+    return curves
+
+
+def gains_over(curves: Sequence[Curve], base: str) -> list[Curve]:
+    """Curves less that of the stage `base`, where both have points."""
+    named = {curve.name: dict(zip(curve.x, curve.y, strict=True)) for curve in curves}
+    below = named.get(base, {})
+    gains = []
+    for curve in curves:
+        known = [(x, y - below[x]) for x, y in zip(curve.x, curve.y, strict=True) if x in below]
+        if known:
+            gains.append(Curve(curve.name, *map(list, zip(*known, strict=True))))
+    return gains

@@ -3,7 +3,6 @@
 import html
 import itertools
 import json
-import math
 import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -12,30 +11,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from experiments.evaluation.ladder import gains_over, zoom_curves
-from experiments.reporting.plots import Curve, line_plot
+from experiments.evaluation.metrics_text import COLUMNS, SPLIT_TITLES, format_metric
+from experiments.reporting.plots import Curve, gains_over, line_plot, zoom_curves
 from experiments.training.gate import verdict
 from jaxcloseup.artifacts.images import png_data_uri
 from jaxcloseup.files import write_file
-
-
-SPLIT_TITLES = {"test": "Close-ups", "test_far": "Ordinary views"}
-COLUMNS = {
-    "psnr": "PSNR (dB)",
-    "ssim": "SSIM",
-    "lpips_vgg": "LPIPS (VGG)",
-    "lpips_alex": "LPIPS (AlexNet)",
-    "cc_psnr": "PSNR, color-corrected (dB)",
-    "psnr_seen1": "PSNR where seen by 1+ (dB)",
-    "psnr_seen3": "PSNR where seen by 3+ (dB)",
-    "coverage_seen1": "share seen by 1+",
-    "coverage_seen3": "share seen by 3+",
-    "depth_error_median": "median depth error (relative)",
-    "depth_error_p90": "90th percentile of it",
-    "normal_error_median": "median normal error (degrees)",
-    "point_depth_error_median": "median depth error at the capture's points (relative)",
-    "point_depth_error_p90": "90th percentile of it",
-}
 
 
 class Picture(NamedTuple):
@@ -73,20 +53,6 @@ def print_table(results: Mapping[str, Any]) -> None:
         for name, values in zip(header[2:], metrics, strict=True):
             table.add_row(name, *values)
         Console().print(table)
-
-
-def write_json(path: pathlib.Path, results: Mapping[str, Any]) -> None:
-    """Write strict JSON, whole or not at all; numbers that are not finite become null."""
-    write_file(path, json.dumps(strict(results), indent=1, allow_nan=False).encode())
-
-
-def strict(value: Any) -> Any:
-    """What JSON is to hold, with None in place of numbers that are not finite."""
-    if isinstance(value, Mapping):
-        return {key: strict(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [strict(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def write_report(
@@ -207,22 +173,6 @@ def _gate_table(gate):
         "<th>tolerance of color<th>of depth<th>labeled<th>PSNR of labels (dB)"
         f"<th>PSNR of the model (dB){lines}</table>"
     )
-
-
-def in_short(split: Mapping[str, Any]) -> str:
-    """A split's PSNR, and how far its depth is off, in a line."""
-    text = f"PSNR {format_metric('psnr', split['psnr'])} dB"
-    for key in ("depth_error_median", "point_depth_error_median"):
-        if split.get(key) is not None:
-            text += f", depth off by {split[key]:.2%}"
-    return text
-
-
-def format_metric(key: str, value: float | None) -> str:
-    """A metric as text, "-" where it could not be computed."""
-    if value is None:
-        return "-"
-    return f"{value:.2f}" if "psnr" in key or "normal" in key else f"{value:.4f}"
 
 
 STYLE = """

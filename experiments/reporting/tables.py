@@ -17,9 +17,10 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.evaluation.ladder import MAGNIFICATIONS, PREFIX
+from experiments.evaluation.metrics_text import SPLIT_TITLES
 from experiments.reporting.plots import Curve, line_plot
-from experiments.reporting.report import SPLIT_TITLES, STYLE, Picture, figures, write_json
-from jaxcloseup.files import write_file
+from experiments.reporting.report import STYLE, Picture, figures
+from jaxcloseup.files import write_file, write_json
 
 
 RESAMPLES = 4000

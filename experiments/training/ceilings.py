@@ -1,4 +1,4 @@
-"""Views that are labeled once, before the first step: the wanted ones, and ceilings of labels."""
+"""Ceilings of what labels can do: random close-ups with true pixels, or with better depth."""
 
 from collections.abc import Callable
 
@@ -7,9 +7,14 @@ import jax.numpy as jnp
 
 from experiments.evaluation.audit import resolved_by_photographs
 from jaxcloseup.geometry.cameras import Camera
-from jaxcloseup.geometry.union_warp import block_sources
 from jaxcloseup.photographs import Views, camera_at
-from jaxcloseup.pseudo import PseudoSettings, label_views, sample_virtual_camera
+from jaxcloseup.pseudo import (
+    LabelSources,
+    PseudoSettings,
+    label_sources,
+    label_views,
+    sample_virtual_camera,
+)
 from jaxcloseup.scenes import Scene
 
 
@@ -19,7 +24,7 @@ CEILING_VIEWS = 64
 def true_close_ups(
     key: jax.Array,
     scene: Scene,
-    depths: jax.Array,
+    sources: LabelSources,
     exact: jax.Array,
     settings: PseudoSettings,
     *,
@@ -33,7 +38,7 @@ def true_close_ups(
     sample, surface = jax.jit(sample_virtual_camera), jax.jit(scene.surface)
     images = []
     for one in jax.random.split(key, CEILING_VIEWS):
-        camera, _ = sample(one, scene.train, depths, settings)
+        camera, _ = sample(one, sources, settings)
         resolved, seen = resolved_by_photographs(scene, camera, exact)
         rgb = resolved if blurred else surface(camera).rgb
         images.append(Views(camera, jnp.asarray(rgb, jnp.float32), jnp.asarray(seen, jnp.float32)))
@@ -43,7 +48,7 @@ def true_close_ups(
 def labels_of_less_error(
     key: jax.Array,
     scene: Scene,
-    depths: jax.Array,
+    sources: LabelSources,
     exact: jax.Array,
     render_depths: Callable[[Camera], jax.Array],
     settings: PseudoSettings,
@@ -57,7 +62,7 @@ def labels_of_less_error(
     Args:
       key: random key.
       scene: with `surface`.
-      depths: `[V, H, W]` trained depths of the training views; 0 where undefined.
+      sources: the photographs with their trained depths.
       exact: `[V, H, W]` exact ones.
       render_depths: stacked cameras `[Q]` to their trained depths `[Q, H, W]`.
       settings: of poses and labels.
@@ -69,10 +74,9 @@ def labels_of_less_error(
 
     sample, surface = jax.jit(sample_virtual_camera), jax.jit(scene.surface)
     keys = jax.random.split(key, CEILING_VIEWS)
-    cameras = [sample(one, scene.train, depths, settings)[0] for one in keys]
+    cameras = [sample(one, sources, settings)[0] for one in keys]
     cameras = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
     true = jnp.stack([surface(camera_at(cameras, i)).depth for i in range(CEILING_VIEWS)])
-    targets, mixed = mix(render_depths(cameras), true), mix(depths, exact)
-    sources = jax.jit(block_sources)(scene.train.cameras, mixed, scene.train.weight)
-    data = cameras, targets, scene.train, mixed, settings
-    return jax.jit(label_views)(*data, sources=sources)
+    targets, mixed = mix(render_depths(cameras), true), mix(sources.depths, exact)
+    better = jax.jit(label_sources)(sources.views, mixed)
+    return jax.jit(label_views)(cameras, targets, better, settings)

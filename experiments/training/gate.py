@@ -10,14 +10,12 @@ labels help (BUILD.md has the figures).
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 
 from experiments.evaluation.audit import audit_left_out
 from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import Camera
-from jaxcloseup.photographs import Views
-from jaxcloseup.pseudo import PseudoSettings
+from jaxcloseup.pseudo import LabelSources, PseudoSettings
 
 
 # Colors and relative depths agree closely, and looser pairs to look at.
@@ -43,16 +41,14 @@ def verdict(found: Mapping[str, Any]) -> str:
 
 
 def weigh_labels(
-    views: Views,
-    depths: jax.Array,
+    sources: LabelSources,
     render: Callable[[Camera], Rendering],
     settings: PseudoSettings,
 ) -> tuple[PseudoSettings, dict[str, Any]]:
     """The settings with the share that labels deserve, which may be 0, and the evidence.
 
     Args:
-      views: training photographs.
-      depths: `[V, H, W]` their rendered z-depth.
+      sources: the training photographs.
       render: `camera -> Rendering` of the model.
       settings: of the labels.
 
@@ -67,7 +63,7 @@ def weigh_labels(
         )
         for rgb, d in TOLERANCES
     ]
-    rows = audit_left_out(views, depths, render, candidates)
+    rows = audit_left_out(sources, render, candidates)
     agreement = rows[0]["coverage"]
     low, high = AGREEMENT
     weight = min(max((agreement - low) / (high - low), 0.0), 1.0)

@@ -11,9 +11,8 @@ import weakref
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from experiments.reporting.report import strict
 from jaxcloseup.artifacts.images import Image, encode_png
-from jaxcloseup.files import append_file, write_file
+from jaxcloseup.files import append_file, strict, write_file
 
 
 def check_tensorboard() -> None:

@@ -4,15 +4,17 @@ import contextlib
 import hashlib
 import json
 import pathlib
+import platform
 import subprocess
 import warnings
 from collections.abc import Mapping
 from typing import Any
 
+import jax
 import numpy as np
 
 import jaxcloseup
-from experiments.reporting.report import write_json
+from jaxcloseup.files import write_json
 from jaxcloseup.scenes import Scene
 
 
@@ -130,3 +132,14 @@ def _git(folder, *args):
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip() if done.returncode == 0 else None
+
+
+def versions() -> dict[str, str]:
+    """What made the numbers."""
+    return {
+        "jaxcloseup": jaxcloseup.__version__,
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "numpy": np.__version__,
+        "device": jax.devices()[0].device_kind,
+    }

@@ -1,87 +1,80 @@
-"""A run that is finished or was cut off, loaded again: its scene, its preset, a stage's state."""
+"""A stored run, finished or cut off, loaded again: its scene, its preset, a stage's state."""
 
-import dataclasses
 import json
-import math
 import pathlib
-import types
-import typing
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from absl import flags
+import jax
+import jax.numpy as jnp
 
-from experiments.methods.presets import Preset
+from experiments.methods import Preset
 from experiments.training import manifest
-from experiments.training.loop import Programs
-from experiments.training.stages import config, state_to_begin
+from experiments.training.programs import Programs
+from experiments.training.settings import with_settings
+from experiments.training.setup import initial_state
+from experiments.training.stored_config import preset_from_config
 from jaxcloseup.artifacts.checkpoints import Checkpoints
-from jaxcloseup.scenes import Scene, load_scene
+from jaxcloseup.scene import Scene
+from jaxcloseup.scenes import load_scene
 from jaxcloseup.train import TrainState
 
 
-FLAGS = flags.FLAGS
-flags.DEFINE_string("run", None, "folder of the run")
-flags.DEFINE_string("stage", None, "which state to render; default: closeup, or the last there is")
-flags.DEFINE_string("data", None, "where the run's capture lies now, if it was moved")
-
-# What is rendered where nobody says: the first of these that a run has.
+# Which stage is rendered by default: the first of these that a run has.
 _BY_DEFAULT = ("closeup", "control", "baseline")
+# Names of a state's arrays that version 0.1.0 spelled otherwise.
+_OLD_NAMES = {"regularize": "regularise", "image_offset": "probe"}
 
 
 class RunError(Exception):
     """A run that cannot be rendered. The message is one sentence that says what to do."""
 
 
-class Record(NamedTuple):
-    """What a run's folder says of it.
+class StoredRun(NamedTuple):
+    """What a run's folder says about it.
 
     Attributes:
-      folder: of the run.
+      folder: the run's folder.
       manifest: its `manifest.json`.
       identity: its `checkpoints/run.json`.
-      preset: as it was trained.
+      trained: how it was trained.
+      preset: the same, with the settings that the user changes now.
       stages: those that have a state.
     """
 
     folder: pathlib.Path
     manifest: Mapping[str, Any]
     identity: Mapping[str, Any]
+    trained: Preset
     preset: Preset
     stages: list[str]
 
 
-def named_run() -> tuple[Record, str]:
-    """The run that `--run` names, and its stage that `--stage` does.
+def read_run(folder: pathlib.Path) -> StoredRun:
+    """Read how a run was trained, and which states it left.
+
+    Prints the settings that its version lacked, with the values that render it as that version did.
 
     Raises:
-      RunError: there is none.
-    """
-    if FLAGS.run is None:
-        raise RunError("--run is missing: name the folder of a run of experiments.run")
-    record = read_run(pathlib.Path(FLAGS.run))
-    return record, choose_stage(record, FLAGS.stage)
-
-
-def read_run(folder: pathlib.Path) -> Record:
-    """Read what a run was, and which states it left.
-
-    Raises:
-      RunError: there is no run, or none that this version can render.
+      RunError: the folder holds no run, or none that this version can render.
     """
     if not folder.is_dir():
         raise RunError(f"--run={folder} is not a folder: name that of a run of experiments.run")
     about, identity = (_read_json(folder, name) for name in (manifest.NAME, "checkpoints/run.json"))
     if "scene" not in about or "config" not in identity:
         raise RunError(f"--run={folder} is of a sweep or unknown: name a run of experiments.run")
+    version = identity.get("version")
     try:
-        preset = preset_from_config(identity["config"])
+        preset, absent = preset_from_config(identity["config"], identity.get("method"))
     except ValueError as error:
         raise RunError(
-            f"--run={folder} was trained by version {identity.get('version')}, of which this one "
-            f"cannot read the configuration ({error}): render it with that version"
+            f"--run={folder} was trained by version {version}, whose configuration this version "
+            f"cannot read ({error}): render it with version {version}"
         ) from None
+    if absent:
+        values = ", ".join(f"{name}={value}" for name, value in absent.items())
+        print(f"{folder}: version {version} had no setting for {values}; it rendered like that")
     checkpoints = folder / "checkpoints"
     stages = sorted(
         path.name
@@ -90,102 +83,93 @@ def read_run(folder: pathlib.Path) -> Record:
     )
     if not stages:
         raise RunError(f"--run={folder} has no checkpoint yet: resume it with experiments.run")
-    return Record(folder, about, identity, preset, stages)
+    return StoredRun(folder, about, identity, preset, preset, stages)
 
 
-def choose_stage(record: Record, stage: str | None) -> str:
-    """The stage that is asked for, or else the closeup, or what there is of it."""
+def change_settings(run: StoredRun, given: Sequence[str]) -> StoredRun:
+    """The run with other settings, for what is trained from its states.
+
+    Raises:
+      RunError: a setting is unknown or has no such value.
+    """
+    try:
+        return run._replace(preset=with_settings(run.preset, given))
+    except ValueError as error:
+        raise RunError(str(error)) from None
+
+
+def choose_stage(run: StoredRun, stage: str | None) -> str:
+    """The stage that the user names; by default the closeup, or the last that trained."""
     if stage is None:
-        return next(name for name in (*_BY_DEFAULT, *record.stages) if name in record.stages)
-    if stage not in record.stages:
+        return next(name for name in (*_BY_DEFAULT, *run.stages) if name in run.stages)
+    if stage not in run.stages:
         raise RunError(
-            f"--stage={stage}: {record.folder} has no state of it (closeup has none where no "
-            "labels were let in): choose " + " or ".join(record.stages)
+            f"--stage={stage}: {run.folder} has no state of it (closeup has none where the gate "
+            "let no labels in): choose " + " or ".join(run.stages)
         )
     return stage
 
 
-def load_run_scene(record: Record, moved_to: str | None = None) -> Scene:
+def load_run_scene(run: StoredRun, moved_to: str | None = None) -> Scene:
     """The scene that a run was trained on, from where it was or `moved_to`.
 
     Raises:
-      RunError: it is another one now.
+      RunError: the capture is another one now.
       SceneError: it cannot be loaded.
     """
-    about = record.manifest
+    about = run.manifest
     name = about["scene"] if moved_to is None else moved_to
     try:
         scene = load_scene(name, **about["load_options"])
     except TypeError as error:
         raise RunError(
-            f"--run={record.folder} was loaded with options that this version lacks ({error}): "
+            f"--run={run.folder} was loaded with options that this version lacks ({error}): "
             "render it with the version that trained it"
         ) from None
     size = [scene.train.cameras.width, scene.train.cameras.height]
-    if size != record.identity["resolution"]:
+    if size != run.identity["resolution"]:
         raise RunError(
-            f"--run={record.folder} was trained with photographs of "
-            f"{' x '.join(map(str, record.identity['resolution']))} pixels, and {name} has "
+            f"--run={run.folder} was trained with photographs of "
+            f"{' x '.join(map(str, run.identity['resolution']))} pixels, and {name} has "
             f"{size[0]} x {size[1]}: name its own capture with --data"
         )
     if manifest.hash_data(scene) != about["data_sha256"]:
         warnings.warn(
-            f"{name} does not hold the photographs or cameras that {record.folder} was trained on.",
+            f"{name} does not hold the photographs or cameras that {run.folder} was trained on.",
             stacklevel=2,
         )
     return scene
 
 
-def restore(record: Record, scene: Scene, stage: str) -> tuple[Programs, TrainState]:
+def restore(run: StoredRun, scene: Scene, stage: str) -> tuple[Programs, TrainState]:
     """The programs of a run, with the room that its images needed, and a stage's newest state.
 
     Raises:
-      CheckpointError: the state is not of this form.
+      RunError: there is no such state, or a changed setting does not fit it.
+      CheckpointError: the state has another form.
     """
-    preset = record.preset
-    programs = Programs(preset, scene)
-    like = state_to_begin(programs, seed=0)
-    found = Checkpoints(record.folder / "checkpoints", record.identity).load(stage, like)
+    programs = Programs(run.preset, scene)
+    shapes = _shapes(programs)
+    if run.preset != run.trained and shapes != _shapes(Programs(run.trained, scene)):
+        raise RunError(
+            f"--set changes the shape of what was trained: --run={run.folder} was trained with "
+            "other shapes, so train anew with these settings, or leave them out"
+        )
+    like = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    old = _OLD_NAMES if str(run.identity.get("version", "")).startswith("0.1.") else {}
+    checkpoints = Checkpoints(run.folder / "checkpoints", run.identity)
+    found = checkpoints.load(stage, like, stored_as=old)
     if found is None:
-        raise RunError(f"--stage={stage}: {record.folder} has no state of it")
+        raise RunError(f"--stage={stage}: {run.folder} has no state of it")
     step, state, progress = found
     programs.make_room(progress["growth"])
-    print(f"{record.folder}: {scene.name}, {stage} after {step} steps")
+    print(f"{run.folder}: {scene.name}, {stage} after {step} steps")
     return programs, state
 
 
-def preset_from_config(stored: Mapping[str, Any]) -> Preset:
-    """The preset of which `pipeline.config` made this JSON.
-
-    Raises:
-      ValueError: it is of another form, with the fields that differ.
-    """
-    preset = _rebuild(Preset, stored, "config")
-    if config(preset) != stored:
-        raise ValueError("a value is of another type")
-    return preset
-
-
-def _rebuild(kind, value, name):
-    if value == "inf":
-        return math.inf
-    if isinstance(value, list):
-        return tuple(_rebuild(Any, inner, name) for inner in value)
-    if not isinstance(value, Mapping):
-        return value
-    # Of a choice of classes, only one has these fields.
-    choices = typing.get_args(kind) if isinstance(kind, types.UnionType) else (kind,)
-    choices = [choice for choice in choices if dataclasses.is_dataclass(choice)]
-    if not choices:
-        raise ValueError(f"{name} holds fields")
-    different = []
-    for choice in choices:
-        fields = {field.name for field in dataclasses.fields(choice)}
-        if fields == set(value):
-            kinds = typing.get_type_hints(choice)
-            return choice(**{k: _rebuild(kinds[k], v, f"{name}.{k}") for k, v in value.items()})
-        different.append(sorted(fields ^ set(value)))
-    raise ValueError(f"{name} differs in {', '.join(min(different, key=len))}")
+def _shapes(programs: Programs) -> TrainState:
+    """The structure of a state, with shapes and types in place of arrays."""
+    return jax.eval_shape(lambda: initial_state(programs, seed=0))
 
 
 def _read_json(folder, name):

@@ -1,5 +1,6 @@
 """All arms of a sweep on one scene, from one baseline a seed."""
 
+import dataclasses
 import functools
 import pathlib
 from collections.abc import Mapping, Sequence
@@ -8,48 +9,47 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-import jaxcloseup
-from experiments.evaluation.ladder import ladder_targets
-from experiments.evaluation.scores import (
-    NO_PERCEPTUAL,
-    Perceptual,
-    evaluate,
-    exact_depths,
-    targets_by_split,
-)
-from experiments.methods.presets import Preset, pseudo_settings, test_time_steps
-from experiments.reporting.pictures import comparisons
-from experiments.reporting.report import SPLIT_TITLES, Picture
-from experiments.training.arms import make_arm, why_not
+from experiments.evaluation.metrics_text import SPLIT_TITLES
+from experiments.evaluation.scores import NO_PERCEPTUAL, Perceptual, Target, evaluate
+from experiments.methods import Preset
+from experiments.training.arms import Arm, describe, make_arm, why_not
 from experiments.training.ceilings import labels_of_less_error, true_close_ups
 from experiments.training.logs import TrainLog
-from experiments.training.loop import Programs, TrainingError, run_stage
-from experiments.training.manifest import hash_data, hash_wanted
-from experiments.training.stages import (
-    config,
+from experiments.training.loop import TrainingError
+from experiments.training.programs import Programs
+from experiments.training.scoring import HeldOut, hold_out
+from experiments.training.setup import (
+    LabelStart,
+    Training,
+    identity_of,
+    label_targets,
     rendered_depths,
-    say_what_is_left_out,
-    state_to_begin,
-    timed,
-    training_depths,
+    say_which_points_fit,
+    start_labels,
 )
 from jaxcloseup.artifacts.checkpoints import Checkpoints
-from jaxcloseup.geometry.union_warp import SourceBlocks, block_sources
-from jaxcloseup.pseudo import PseudoSettings, label_views
-from jaxcloseup.scenes import Scene
+from jaxcloseup.field import Rendering
+from jaxcloseup.photographs import Views
+from jaxcloseup.pseudo import LabelSources, PseudoSettings
+from jaxcloseup.scene import Scene
 from jaxcloseup.train import TrainState
 
 
 SHOWN = 2  # views of a split
 
 
-class _Start(NamedTuple):
-    """Where the arms of a seed begin."""
+class SweepOutcome(NamedTuple):
+    """What a sweep found on one scene.
 
-    state: TrainState
-    depths: jax.Array
-    sources: SourceBlocks
-    skipped: int
+    Attributes:
+      scores: for each arm, then seed, `skipped` steps and the metrics of each split in `splits`.
+      shown: the first held-out views of each split.
+      renderings: the first seed's renderings of these, by arm and split, then by name.
+    """
+
+    scores: dict[str, dict[str, Any]]
+    shown: dict[str, Sequence[Target]]
+    renderings: dict[tuple[str, str], dict[str, Rendering]]
 
 
 def run_sweep(
@@ -64,169 +64,208 @@ def run_sweep(
     perceptual: Perceptual = NO_PERCEPTUAL,
     seconds: dict[str, float] | None = None,
     log: TrainLog | None = None,
-    compare: pathlib.Path | None = None,
-) -> tuple[dict[str, Any], list[Picture]]:
-    """All arms of one scene.
+) -> SweepOutcome:
+    """Train and score all arms on one scene.
 
     Args:
-      scene: what is photographed.
-      preset: of stage 1, and of all that an arm does not change.
+      scene: what was photographed.
+      preset: how stage 1 trains, and all that an arm does not change.
       arms: their names.
       seeds: how many.
-      folder: for checkpoints; those of the same sweep are gone on from.
-      names: of "method" and "preset".
+      folder: for checkpoints; the same sweep resumes from those it holds.
+      names: "method" and "preset" by name.
       max_parallel: arms and seeds trained at once.
       perceptual: networks of LPIPS.
-      seconds: is filled with the wall time of each stage.
-      log: is told of what is printed.
-      compare: folder for pictures.
-
-    Returns:
-      For each arm the metrics of each seed and split, and of the first views of each split a
-      picture of the truth and of all arms of the first seed; none without `compare`.
+      seconds: filled with the wall time of each stage.
+      log: gets every report.
     """
-    chosen = [make_arm(name, pseudo_settings(preset)) for name in arms]
-    for arm in chosen:
-        if why_not(arm, scene):
-            print(f"no {arm.name} of {scene.name}: {why_not(arm, scene)}")
-    chosen = [arm for arm in chosen if not why_not(arm, scene)]
-    programs = Programs(preset, scene)
-    views = jax.device_put(scene.train)
-    identity = {"scene": scene.name, "config": config(preset), "seeds": seeds, **names}
-    identity |= {"arms": {arm.name: str(jax.device_get(arm.settings)) for arm in chosen}}
-    identity |= {"resolution": [views.cameras.width, views.cameras.height]}
+    scene = dataclasses.replace(scene, train=jax.device_put(scene.train))
+    chosen = choose_arms(arms, preset, scene)
+    together, in_turn = order_arms(chosen, seeds)
+    identity = identity_of(scene, preset, names) | {"seeds": seeds, "arms": describe(chosen)}
     identity |= {"max_parallel": max_parallel, "devices": len(jax.devices())}
-    identity |= {"version": jaxcloseup.__version__, "data_sha256": hash_data(scene)}
-    identity["wanted_sha256"] = hash_wanted(scene)
-    together = [(arm, seed) for arm in chosen for seed in range(seeds)]
-    in_turn = [(arm, seed) for arm, seed in together if arm.in_turn]
-    together = [pair for pair in together if not pair[0].in_turn and pair[0].kind != "baseline"]
-    # Side by side, arms that look from the same places share their forward warps.
-    together.sort(key=lambda pair: (pair[1], pair[0].outlook))
     # Rows of what is kept are told apart by their place.
     identity["together"] = [[arm.name, seed] for arm, seed in together]
-    checkpoints = Checkpoints(folder, identity)
-    seconds = {} if seconds is None else seconds
-
-    def stage(name, *data, steps):
-        with timed(seconds, name):
-            kept = {"checkpoints": checkpoints, "save_every": 1000, "log": log}
-            return run_stage(name, *data, steps=steps, **kept)
-
-    starts = []
-
-    def start_from(state, seed, skipped):
-        depths = training_depths(programs, state, seed)
-        sources = jax.jit(block_sources)(views.cameras, depths, views.weight)
-        return _Start(state, depths, sources, skipped)
-
-    say_what_is_left_out(programs)
+    programs = Programs(preset, scene)
+    training = Training(programs, Checkpoints(folder, identity), log)
+    training.seconds = {} if seconds is None else seconds
+    say_which_points_fit(programs)
+    starts = Starts(training, seeds)
+    scorer = ArmScorer(programs, hold_out(programs, starts.of(0)), chosen, perceptual)
     for seed in range(seeds):
-        data = programs, "photographs", state_to_begin(programs, seed), views
-        state, history = stage(f"baseline_{seed}", *data, steps=preset.baseline_steps)
-        starts.append(start_from(state, seed, _skipped(history)))
-    exact = exact_depths(scene, views.cameras) if scene.surface else None
-    render = functools.partial(programs.render, starts[0].state)
-    targets = targets_by_split(scene, starts[0].depths, exact, render)
-    if exact is not None:
-        targets |= ladder_targets(scene, exact)
-
-    results: dict[str, Any] = {arm.name: {} for arm in chosen}
-
-    shown = {split: targets[split][:SHOWN] for split in SPLIT_TITLES if split in targets}
-    renderings: dict[str, dict[str, Any]] = {arm.name: {} for arm in chosen}
-
-    def score(arm, seed, state, skipped):
-        splits = {}
-        for split, of_split in targets.items():
-            render = functools.partial(programs.render, state)
-            splits[split], seen = evaluate(render, of_split, perceptual)
-            if seed == 0 and split in shown:
-                renderings[arm][split] = {view.name: seen[view.name] for view in shown[split]}
-        results[arm][str(seed)] = {"skipped": skipped, "splits": splits}
-
-    @functools.cache
-    def with_depth(expected, seed):
-        start = starts[seed]
-        flag = jnp.full_like(start.state.buffers.expected, expected)
-        buffers = start.state.buffers.replace(expected=flag)
-        return start_from(start.state.replace(buffers=buffers), seed, start.skipped)
-
-    def begin(arm, seed):
-        if arm.expected_depth is None:
-            return starts[seed]
-        return with_depth(arm.expected_depth, seed)
-
-    for seed, start in enumerate(starts):
-        if "baseline" in results:
-            score("baseline", seed, start.state, start.skipped)
+        if "baseline" in scorer.scores:
+            scorer.score("baseline", seed, starts.of(seed).state, starts.skipped[seed])
     for first in range(0, len(together), max_parallel):
         group = together[first : first + max_parallel]
-        name = f"arms_{first // max_parallel}"
-        begun = [begin(arm, seed) for arm, seed in group]
-        states, history = _train_together(stage, name, programs, views, group, begun)
-        for i, (arm, seed) in enumerate(group):
-            alone = jax.tree.map(lambda leaf, i=i: leaf[i], states.replace(step=None))
-            skipped = sum(chunk["skipped"][i] for chunk in history)
-            score(arm.name, seed, alone.replace(step=states.step), skipped)
+        train_together(training, f"arms_{first // max_parallel}", group, starts, scorer)
     for arm, seed in in_turn:
-        start = starts[seed]
-        steps = preset.closeup_steps
-        render = functools.partial(programs.render, start.state)
-        depths_of = functools.partial(rendered_depths, render, scene=scene, near=0.0)
-        data = scene, start.depths, exact
-        if arm.depth_error is not None:
-            data = *data, depths_of, arm.settings
-            labels = labels_of_less_error(jax.random.key(seed), *data, share=arm.depth_error)
-        elif arm.kind != "test_time":
-            blurred = arm.kind == "resolved"
-            data = *data, arm.settings
-            labels = true_close_ups(jax.random.key(seed), *data, blurred=blurred)
-        else:
-            cameras = scene.test.cameras
-            data = cameras, depths_of(cameras), scene.train, start.depths, arm.settings
-            labels = jax.jit(label_views)(*data, sources=start.sources)
-            steps = test_time_steps(preset, len(scene.test))
-        name = f"{arm.name}_{seed}"
-        data = views, labels, arm.settings
-        try:
-            state, history = stage(name, programs, "targets", start.state, *data, steps=steps)
-        except TrainingError as error:
-            print(f"{name} is left out: {error}")
-            continue
-        score(arm.name, seed, state, _skipped(history))
-    if compare is None:
-        return results, []
-    # Arms in the order in which they were named, whatever was trained first.
-    by_arm = {(arm, split): seen for arm, of in renderings.items() for split, seen in of.items()}
-    return results, comparisons(compare, shown, by_arm)
+        train_in_turn(training, arm, seed, starts.of(seed, arm.labels.expected_depth), scorer)
+    return scorer.outcome()
 
 
-def _skipped(history: Sequence[Mapping[str, Any]]) -> int:
-    return sum(chunk["skipped"] for chunk in history)
+def choose_arms(names: Sequence[str], preset: Preset, scene: Scene) -> list[Arm]:
+    """The arms that a scene can have; prints why it cannot have others."""
+    arms = [make_arm(name, preset) for name in names]
+    for arm in arms:
+        if why_not(arm, scene):
+            print(f"no {arm.name} on {scene.name}: {why_not(arm, scene)}")
+    return [arm for arm in arms if not why_not(arm, scene)]
+
+
+def order_arms(
+    arms: Sequence[Arm], seeds: int
+) -> tuple[list[tuple[Arm, int]], list[tuple[Arm, int]]]:
+    """Pairs of arm and seed that train together, and those that train in turn."""
+    pairs = [(arm, seed) for arm in arms for seed in range(seeds)]
+    together = [pair for pair in pairs if not pair[0].in_turn and pair[0].kind != "baseline"]
+    # Side by side, arms that look from the same places share their forward warps.
+    together.sort(key=lambda pair: (pair[1], pair[0].outlook))
+    return together, [pair for pair in pairs if pair[0].in_turn]
+
+
+class Starts:
+    """Baselines of all seeds, and what fine-tuning on labels begins with."""
+
+    def __init__(self, training: Training, seeds: int) -> None:
+        """Train a baseline for each seed."""
+        self._programs = training.programs
+        self._baselines: list[TrainState] = []
+        self.skipped: list[int] = []
+        for seed in range(seeds):
+            self._baselines.append(training.train_baseline(f"baseline_{seed}", seed))
+            self.skipped.append(count_skipped(training.history[f"baseline_{seed}"]))
+        self._starts: dict[tuple[int, bool | None], LabelStart] = {}
+
+    def of(self, seed: int, expected_depth: bool | None = None) -> LabelStart:
+        """The start of a seed; `expected_depth` as in `LabelConfig`."""
+        if (seed, expected_depth) not in self._starts:
+            self._starts[seed, expected_depth] = start_labels(
+                self._programs, self._baselines[seed], seed, expected_depth=expected_depth
+            )
+        return self._starts[seed, expected_depth]
+
+
+class ArmScorer:
+    """Scores arms on what is held out.
+
+    Attributes:
+      scores: see `SweepOutcome`.
+    """
+
+    def __init__(
+        self, programs: Programs, held_out: HeldOut, arms: Sequence[Arm], perceptual: Perceptual
+    ) -> None:
+        """Score nothing yet."""
+        self.programs, self.held_out, self._perceptual = programs, held_out, perceptual
+        targets = held_out.targets
+        self._shown = {split: targets[split][:SHOWN] for split in SPLIT_TITLES if split in targets}
+        self.scores: dict[str, dict[str, Any]] = {arm.name: {} for arm in arms}
+        self._renderings: dict[tuple[str, str], dict[str, Rendering]] = {}
+
+    def score(self, arm: str, seed: int, state: TrainState, skipped: int) -> None:
+        """Render and score one arm of one seed."""
+        splits = {}
+        for split, targets in self.held_out.all.items():
+            render = functools.partial(self.programs.render, state)
+            splits[split], seen = evaluate(render, targets, self._perceptual)
+            if seed == 0 and split in self._shown:
+                shown = self._shown[split]
+                self._renderings[arm, split] = {view.name: seen[view.name] for view in shown}
+        self.scores[arm][str(seed)] = {"skipped": skipped, "splits": splits}
+
+    def outcome(self) -> SweepOutcome:
+        """What was found, arms in the order in which they were named."""
+        order = {arm: i for i, arm in enumerate(self.scores)}
+        pairs = sorted(self._renderings.items(), key=lambda pair: order[pair[0][0]])
+        return SweepOutcome(self.scores, self._shown, dict(pairs))
+
+
+def train_together(
+    training: Training,
+    name: str,
+    group: Sequence[tuple[Arm, int]],
+    starts: Starts,
+    scorer: ArmScorer,
+) -> None:
+    """Train and score arms as one program."""
+    print(f"{name}: " + ", ".join(f"{arm.name} {seed}" for arm, seed in group))
+    begun = [starts.of(seed, arm.labels.expected_depth) for arm, seed in group]
+    state, sources, settings = stack_arms(
+        [arm.settings for arm, _ in group], begun, len(jax.devices())
+    )
+    steps = training.programs.preset.closeup_steps
+    states = training.train(name, "arms", state, sources, settings, steps=steps)
+    for i, (arm, seed) in enumerate(group):
+        alone = jax.tree.map(lambda leaf, i=i: leaf[i], states.replace(step=None))
+        skipped = sum(chunk["skipped"][i] for chunk in training.history[name])
+        scorer.score(arm.name, seed, alone.replace(step=states.step), skipped)
 
 
 def stack_arms(
-    group: Sequence[tuple[PseudoSettings, TrainState, jax.Array, SourceBlocks]], devices: int
-) -> tuple[TrainState, jax.Array, PseudoSettings, SourceBlocks]:
-    """States, depths, settings and sources with a leading axis of arms, as `Programs.run` takes.
+    settings: Sequence[PseudoSettings], starts: Sequence[LabelStart], devices: int
+) -> tuple[TrainState, LabelSources, PseudoSettings]:
+    """States, sources and settings with a leading axis of arms, as `Programs.run` takes them.
 
-    The last arm is repeated until each device has as many.
+    Arms share the count of steps and the photographs. The last arm is repeated until each device
+    has as many.
     """
-    group = [*group, *[group[-1]] * (-len(group) % devices)]
-    settings, states, depths, sources = (
-        jax.tree.map(lambda *leaves: jnp.stack(leaves), *column)
-        for column in zip(*group, strict=True)
+    fill = -len(starts) % devices
+    starts, settings = [*starts, *[starts[-1]] * fill], [*settings, *[settings[-1]] * fill]
+
+    def stack(records):
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *records)
+
+    states = stack([start.state for start in starts])
+    first = starts[0].sources
+    sources = LabelSources(
+        first.views,
+        jnp.stack([start.sources.depths for start in starts]),
+        stack([start.sources.blocks for start in starts]),
     )
-    return states.replace(step=states.step[0]), depths, settings, sources
+    return states.replace(step=states.step[0]), sources, stack(settings)
 
 
-def _train_together(stage, name, programs, views, group, begun):
-    arms = [
-        (arm.settings, start.state, start.depths, start.sources)
-        for (arm, _), start in zip(group, begun, strict=True)
-    ]
-    states, *data = stack_arms(arms, len(jax.devices()))
-    print(f"{name}: " + ", ".join(f"{arm.name} {seed}" for arm, seed in group))
-    steps = programs.preset.closeup_steps
-    return stage(name, programs, "arms", states, views, *data, steps=steps)
+def train_in_turn(
+    training: Training, arm: Arm, seed: int, start: LabelStart, scorer: ArmScorer
+) -> None:
+    """Train and score one arm on views that are labeled before its first step."""
+    name, programs = f"{arm.name}_{seed}", training.programs
+    preset, scene = programs.preset, programs.scene
+    labels = label_arm(programs, arm, seed, start, scorer.held_out.exact)
+    steps = preset.closeup_steps
+    if arm.kind == "test_time":
+        steps = programs.method.target_steps(preset.field, len(scene.test))
+    try:
+        data = scene.train, labels, arm.settings
+        state = training.train(name, "target_views", start.state, *data, steps=steps)
+    except TrainingError as error:
+        print(f"{name} is left out: {error}")
+        return
+    scorer.score(arm.name, seed, state, count_skipped(training.history[name]))
+
+
+def label_arm(
+    programs: Programs, arm: Arm, seed: int, start: LabelStart, exact: jax.Array | None
+) -> Views:
+    """The labeled views of an arm that trains in turn."""
+    scene, key = programs.scene, jax.random.key(seed)
+    if arm.depth_error is not None:
+        render = functools.partial(programs.render, start.state)
+        return labels_of_less_error(
+            key,
+            scene,
+            start.sources,
+            exact,
+            functools.partial(rendered_depths, render, scene=scene),
+            arm.settings,
+            share=arm.depth_error,
+        )
+    if arm.kind == "test_time":
+        return label_targets(programs, start, scene.test.cameras, arm.settings)
+    blurred = arm.kind == "resolved"
+    return true_close_ups(key, scene, start.sources, exact, arm.settings, blurred=blurred)
+
+
+def count_skipped(history: Sequence[Mapping[str, Any]]) -> int:
+    """Steps of a stage that were skipped because they were not finite."""
+    return sum(chunk["skipped"] for chunk in history)

@@ -1,17 +1,12 @@
-"""What becomes of cameras to render: fine-tuning for them, and pictures of what they see."""
+"""Frames of cameras: color, depth, normals and support as pictures."""
 
-import functools
 import pathlib
 from collections.abc import Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from experiments.methods.presets import pseudo_settings, test_time_steps
-from experiments.training.gate import print_gate, weigh_labels
-from experiments.training.loop import Programs, TrainingError
-from experiments.training.stages import rendered_depths
+from experiments.training.programs import Programs
 from experiments.viewing.camera_paths import Shots, one_by_one
 from jaxcloseup.artifacts.images import (
     Image,
@@ -21,53 +16,14 @@ from jaxcloseup.artifacts.images import (
     write_png,
 )
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
-from jaxcloseup.pseudo import label_views
-from jaxcloseup.scenes import Scene
+from jaxcloseup.label_rules import label_depth
+from jaxcloseup.pseudo import LabelSources
+from jaxcloseup.scene import Scene
 from jaxcloseup.support import find_support
-from jaxcloseup.train import TrainState, label_depth
+from jaxcloseup.train import TrainState
 
 
 _support = jax.jit(find_support)
-
-
-def fine_tune(
-    programs: Programs, state: TrainState, depths: jax.Array, shots: Shots, *, most: int | None
-) -> TrainState:
-    """Train a state for the cameras that are to be rendered, with labels made once for them.
-
-    Where the preset has a gate, it weighs the labels again.
-
-    Args:
-      programs: of the run.
-      state: of which depth is rendered for the labels.
-      depths: `[V, H, W]` of the training views, of this state.
-      shots: the cameras.
-      most: steps in all; by default the preset's, for each camera of surfels.
-    """
-    preset, scene = programs.preset, programs.scene
-    render = functools.partial(programs.render, state)
-    settings, views = pseudo_settings(preset), scene.train
-    if preset.gated:
-        settings, found = weigh_labels(views, depths, render, settings)
-        print_gate(found)
-        if not found["weight"]:
-            print("nothing is fine-tuned")
-            return state
-    targets = rendered_depths(render, shots.cameras, scene, near=0.0)
-    labels = jax.jit(label_views)(shots.cameras, targets, views, depths, settings)
-    steps = test_time_steps(preset, len(shots.names))
-    steps = min(steps, most or steps)
-    coverage = float(jnp.mean(labels.weight))
-    print(f"labels on {coverage:.0%} of the pixels to be rendered; {steps} steps", flush=True)
-    if coverage == 0:
-        print("nothing is fine-tuned")
-        return state
-    state, values = programs.run("targets", state, views, labels, settings, count=steps)
-    if values["skipped"] == steps:
-        raise TrainingError(f"loss or gradient was not finite in each of {steps} steps for them")
-    numbers = {key: value for key, value in values.items() if isinstance(value, float)}
-    print("  ".join(f"{key} {value:.4g}" for key, value in numbers.items()))
-    return state
 
 
 def render_shots(
@@ -76,16 +32,16 @@ def render_shots(
     state: TrainState,
     shots: Shots,
     *,
-    depths: jax.Array | None,
+    sources: LabelSources | None,
 ) -> list[pathlib.Path]:
     """Write `<kind>/<name>.png` for every camera; returns the folders.
 
     Args:
-      output_dir: for `rgb`, `depth`, `normals` of surfels, and `support`.
-      programs: of the run.
+      output_dir: folder for `rgb`, `depth`, `normals` (from fields that render them) and `support`.
+      programs: the run's.
       state: what is rendered.
-      shots: cameras.
-      depths: `[V, H, W]` of the training views, or None for no support.
+      shots: the cameras.
+      sources: the training photographs with their depths, or None for no support.
     """
     scene = programs.scene
     cameras = one_by_one(shots)
@@ -94,7 +50,7 @@ def render_shots(
     limits = depth_range([label_depth(one, near=0, far=scene.far) for one in some], scene)
     images: dict[str, Image] = {}
     for name, camera in cameras:
-        images = pictures(programs, state, camera, depths=depths, limits=limits)
+        images = pictures(programs, state, camera, sources=sources, limits=limits)
         for kind, image in images.items():
             write_png(output_dir / kind / f"{name}.png", image)
     return [output_dir / kind for kind in images]
@@ -105,17 +61,17 @@ def pictures(
     state: TrainState,
     camera: Camera,
     *,
-    depths: jax.Array | None,
+    sources: LabelSources | None,
     limits: tuple[float, float] | None = None,
 ) -> dict[str, Image]:
-    """One camera's `rgb`, `depth`, `normals` of surfels, and `support`, in colors.
+    """One camera's pictures: `rgb`, `depth`, `normals` and `support`, the last two if it has them.
 
     Args:
-      programs: of the run.
+      programs: the run's.
       state: what is rendered.
-      camera: from where.
-      depths: `[V, H, W]` of the training views, or None for no support.
-      limits: depths of the extreme colors; by default most of this camera's.
+      camera: the camera.
+      sources: the training photographs with their depths, or None for no support.
+      limits: depths of the extreme colors; by default those of most of the picture.
     """
     scene = programs.scene
     seen = programs.render(state, camera)
@@ -124,12 +80,12 @@ def pictures(
     solid = np.asarray(seen.alpha) >= 0.5
     depth_colors = colorize_depth(seen.depth, near=near, far=far, valid=solid)
     images = {"rgb": seen.rgb, "depth": depth_colors}
-    surfels = getattr(seen.aux, "surfels", None)
-    if surfels is not None:
-        images["normals"] = colorize_normals(np.where(solid[..., None], surfels.normal, 0))
-    if depths is not None:
+    if seen.normal is not None:
+        images["normals"] = colorize_normals(np.where(solid[..., None], seen.normal, 0))
+    if sources is not None:
         pixels = pixel_grid(camera.height, camera.width)
-        images["support"] = colorize_support(*_support(camera, pixels, depth, scene.train, depths))
+        support = _support(camera, pixels, depth, sources.views, sources.depths)
+        images["support"] = colorize_support(*support)
     return images
 
 

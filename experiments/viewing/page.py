@@ -11,10 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from viser.transforms import SO3
 
-from experiments.training.loop import Programs, TrainingError
-from experiments.training.stages import training_depths
-from experiments.viewing.camera_paths import Shots, looked_at
-from experiments.viewing.frames import fine_tune, pictures
+from experiments.training.fine_tuning import fine_tune
+from experiments.training.loop import TrainingError
+from experiments.training.programs import Programs
+from experiments.training.setup import LabelStart, start_labels
+from experiments.viewing.camera_paths import looked_at
+from experiments.viewing.frames import pictures
 from experiments.viewing.picking import (
     closeup_camera,
     rank_views,
@@ -23,12 +25,11 @@ from experiments.viewing.picking import (
     vertical_fov,
 )
 from experiments.viewing.server import Server
-from jaxcloseup.artifacts.gaussians import as_gaussians
 from jaxcloseup.artifacts.images import encode_png, to_uint8
 from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.label_rules import label_depth
 from jaxcloseup.photographs import camera_at
-from jaxcloseup.splats import Surfels
-from jaxcloseup.train import TrainState, label_depth
+from jaxcloseup.train import TrainState
 
 
 _HELP = """Click on the scene for a close-up of what is there, on a camera to go to it.
@@ -64,7 +65,7 @@ class Viewer:
         self._server, self._programs, self._state = server, programs, state
         self._scene, self._stage, self._seed = programs.scene, stage, seed
         self._jobs: queue.Queue = queue.Queue(maxsize=1)
-        self._depths: jax.Array | None = None
+        self._start: LabelStart | None = None
         self._camera: Camera | None = None  # of the close-up
         self._aim: tuple[Camera, np.ndarray] | None = None  # its photograph's, and the point
         self._picture: np.ndarray | None = None
@@ -104,8 +105,9 @@ class Viewer:
 
     def _add_scene(self):
         scene, params = self._server.scene, self._state.params
-        if isinstance(params, Surfels):
-            found = as_gaussians(params, self._state.buffers.alive)
+        method, config = self._programs.method, self._programs.preset.field
+        if method.gaussians is not None:
+            found = method.gaussians(params, self._state.buffers)
             # Viser keeps covariances in 16 bits: the largest radius is 100 in the units it gets.
             variances = np.trace(found.covariances, axis1=1, axis2=2)
             unit = np.sqrt(variances.max(initial=1e-18)) / 100
@@ -118,8 +120,7 @@ class Viewer:
                 scale=unit,
             )
             # As the run's own renderer has it.
-            background = self._programs.preset.field.background or 0.0
-            scene.set_background_image(to_uint8(np.full((1, 1), background)))
+            scene.set_background_image(to_uint8(np.full((1, 1), method.background(config))))
         elif len(self._scene.points):
             size = 0.003 * self._distance
             points, rgb = self._scene.points, to_uint8(self._scene.rgb[None])[0]
@@ -220,7 +221,7 @@ class Viewer:
             raise ViewError("There is no surface: click where the scene is.")
         point = np.asarray(ray.position) + depth * np.asarray(ray.rotation)[:, 2]
         data = (jnp.asarray(a, jnp.float32) for a in (point, direction))
-        ranks = np.asarray(rank_views(views, self._training_depths(), *data))
+        ranks = np.asarray(rank_views(views, self._label_start().sources.depths, *data))
         if not ranks.any():
             raise ViewError("No photograph shows what is there: click somewhere else.")
         best = int(ranks.argmax())
@@ -244,24 +245,27 @@ class Viewer:
         self._add_frustum("/closeup", self._camera)
 
     def _render(self, camera, tuned):
-        depths, state = self._training_depths(), self._state
+        start, state = self._label_start(), self._state
         if tuned:
-            shots = Shots(jax.tree.map(lambda leaf: leaf[None], camera), ["closeup"])
-            state = fine_tune(self._programs, state, depths, shots, most=None)
-        images = pictures(self._programs, state, camera, depths=depths)
+            cameras = jax.tree.map(lambda leaf: leaf[None], camera)
+            state = fine_tune(self._programs, start, cameras, most=None)
+        images = pictures(self._programs, state, camera, sources=start.sources)
         self._picture = picture = to_uint8(images["rgb"])
         factor = -(-_SHOWN // picture.shape[1])
         self._image.image = picture.repeat(factor, axis=0).repeat(factor, axis=1)
         self._support.image = images["support"]
         self._image.visible = self._support.visible = True
-        if tuned and state is self._state:
+        if tuned and state is start.state:
             return "No labels are let in for this camera, so nothing was fine-tuned; rendered"
         return "Fine-tuned and rendered" if tuned else "Rendered"
 
-    def _training_depths(self):
-        if self._depths is None:
-            self._depths = training_depths(self._programs, self._state, self._seed)
-        return self._depths
+    def _label_start(self):
+        if self._start is None:
+            expected = self._programs.preset.labels.expected_depth
+            self._start = start_labels(
+                self._programs, self._state, self._seed, expected_depth=expected
+            )
+        return self._start
 
     def _seen_by(self, client):
         """The camera of a visitor, of the photographs' size."""

@@ -1,1 +1,39 @@
-"""Host side, what goes out: pictures and files."""
+"""Write what a run produces: images, videos, PLY files of surfels, and checkpoints.
+
+`checkpoints` is not re-exported, because Orbax is slow to import.
+"""
+
+from jaxcloseup.artifacts.gaussians import Gaussians, as_gaussians
+from jaxcloseup.artifacts.images import (
+    Image,
+    colorize_depth,
+    colorize_error,
+    colorize_normals,
+    colorize_support,
+    encode_png,
+    png_data_uri,
+    side_by_side,
+    to_uint8,
+    write_png,
+)
+from jaxcloseup.artifacts.surfel_ply import read_surfels, write_surfels
+from jaxcloseup.artifacts.video import write_video
+
+
+__all__ = [
+    "Gaussians",
+    "Image",
+    "as_gaussians",
+    "colorize_depth",
+    "colorize_error",
+    "colorize_normals",
+    "colorize_support",
+    "encode_png",
+    "png_data_uri",
+    "read_surfels",
+    "side_by_side",
+    "to_uint8",
+    "write_png",
+    "write_surfels",
+    "write_video",
+]

@@ -1,7 +1,7 @@
-"""Checkpoints of a run: training states of its stages, and what run they are of.
+"""Checkpoints of a run: the training states of its stages and the run's identity.
 
-Orbax writes beside and renames, so a checkpoint that a crash cut short is never seen. Where several
-hosts train together the first one writes and all read; states are then whole on each of them.
+Orbax writes to a temporary folder and renames it, so a crash never leaves half a checkpoint. With
+several hosts, the first one writes and all read; each host holds the whole state.
 """
 
 import json
@@ -17,22 +17,22 @@ from jaxcloseup.files import write_file
 
 
 class CheckpointError(Exception):
-    """A run that cannot be resumed. The message is one sentence that says what to do."""
+    """A run cannot be saved or resumed; the message is one sentence that says what to do."""
 
 
 class Checkpoints:
     """The checkpoints of one run.
 
     Args:
-      folder: where they are kept, one folder for each stage.
-      identity: what makes the run this run, as JSON can hold it: scene, method, configuration ...
+      folder: folder of the checkpoints, with a subfolder per stage.
+      identity: JSON values that identify the run: scene, method, configuration, ...
 
     Raises:
-      CheckpointError: the folder belongs to another run; names the first thing that differs.
+      CheckpointError: the folder belongs to another run; names the first field that differs.
     """
 
     def __init__(self, folder: str | pathlib.Path, identity: Mapping[str, Any]) -> None:
-        """Claim the folder for this run, or go on with it."""
+        """Write the identity to a new folder, or check that an existing folder has the same one."""
         self.folder = pathlib.Path(folder).resolve()
         self._managers: dict[str, ocp.CheckpointManager] = {}
         identity = json.loads(json.dumps(identity))
@@ -46,22 +46,26 @@ class Checkpoints:
             kept = json.loads(path.read_bytes())
         except (OSError, ValueError) as error:
             raise CheckpointError(
-                f"{path} cannot be read ({error}): start anew in another output folder."
+                f"{path} cannot be read ({error}): start a new run in another output folder."
             ) from error
         for name in sorted(kept.keys() | identity.keys()):
             if kept.get(name) != identity.get(name):
                 raise CheckpointError(
-                    f"{self.folder} is of another run, {_difference(name, kept, identity)}: resume "
-                    "it as it was begun, or name a new output folder."
+                    f"{self.folder} belongs to another run, {_difference(name, kept, identity)}: "
+                    "resume it with its own settings, or choose a new output folder."
                 )
 
     def save(self, stage: str, step: int, state: Any, progress: Mapping[str, Any]) -> None:
-        """Keep a stage's state after `step` of its steps; `progress` is JSON. Two are kept.
+        """Save a stage's state after `step` steps, and keep the stage's two newest checkpoints.
 
-        `state` is a pytree of arrays; random keys are kept too.
+        Args:
+          stage: name of the stage.
+          step: number of steps done in the stage.
+          state: pytree of arrays; may hold random keys.
+          progress: JSON values to save with the state.
 
         Raises:
-          CheckpointError: it cannot be written; those before it stay.
+          CheckpointError: the checkpoint cannot be written; earlier ones stay.
         """
         if jax.process_index() > 0:
             return
@@ -70,32 +74,50 @@ class Checkpoints:
         )
         try:
             self._manager(stage).save(step, args=items, force=True)
-        except (ValueError, OSError) as error:  # of a full disk, a ValueError
+        except (ValueError, OSError) as error:  # a full disk raises ValueError
             reason = str(error).partition("\n")[0].rsplit(": ", 1)[-1].split(" [os_error")[0]
             raise CheckpointError(
-                f"{self.folder / stage / str(step)} cannot be written ({reason}): make room for it "
-                "and resume the run from the checkpoint before."
+                f"{self.folder / stage / str(step)} cannot be written ({reason}): make room on the "
+                "disk and resume the run from the previous checkpoint."
             ) from error
 
-    def load(self, stage: str, like: Any) -> tuple[int, Any, dict[str, Any]] | None:
-        """A stage's newest step, state and progress, or None; `like` gives the state's form."""
+    def load(
+        self, stage: str, like: Any, *, stored_as: Mapping[str, str] | None = None
+    ) -> tuple[int, Any, dict[str, Any]] | None:
+        """Load a stage's newest step, state and progress, or None if it has no checkpoint.
+
+        Args:
+          stage: name of the stage.
+          like: pytree with the structure, shapes and types of the state.
+          stored_as: names of fields in `like` whose checkpoint has other names, to these.
+
+        Raises:
+          CheckpointError: the checkpoint cannot be read, or its state differs from `like`.
+        """
         manager = self._manager(stage)
         step = manager.latest_step()
         if step is None:
             return None
         items = ocp.args.Composite(
-            state=ocp.args.StandardRestore(_plain(like)), progress=ocp.args.JsonRestore()
+            # Under other names the state comes back as nested dicts.
+            state=ocp.args.StandardRestore(None if stored_as else _plain(like)),
+            progress=ocp.args.JsonRestore(),
         )
         try:
             found = manager.restore(step, args=items)
+            plain = found["state"]
+            if stored_as:
+                plain = jax.tree_util.tree_map_with_path(
+                    lambda path, _: _follow(found["state"], path, stored_as), like
+                )
         except (ValueError, KeyError, OSError) as error:
             raise CheckpointError(
                 f"{self.folder / stage / str(step)} does not hold this run's state "
-                f"({str(error).splitlines()[0]}): remove it to go on from an earlier one."
+                f"({str(error).splitlines()[0]}): remove it to resume from an earlier one."
             ) from error
         state = jax.tree.map(
             lambda new, old: jax.random.wrap_key_data(new) if _is_key(old) else jnp.asarray(new),
-            found["state"],
+            plain,
             like,
         )
         return step, state, found["progress"]
@@ -118,13 +140,13 @@ class Checkpoints:
 
 
 def _difference(name, kept, identity):
-    """What differs, down to the innermost field."""
+    """Describe the first difference, down to the innermost field."""
     old, new = kept.get(name), identity.get(name)
     while isinstance(old, dict) and isinstance(new, dict):
         both = ((k, old.get(k, "absent"), new.get(k, "absent")) for k in sorted({*old, *new}))
         inner, old, new = next(values for values in both if values[1] != values[2])
         name = f"{name}.{inner}"
-    return f"whose {name} is {old} and not {new}"
+    return f"whose {name} is {old} instead of {new}"
 
 
 def _is_key(leaf):
@@ -132,7 +154,16 @@ def _is_key(leaf):
 
 
 def _plain(state):
-    """The state as NumPy arrays, which belong to no device of no host."""
+    """Copy the state to NumPy arrays, which belong to no device, and unwrap its random keys."""
     return jax.device_get(
         jax.tree.map(lambda leaf: jax.random.key_data(leaf) if _is_key(leaf) else leaf, state)
     )
+
+
+def _follow(tree, path, stored_as):
+    """The leaf of nested dicts and lists that lies at a pytree's path, under other names."""
+    for key in path:
+        name = jax.tree_util.keystr((key,), simple=True)
+        name = stored_as.get(name, name)
+        tree = tree[int(name)] if isinstance(tree, list | tuple) else tree[name]
+    return tree

@@ -1,4 +1,4 @@
-"""Surfels as the 3-D Gaussians that viewers know: discs with a thickness, of one color each."""
+"""Convert surfels to 3-D Gaussians for viewers: thin discs with one color each."""
 
 from typing import NamedTuple
 
@@ -11,17 +11,17 @@ from jaxcloseup.splats.spherical_harmonics import sh_to_rgb
 from jaxcloseup.splats.surfels import Surfels
 
 
-_LEAST_LOG_SCALE = -20.0  # what compressed PLY can hold
+_MIN_LOG_SCALE = -20.0  # the smallest that compressed PLY can hold
 
 
 class Gaussians(NamedTuple):
-    """`M` Gaussians in world units, NumPy, float32.
+    """`M` Gaussians in world units, as float32 NumPy arrays.
 
     Attributes:
-      means: `[M, 3]`.
-      covariances: `[M, 3, 3]` R diag(scale^2) R^T.
-      rgb: `[M, 3]` in [0, 1], the mean over all directions.
-      opacities: `[M]` in [0, 1].
+      means: `[M, 3]` centers.
+      covariances: `[M, 3, 3]` covariances R diag(scale^2) R^T.
+      rgb: `[M, 3]` mean colors over all directions, in [0, 1].
+      opacities: `[M]` opacities in [0, 1].
     """
 
     means: np.ndarray
@@ -31,13 +31,13 @@ class Gaussians(NamedTuple):
 
 
 def thickened(log_scales: np.ndarray) -> np.ndarray:
-    """Log scales `[N, 3]` of discs' `[N, 2]`: as thick as a thousandth of the smaller radius."""
+    """Extend log scales `[N, 2]` to `[N, 3]` with a thickness of 1/1000 of the smaller radius."""
     thin = log_scales.min(axis=1, keepdims=True) + np.float32(np.log(1e-3))
-    return np.concatenate([log_scales, np.maximum(thin, _LEAST_LOG_SCALE)], axis=1)
+    return np.concatenate([log_scales, np.maximum(thin, _MIN_LOG_SCALE)], axis=1)
 
 
 def as_gaussians(surfels: Surfels, alive: jax.Array) -> Gaussians:
-    """The living ones of `N` surfels, `alive [N]`, that are finite."""
+    """Convert those of `N` surfels that are alive (`alive [N]`) and finite."""
     rotations = np.asarray(quaternion_to_matrix(surfels.quaternions))
     axes = rotations * np.exp(thickened(np.asarray(surfels.log_scales)))[:, None, :]
     rgb = sh_to_rgb(surfels.sh[:, :1], jnp.zeros_like(surfels.means))

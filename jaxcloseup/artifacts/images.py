@@ -1,6 +1,6 @@
-"""Pictures: PNG files, color maps for depth, error, normals and support, panels side by side.
+"""Draw images: PNG files, color maps for depth, error, normals and support, rows of panels.
 
-Images are `[H, W, 3]`, red first, or `[H, W]` gray; floats in [0, 1] or uint8; NumPy or JAX arrays.
+Images are RGB `[H, W, 3]` or gray `[H, W]`; floats in [0, 1] or uint8; NumPy or JAX arrays.
 """
 
 import base64
@@ -18,14 +18,14 @@ Image = np.ndarray | jax.Array
 
 _LABEL_HEIGHT = 24
 _LEGEND_WIDTH = 360
-_UNSEEN = (230, 0, 126)
+_UNSEEN = (230, 0, 126)  # magenta
 
 
 def to_uint8(image: Image) -> np.ndarray:
-    """The image as uint8 `[H, W, 3]`: clipped, rounded, black where it is not a number."""
+    """Convert an image to uint8 `[H, W, 3]`: clip, round, and make NaN black."""
     image = np.asarray(image)
     if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
-        raise ValueError(f"an image must be [H, W, 3] or [H, W], this one is {image.shape}.")
+        raise ValueError(f"an image must be [H, W, 3] or [H, W], got {image.shape}.")
     if image.dtype != np.uint8:
         image = np.rint(np.clip(np.nan_to_num(image.astype(np.float32)), 0, 1) * 255)
     return (
@@ -34,12 +34,12 @@ def to_uint8(image: Image) -> np.ndarray:
 
 
 def encode_png(image: Image) -> bytes:
-    """The image as the bytes of an 8-bit PNG."""
+    """Encode an image as the bytes of an 8-bit PNG."""
     return cv2.imencode(".png", to_uint8(image)[..., ::-1])[1].tobytes()
 
 
 def write_png(path: str | pathlib.Path, image: Image) -> None:
-    """Write an image as an 8-bit PNG, whole or not at all, making its folders.
+    """Write an image as an 8-bit PNG, atomically, and create its folders.
 
     Raises:
       OSError: the path cannot be written.
@@ -48,7 +48,7 @@ def write_png(path: str | pathlib.Path, image: Image) -> None:
 
 
 def png_data_uri(image: Image) -> str:
-    """The image as a `data:` address, for a page that needs no files beside it."""
+    """Encode an image as a `data:` URI, for a self-contained HTML page."""
     return "data:image/png;base64," + base64.b64encode(encode_png(image)).decode()
 
 
@@ -59,15 +59,15 @@ def colorize_depth(
     far: float | None = None,
     valid: Image | None = None,
 ) -> np.ndarray:
-    """Depth in false colors, uint8 `[H, W, 3]`: near is red, far is blue, nothing is black.
+    """Map depth to colors, uint8 `[H, W, 3]`: near is red, far is blue, invalid is black.
 
-    Colors follow inverse depth, so that what is near keeps most of them.
+    Colors follow inverse depth, which gives near surfaces most of the range.
 
     Args:
-      depth: `[H, W]` z-depth; what is not positive and finite is nothing.
-      near: depth of the reddest red; by default the 2nd percentile of the depths.
-      far: depth of the darkest blue; by default the 98th.
-      valid: `[H, W]` bool, False where depth means nothing.
+      depth: `[H, W]` z-depth; values that are not positive and finite are invalid.
+      near: depth drawn as the darkest red; by default the 2nd percentile of the valid depths.
+      far: depth drawn as the darkest blue; by default the 98th percentile.
+      valid: `[H, W]` bool, False at further invalid pixels.
     """
     depth = np.asarray(depth, np.float64)
     shown = np.isfinite(depth) & (depth > 0)
@@ -83,21 +83,21 @@ def colorize_depth(
 
 
 def colorize_error(error: Image, *, highest: float = 0.25) -> np.ndarray:
-    """Absolute error in false colors, uint8 `[H, W, 3]`: black is none, bright yellow is much.
+    """Map absolute error to colors, uint8 `[H, W, 3]`, from black (0) to bright yellow.
 
     Args:
-      error: `[H, W]`, or `[H, W, 3]` to be averaged over channels; signs do not matter.
-      highest: the error of the brightest color, fixed so that pictures compare.
+      error: `[H, W]` errors, or `[H, W, 3]` to average over channels; signs are ignored.
+      highest: error drawn in the brightest color; fixed, so that images are comparable.
     """
     error = np.abs(np.asarray(error, np.float64))
     return _map((error.mean(-1) if error.ndim == 3 else error) / highest, cv2.COLORMAP_INFERNO)
 
 
 def colorize_normals(normal: Image) -> np.ndarray:
-    """Normals in false colors, uint8 `[H, W, 3]`: (n + 1) / 2; where there is none, black.
+    """Map normals to colors (n + 1) / 2, uint8 `[H, W, 3]`; pixels without a normal are black.
 
     Args:
-      normal: `[H, W, 3]` of any length; those of length 0 are none.
+      normal: `[H, W, 3]` normals of any length; length 0 means no normal.
     """
     normal = np.nan_to_num(np.asarray(normal, np.float64))
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -106,17 +106,17 @@ def colorize_normals(normal: Image) -> np.ndarray:
 
 
 def colorize_support(count: Image, footprint: Image) -> np.ndarray:
-    """Two panels, how sharply and by how many photographs pixels were seen, with legends below.
+    """Draw how sharply, and in how many photographs, each pixel was seen: two panels with legends.
 
-    Pixels that nobody saw are magenta in both, the one color that the maps do not have.
+    Unseen pixels are magenta in both panels, a color that the maps do not contain.
 
     Args:
-      count: `[H, W]` photographs that saw the pixel.
-      footprint: `[H, W]` side of the smallest photograph's pixel in pixels of the view; drawn in
-        steps, up to 1 (as sharp as the view), 2, 4, 8 and coarser.
+      count: `[H, W]` number of photographs that saw the pixel.
+      footprint: `[H, W]` side of the finest photograph's pixel, in pixels of the view; drawn in
+        steps of up to 1 (as sharp as the view), 2, 4, 8 and coarser.
 
     Returns:
-      uint8 `[H', W', 3]`; small images are drawn larger, for the legends to be read.
+      uint8 `[H', W', 3]`; small images are enlarged so that their legends are readable.
     """
     count, footprint = np.asarray(count), np.asarray(footprint)
     unseen = count < 1
@@ -140,7 +140,7 @@ def colorize_support(count: Image, footprint: Image) -> np.ndarray:
 def side_by_side(
     images: Iterable[Image], *, labels: Sequence[str] | None = None, gap: int = 8
 ) -> np.ndarray:
-    """Panels in a row on white, uint8 `[H, W, 3]`, aligned at the top, each under its label."""
+    """Draw labeled panels in a row on white, aligned at the top, uint8 `[H, W, 3]`."""
     panels = [to_uint8(image) for image in images]
     if labels is not None:
         panels = [
@@ -157,13 +157,13 @@ def side_by_side(
 
 
 def _map(unit: np.ndarray, colors: int) -> np.ndarray:
-    """Colors of values in [0, 1]; OpenCV's maps come blue first."""
+    """Map values in [0, 1] to RGB with a color map of OpenCV, which stores blue first."""
     levels = np.rint(np.clip(np.nan_to_num(unit), 0, 1) * 255).astype(np.uint8)
     return cv2.applyColorMap(levels, colors)[..., ::-1]
 
 
 def _label(text: str, width: int) -> np.ndarray:
-    """A white strip with `text`, made small enough to fit; OpenCV's fonts know ASCII only."""
+    """Draw `text` on a white strip, scaled to fit; OpenCV's fonts have only ASCII."""
     strip = np.full((_LABEL_HEIGHT, width, 3), 255, np.uint8)
     text = text.encode("ascii", "replace").decode()
     font, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.5
@@ -173,7 +173,7 @@ def _label(text: str, width: int) -> np.ndarray:
 
 
 def _legend(colors, texts, width):
-    """A strip of boxes of the colors, each with its text."""
+    """Draw a strip of color boxes, each with its text."""
     edges = np.linspace(0, width, len(texts) + 1).astype(int)
     boxes = []
     for color, text, left, right in zip(colors, texts, edges, edges[1:], strict=False):

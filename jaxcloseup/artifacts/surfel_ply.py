@@ -1,7 +1,7 @@
-"""Surfels in the PLY layout that viewers and editors of Gaussian splats exchange.
+"""Read and write surfels in the PLY layout that viewers and editors of Gaussian splats share.
 
-Values are those before activation: log scales, opacity logits, quaternions as they are. Spherical
-harmonics beyond the constant lie channel by channel, all of red first.
+The file stores values before activation: log scales, opacity logits, unnormalized quaternions.
+Spherical harmonics above degree 0 are stored channel by channel, red first.
 """
 
 import pathlib
@@ -20,24 +20,24 @@ from jaxcloseup.splats.surfels import Surfels
 def write_surfels(
     path: str | pathlib.Path, surfels: Surfels, alive: jax.Array, *, num_scales: int = 3
 ) -> int:
-    """Write living surfels, in the coordinates they have, whole or not at all.
+    """Write the surfels that are alive, atomically and in their own coordinates.
 
     Args:
-      path: the file.
+      path: path of the file.
       surfels: `N` surfels.
       alive: `[N]` bool.
-      num_scales: 3, with a thickness of a thousandth of the smaller radius, for viewers of 3-D
-        Gaussians; 2 for those that know discs.
+      num_scales: 3 for viewers of 3-D Gaussians, with a thickness of 1/1000 of the smaller radius;
+        2 for viewers of discs.
 
     Returns:
-      How many living surfels were left out because a value of theirs is not finite.
+      The number of alive surfels that were dropped because a value is not finite.
 
     Raises:
-      ValueError: `num_scales` is neither.
+      ValueError: `num_scales` is neither 2 nor 3.
       OSError: one sentence that names the path and the reason.
     """
     if num_scales not in (2, 3):
-        raise ValueError(f"num_scales is 2 or 3, not {num_scales}")
+        raise ValueError(f"num_scales must be 2 or 3, got {num_scales}")
     surfels, alive = jax.device_get((surfels, alive))
     sh = np.asarray(surfels.sh, np.float32)
     scales = np.asarray(surfels.log_scales, np.float32)
@@ -65,10 +65,10 @@ def write_surfels(
 
 
 def read_surfels(path: str | pathlib.Path) -> Surfels:
-    """Surfels of a PLY file with two or three scales, of any degree of spherical harmonics.
+    """Read surfels from a PLY file with two or three scales and spherical harmonics of degree 0-3.
 
     Raises:
-      PlyError: not a PLY file of splats; one sentence that says what to do.
+      PlyError: the file is not a PLY file of splats; one sentence that says what to do.
     """
     vertices = read_vertices(path)
     constant, rest, scales, rotation = (
@@ -83,8 +83,8 @@ def read_surfels(path: str | pathlib.Path) -> Surfels:
         or "opacity" not in vertices.dtype.names
     ):
         raise PlyError(
-            f"{path} does not hold splats (f_dc_*, f_rest_*, opacity, scale_*, rot_*): export it "
-            "again as Gaussian splats."
+            f"{path} lacks the properties of splats (f_dc_*, f_rest_*, opacity, scale_*, rot_*): "
+            "export it again as Gaussian splats."
         )
     higher = rest.reshape(len(vertices), 3, bands).swapaxes(1, 2)
     return Surfels(
@@ -101,7 +101,7 @@ def _numbered(stem, array):
 
 
 def _columns(vertices, stem):
-    """The properties `stem_0`, `stem_1`, ... as `[P, count]`, by number and not by place."""
+    """Stack the properties `stem_0`, `stem_1`, ... by number as `[P, count]`."""
     numbers = sorted(
         int(match[1])
         for name in vertices.dtype.names

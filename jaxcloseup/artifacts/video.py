@@ -1,4 +1,4 @@
-"""Videos out of frames: MP4 where the extra `video` is installed, else WebM or AVI by OpenCV."""
+"""Write videos: MP4 if the extra `video` is installed, otherwise WebM or AVI with OpenCV."""
 
 import contextlib
 import functools
@@ -13,25 +13,25 @@ import numpy as np
 from jaxcloseup.artifacts.images import Image, to_uint8
 
 
-# What OpenCV's wheels can write: VP8 plays in browsers, Motion JPEG needs no codec at all.
+# OpenCV's wheels can write VP8, which browsers play, and Motion JPEG, which needs no codec.
 _OPENCV = {".webm": "VP80", ".avi": "MJPG"}
 
 
 def write_video(stem: str | pathlib.Path, frames: Iterable[Image], *, fps: float) -> pathlib.Path:
-    """Write frames as a video, whole or not at all, making its folder.
+    """Write frames as a video, atomically, and create its folder.
 
     Args:
-      stem: the path without ending, which the format decides.
-      frames: images of one size, one or more, as `write_png` takes them. Odd sides get one row or
-        column more, a copy of the last, for codecs know even ones only.
-      fps: frames a second.
+      stem: path without suffix; the format decides the suffix.
+      frames: one or more images of one size, as for `write_png`. Odd sides grow by a copy of the
+        last row or column, because codecs need even sides.
+      fps: frames per second.
 
     Returns:
       The path of the file.
 
     Raises:
-      OSError: it cannot be written, with the reason.
-      ValueError: frames differ in size, or there are none.
+      OSError: the video cannot be written; the message gives the reason.
+      ValueError: the frames differ in size, or there are none.
     """
     stem = pathlib.Path(stem)
     frames = _even(frames)
@@ -56,9 +56,9 @@ def write_video(stem: str | pathlib.Path, frames: Iterable[Image], *, fps: float
                     count += 1
             finally:
                 close()
-            # Codecs do not tell of a full disk.
+            # Codecs do not report a full disk.
             if _count(part) != count:
-                raise _unwritable(path, "it was cut short, as by a full disk")
+                raise _unwritable(path, "frames are missing, perhaps because the disk is full")
             part.replace(path)
         except OSError as error:
             if error.args and str(path) in str(error):
@@ -68,7 +68,7 @@ def write_video(stem: str | pathlib.Path, frames: Iterable[Image], *, fps: float
         finally:
             part.unlink(missing_ok=True)
         return path
-    raise _unwritable(stem, "OpenCV here writes neither WebM nor AVI; install the extra `video`")
+    raise _unwritable(stem, "this OpenCV writes neither WebM nor AVI; install the extra `video`")
 
 
 def _formats() -> Iterator[tuple[str, Callable]]:
@@ -76,7 +76,7 @@ def _formats() -> Iterator[tuple[str, Callable]]:
         import imageio_ffmpeg
 
         program = imageio_ffmpeg.get_ffmpeg_exe()
-    except (ImportError, RuntimeError):  # without it, or without a program in it
+    except (ImportError, RuntimeError):  # not installed, or installed without FFmpeg
         pass
     else:
         yield ".mp4", functools.partial(_open_ffmpeg, program)
@@ -93,7 +93,7 @@ def _formats() -> Iterator[tuple[str, Callable]]:
 
 
 def _open_ffmpeg(program, path, size, fps):
-    """A pipe into FFmpeg. imageio-ffmpeg's own forks this process, which JAX's threads forbid."""
+    """Open a pipe into FFmpeg; imageio-ffmpeg's own writer forks, which JAX's threads forbid."""
     frames = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", f"{fps:g}"]
     codec = ["-c:v", "libx264", "-crf", "16", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
     command = [program, "-y", "-v", "error", *frames, "-i", "-", *codec, str(path)]
@@ -101,7 +101,7 @@ def _open_ffmpeg(program, path, size, fps):
     process = subprocess.Popen(command, **pipes)
 
     def add(frame):
-        # Where FFmpeg gave up there is no pipe any more; `close` says why.
+        # If FFmpeg fails, the pipe is gone; `close` raises the reason.
         with contextlib.suppress(BrokenPipeError):
             process.stdin.write(np.ascontiguousarray(frame))
 
@@ -115,13 +115,15 @@ def _open_ffmpeg(program, path, size, fps):
 
 
 def _even(frames: Iterable[Image]) -> Iterator[np.ndarray]:
-    """The frames as uint8 with even sides."""
+    """Convert the frames to uint8 and pad them to even sides."""
     shape = None
     for frame in frames:
         frame = to_uint8(frame)
         height, width = frame.shape[:2]
         if shape not in (None, frame.shape):
-            raise ValueError(f"frames of one video have one size, not {shape} and {frame.shape}.")
+            raise ValueError(
+                f"all frames of a video must have one size, got {shape} and {frame.shape}."
+            )
         shape = frame.shape
         yield np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
     if shape is None:

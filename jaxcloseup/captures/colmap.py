@@ -1,7 +1,7 @@
-"""COLMAP's sparse models, read with pycolmap.
+"""Read COLMAP's sparse models with pycolmap.
 
-COLMAP's cameras look along z with y down and its pixel centers are at +0.5, as here; its poses are
-world-to-camera.
+COLMAP shares our conventions (cameras look along z with y down, pixel centers at +0.5), but its
+poses are world-to-camera.
 """
 
 import collections
@@ -10,42 +10,42 @@ from typing import Any
 
 import numpy as np
 
-from jaxcloseup.captures.colmap_files import check_files
+from jaxcloseup.captures.colmap_checks import check_files
 from jaxcloseup.captures.distortion import read_distortion
 from jaxcloseup.captures.frames import Frame, check_photographs
 from jaxcloseup.captures.json_fields import number
 from jaxcloseup.scene import SceneError
 
 
-_FIELDS = {"f": "fl_x", "fx": "fl_x", "fy": "fl_y", "k": "k1"}  # others are called alike
+_FIELDS = {"f": "fl_x", "fx": "fl_x", "fy": "fl_y", "k": "k1"}  # other names are the same
 
 
 def holds_model(folder: pathlib.Path) -> bool:
-    """Whether a COLMAP model, whole or not, lies in a folder."""
+    """Whether a folder holds a COLMAP model, complete or not."""
     return any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))
 
 
 def read_colmap(
     model: pathlib.Path, photographs: pathlib.Path
 ) -> tuple[pathlib.Path, list[Frame], tuple[np.ndarray, np.ndarray]]:
-    """A sparse model, binary or text, with or without the rigs and frames of COLMAP 3.12.
+    """Read a sparse model, binary or text, with or without the rigs and frames of COLMAP 3.12.
 
     Args:
-      model: the folder of cameras, images and points3D; binary wins where both are.
-      photographs: the folder in which the images are.
+      model: folder of cameras, images and points3D; binary files win over text files.
+      photographs: folder of the images.
 
     Returns:
-      The file that lists the images; the images that have a pose, by name; and the points `[P, 3]`
-      with their colors `[P, 3]` in [0, 1], float32, by number.
+      The file that lists the images; the images that have a pose, sorted by name; and the points
+      `[P, 3]` with their colors `[P, 3]` in [0, 1], float32, sorted by id.
 
     Raises:
-      SceneError: names the file and what in it, and says what to do.
+      SceneError: names the file and the record in it, and says what to do.
     """
     try:
         import pycolmap
     except ImportError as error:
         raise SceneError(
-            f"{model} is a COLMAP model, and pycolmap, which reads it, is not installed: "
+            f"{model} is a COLMAP model, and reading it needs pycolmap: install it with "
             "pip install 'jaxcloseup[colmap]'."
         ) from error
     suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"
@@ -61,10 +61,10 @@ def read_colmap(
     read = reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text
     try:
         read(str(model))
-    except Exception as error:  # pycolmap raises what its checks in C++ happen to throw
+    except Exception as error:  # pycolmap's C++ checks raise various types
         reason = " ".join(str(error).split())
         raise SceneError(
-            f"{model}: its files do not belong together ({reason}): export the model again."
+            f"{model}: its files do not match each other ({reason}): export the model again."
         ) from error
 
     source, cameras = model / f"images{suffix}", model / f"cameras{suffix}"
@@ -101,7 +101,7 @@ def read_colmap(
 
 
 def _lens(file: pathlib.Path, camera: Any) -> tuple[dict[str, Any], tuple[int, int]]:
-    """A camera as the fields of `transforms.json`, and its (width, height)."""
+    """Convert a camera to the fields of `transforms.json` and its (width, height)."""
     label = f"{file}: camera {camera.camera_id}"
     size = (
         int(number(label, "width", camera.width, above=0)),
@@ -118,12 +118,12 @@ def _lens(file: pathlib.Path, camera: Any) -> tuple[dict[str, Any], tuple[int, i
 def _check_names(source: pathlib.Path, names: list[str]) -> None:
     if not names:
         raise SceneError(
-            f"{source} has no image with a pose: solve the cameras again with photographs that "
-            "overlap more."
+            f"{source} has no image with a pose: run COLMAP again with photographs that overlap "
+            "more."
         )
     twice = [name for name, count in collections.Counter(names).items() if count > 1]
     if twice:
         raise SceneError(
-            f"{source} lists {twice[0]!r} more than once ({len(twice)} such names): delete all but "
-            "one of each from the model."
+            f"{source} lists {twice[0]!r} more than once ({len(twice)} such names): keep one of "
+            "each in the model."
         )

@@ -1,8 +1,8 @@
-"""Lenses that bend: photographs resampled to those of a pinhole camera.
+"""Lens distortion: resample photographs to a pinhole camera.
 
-Formulas are OpenCV's, which COLMAP, nerfstudio and instant-ngp share. Intrinsics are ours (the
-center of the top-left pixel is (0.5, 0.5)); OpenCV's centers are at whole numbers, so that half a
-pixel is taken off on the way in and no coordinate comes out.
+The formulas are OpenCV's, which COLMAP, nerfstudio and instant-ngp share. Intrinsics follow our
+convention (the center of the top-left pixel is (0.5, 0.5)); OpenCV puts pixel centers at integers,
+so `undistortion_map` subtracts half a pixel from the principal point.
 """
 
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from jaxcloseup.captures.json_fields import number
 from jaxcloseup.scene import SceneError
 
 
-# The coefficients of each model, by the names that files give them; others must be 0.
+# The coefficients that each model reads, by their names in files; any other must be 0.
 _RADIAL_TANGENTIAL = ("k1", "k2", "p1", "p2", "k3")
 _PERSPECTIVE = {
     **dict.fromkeys(("PINHOLE", "SIMPLE_PINHOLE", "OPENCV"), _RADIAL_TANGENTIAL),
@@ -27,11 +27,11 @@ COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
 class Distortion(NamedTuple):
-    """How a lens bends, as a hashable record.
+    """Lens distortion as a hashable record.
 
     Attributes:
-      fisheye: whether the angle off the axis, rather than its tangent, grows along the image.
-      coefficients: in OpenCV's order: k1, k2, p1, p2, k3, k4, k5, k6; of a fisheye k1, k2, k3, k4.
+      fisheye: whether the image radius follows the angle off the axis rather than its tangent.
+      coefficients: in OpenCV's order k1, k2, p1, p2, k3, k4, k5, k6; for a fisheye k1, k2, k3, k4.
     """
 
     fisheye: bool
@@ -39,12 +39,12 @@ class Distortion(NamedTuple):
 
 
 class Remap(NamedTuple):
-    """Where each pixel `[H, W]` of the pinhole photograph is found in the distorted one.
+    """For each pinhole pixel `[H, W]`, its position in the distorted photograph.
 
     Attributes:
-      x: columns, float32, with OpenCV's integer centers.
-      y: rows.
-      inside: whether the distorted photograph shows it.
+      x: float32 columns; pixel centers are integers, as in OpenCV.
+      y: float32 rows, likewise.
+      inside: bool, whether the distorted photograph shows the pixel.
     """
 
     x: np.ndarray
@@ -53,14 +53,14 @@ class Remap(NamedTuple):
 
 
 def read_distortion(label: str, lens: dict[str, Any]) -> Distortion | None:
-    """The distortion that a lens's fields describe, or None for a pinhole.
+    """Read the distortion that a lens's fields describe, or None for a pinhole.
 
     Args:
-      label: how messages name it.
-      lens: `camera_model`, `is_fisheye` and coefficients, each of them optional.
+      label: name of the lens in error messages.
+      lens: optional fields `camera_model`, `is_fisheye` and the coefficients.
 
     Raises:
-      SceneError: a model or a coefficient that is not known here.
+      SceneError: the camera model or a non-zero coefficient is not supported.
     """
     model = lens.get("camera_model", "OPENCV")
     name = str(model).upper()
@@ -76,7 +76,7 @@ def read_distortion(label: str, lens: dict[str, Any]) -> Distortion | None:
     if strange:
         # Programs do not agree on what k4 multiplies: r^8, or r^2 in a denominator.
         kind = "OPENCV_FISHEYE" if fisheye else name
-        hint = "take FULL_OPENCV if OpenCV's rational model is meant, or " if not fisheye else ""
+        hint = "set FULL_OPENCV if you mean OpenCV's rational model, or " if not fisheye else ""
         raise SceneError(
             f"{label}: lens distortion (non-zero {', '.join(strange)}) is not supported with "
             f"{kind}: {hint}undistort the photographs to a pinhole camera first."
@@ -87,16 +87,18 @@ def read_distortion(label: str, lens: dict[str, Any]) -> Distortion | None:
     return Distortion(fisheye, tuple(given.get(key, 0.0) for key in order))
 
 
-def undistortion(
+def undistortion_map(
     distortion: Distortion, intrinsics: tuple[float, float, float, float], width: int, height: int
 ) -> Remap:
-    """The map from a pinhole photograph, of the same size and intrinsics, to the distorted one.
+    """Compute where each pixel of a pinhole photograph lies in the distorted one.
+
+    Both photographs have the same size and intrinsics.
 
     Args:
-      distortion: of the lens.
-      intrinsics: fx, fy, cx, cy in pixels, of both photographs.
-      width: in pixels.
-      height: in pixels.
+      distortion: distortion of the lens.
+      intrinsics: fx, fy, cx, cy in pixels.
+      width: image width in pixels.
+      height: image height in pixels.
     """
     fx, fy, cx, cy = intrinsics
     matrix = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
@@ -112,22 +114,22 @@ def undistortion(
 
 
 def undistort(image: np.ndarray, mask: np.ndarray, remap: Remap) -> tuple[np.ndarray, np.ndarray]:
-    """A photograph `[H, W, 3]` and its mask `[H, W]`, both uint8, as a pinhole camera takes them.
+    """Resample a photograph `[H, W, 3]` and its mask `[H, W]`, both uint8, to a pinhole camera.
 
-    What the photograph does not show has mask 0, and the colors of its border.
+    Pixels outside the distorted photograph get mask 0 and the colors of its border.
     """
-    # Cubic: the detail that a bilinear average takes away is what close-ups are made of.
+    # Cubic, because close-ups need the detail that bilinear averaging removes.
     image = cv2.remap(image, remap.x, remap.y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     mask = cv2.remap(mask, remap.x, remap.y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return image, np.where(remap.inside, mask, 0).astype(np.uint8)
 
 
-def _fold(distortion: Distortion, most: float) -> float:
-    """The radius from which on the radial polynomial turns back, or infinity.
+def _fold(distortion: Distortion, largest: float) -> float:
+    """Find the radius at which the radial polynomial stops growing, or infinity.
 
-    Beyond it, directions that the lens never saw would land on the photograph again.
+    Beyond it, directions that the lens never saw would land inside the photograph again.
     """
-    radius = np.linspace(0, most, 4096)
+    radius = np.linspace(0, largest, 4096)
     if distortion.fisheye:
         angle = np.arctan(radius)
         k1, k2, k3, k4 = distortion.coefficients
@@ -136,6 +138,6 @@ def _fold(distortion: Distortion, most: float) -> float:
         k1, k2, _, _, k3, k4, k5, k6 = distortion.coefficients
         square = radius**2
         above, below = np.polyval([k3, k2, k1, 1], square), np.polyval([k6, k5, k4, 1], square)
-        bent = radius * above / np.where(below > 0, below, -1)  # past a pole counts as turned
+        bent = radius * above / np.where(below > 0, below, -1)  # past a pole counts as folded
     back = np.flatnonzero(np.diff(bent) <= 0)
     return float(radius[back[0]]) if len(back) else np.inf

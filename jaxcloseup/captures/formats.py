@@ -1,4 +1,4 @@
-"""What kind of capture a folder holds, and what it lists."""
+"""Detect the format of a capture folder and list its photographs."""
 
 import pathlib
 from typing import Any, NamedTuple
@@ -10,8 +10,8 @@ from jaxcloseup.captures.frames import Frame
 from jaxcloseup.captures.llff import read_llff
 from jaxcloseup.captures.masks import attach_masks
 from jaxcloseup.captures.points import read_ply_points
-from jaxcloseup.captures.reduced import attach_reduced
-from jaxcloseup.captures.splits import divide, listed_split, split_of_file, warn_duplicates
+from jaxcloseup.captures.reduced_photos import attach_reduced
+from jaxcloseup.captures.splits import divide, splits_from_fields, splits_from_file, warn_duplicates
 from jaxcloseup.captures.transforms import read_transforms
 from jaxcloseup.scene import SceneError
 
@@ -27,18 +27,18 @@ _MODELS = ("sparse/0", "sparse", "colmap/sparse/0")
 
 
 class Listing(NamedTuple):
-    """What a folder lists.
+    """The photographs, points and fields that a capture's files list.
 
     Attributes:
       format: one of `FORMATS`.
-      folder: of the capture.
-      file: the file that speaks for the whole capture.
-      fields: its fields.
-      frames: for each split present the photographs, `train` first.
-      points: `[P, 3]` float32, possibly none.
-      rgb: `[P, 3]` their colors in [0, 1].
-      notes: sentences on what was read and how it was divided.
-      times_nearer: as `splits.Division` has it.
+      folder: folder of the capture.
+      file: main file of the capture, which error messages name.
+      fields: fields of the main file.
+      frames: photographs of each split present, `train` first.
+      points: `[P, 3]` float32 world points; P may be 0.
+      rgb: `[P, 3]` float32 colors of the points in [0, 1].
+      notes: sentences on what was read and how it was split.
+      times_nearer: see `splits.Division`.
     """
 
     format: str
@@ -53,7 +53,7 @@ class Listing(NamedTuple):
 
 
 class _Content(NamedTuple):
-    """A folder's photographs, and how its files divide them, if they do."""
+    """What one format's reader returns; `given` holds the splits if the files list any."""
 
     file: pathlib.Path
     fields: dict[str, Any]
@@ -65,41 +65,43 @@ class _Content(NamedTuple):
 def read_listing(
     path: pathlib.Path, *, format: str | None = None, split: str, zoom: int = 1, downscale: int = 1
 ) -> Listing:
-    """The photographs of a folder by split; `load_scene` documents the arguments.
+    """List a folder's photographs by split; `load_scene` documents the arguments.
 
     Raises:
-      SceneError: no known file in the folder, or something wrong in one.
+      SceneError: the folder holds no known format, or one of its files is wrong.
     """
     found = [(kind, name) for kind, name in _detect(path) if format in (None, kind)]
     if not found:
         wanted = f" in the format {format}" if format else ""
         raise SceneError(
-            f"{path} holds no capture{wanted}: neither {_SEPARATE} nor {_SINGLE}, nor a COLMAP "
-            f"model in {', '.join(_MODELS)} or in itself, nor {_LLFF} is there."
+            f"{path} holds no capture{wanted}: add {_SEPARATE}, {_SINGLE}, {_LLFF}, or a COLMAP "
+            f"model in {', '.join(_MODELS)} or in the folder itself."
         )
     (kind, name), *others = found
     folder = _folder_of_model(path) if name == "." else path
     content = {"transforms": _read_transforms, "colmap": _read_model, "llff": _read_llff}[kind](
         folder, path / name
     )
-    called = folder.resolve().name
+    scene = folder.resolve().name
     rejected = " or ".join(_describe(*other, path) for other in others)
-    note = f"{called}: reading {_describe(kind, name, path)}" + (
+    note = f"{scene}: reading {_describe(kind, name, path)}" + (
         f" and not {rejected}" if rejected else ""
     )
-    given = content.given or (split_of_file(folder, content.frames) if split == "given" else None)
+    given = content.given
+    if split == "given" and not given:
+        given = splits_from_file(folder, content.frames)
     points, rgb = content.points
-    division = divide(called, content.frames, given, split, points, zoom)
-    if split != "zoom":  # whose close-ups are what training photographs do not show
+    division = divide(scene, content.frames, given, split, points, zoom)
+    if split != "zoom":  # crops share files with training photographs but show finer detail
         warn_duplicates(folder, division.frames)
     frames, masked = attach_masks(folder, division.frames)
-    frames, reduced = attach_reduced(called, frames, downscale)
+    frames, reduced = attach_reduced(scene, frames, downscale)
     keep = _seen_in_training(frames, len(points))
     notes = [note, *division.notes, *masked, *reduced]
     if not keep.all():
         notes.append(
-            f"{called}: {np.sum(~keep)} of {len(keep)} points, which fewer than two training "
-            "photographs see, are left out"
+            f"{scene}: dropped {np.sum(~keep)} of {len(keep)} points, which fewer than two "
+            "training photographs see"
         )
     return Listing(
         format=kind,
@@ -115,7 +117,7 @@ def read_listing(
 
 
 def _detect(path: pathlib.Path) -> list[tuple[str, str]]:
-    """Formats and what speaks for them in a folder, in order of precedence."""
+    """Find (format, file or model folder) pairs in a folder, in order of precedence."""
     files = [("transforms", _SEPARATE), ("transforms", _SINGLE)]
     found = [(kind, name) for kind, name in files if (path / name).is_file()]
     found += [("colmap", name) for name in (*_MODELS, ".") if holds_model(path / name)]
@@ -129,7 +131,7 @@ def _describe(kind: str, name: str, path: pathlib.Path) -> str:
 
 
 def _folder_of_model(model: pathlib.Path) -> pathlib.Path:
-    """The capture to which a model's folder belongs: the next one around it with photographs."""
+    """Find the capture that a model belongs to: the nearest parent folder with `images`."""
     around = model.resolve()
     candidates = (around, *around.parents)[:4]
     return next((folder for folder in candidates if (folder / "images").is_dir()), model)
@@ -138,7 +140,7 @@ def _folder_of_model(model: pathlib.Path) -> pathlib.Path:
 def _read_transforms(folder: pathlib.Path, file: pathlib.Path) -> _Content:
     if file.name == _SINGLE:
         fields, frames = read_transforms(file)
-        given = listed_split(file, fields, frames)
+        given = splits_from_fields(file, fields, frames)
     else:
         present = {
             split: next((folder / name for name in names if (folder / name).is_file()), None)
@@ -165,7 +167,7 @@ def _read_ply(file: pathlib.Path, fields: dict[str, Any]) -> tuple[np.ndarray, n
     folder, named = file.parent, fields.get("ply_file_path")
     if named and not (folder / str(named)).is_file():
         raise SceneError(
-            f"{file}: ply_file_path {named!r} does not exist: restore it or drop the field."
+            f"{file}: ply_file_path {named!r} does not exist: restore it or remove the field."
         )
     ply = folder / str(named or "points3d.ply")
     if ply.is_file():
@@ -174,9 +176,9 @@ def _read_ply(file: pathlib.Path, fields: dict[str, Any]) -> tuple[np.ndarray, n
 
 
 def _seen_in_training(splits: dict[str, list[Frame]], count: int) -> np.ndarray:
-    """Whether two training photographs see each point, `[P]`, or True where files do not say.
+    """Whether two training photographs see each point, `[P]` bool; all True if files do not say.
 
-    A point that only held-out photographs see would tell training what is in them.
+    A point that only held-out photographs see would leak their content into training.
     """
     seen = [frame.seen for frame in splits["train"]]
     if len(splits) == 1 or any(rows is None for rows in seen):

@@ -1,4 +1,4 @@
-"""A photograph before it is read: where it lies, its camera and its lens."""
+"""`Frame`: the files, camera and lens of a photograph that is not decoded yet."""
 
 import math
 import pathlib
@@ -13,19 +13,20 @@ from jaxcloseup.scene import SceneError
 
 
 class Frame(NamedTuple):
-    """One listed photograph, not yet read.
+    """A listed photograph that is not decoded yet.
 
     Attributes:
-      source: the file that lists it.
-      listed: its `file_path`, as written there.
-      file: the image.
-      mask: its mask, or None.
-      camtoworld: `[3, 4]` float64, OpenCV.
-      size: (width, height) that the intrinsics belong to, or None for the image's own.
-      lens: this frame's own fields about the lens, then those of the whole file.
-      distortion: of the lens, or None for a pinhole.
-      seen: indices of the capture's points that it shows, or None where the format does not say.
-      reduced: the same image, reduced before, which is read in its place; or None.
+      source: file that lists the photograph.
+      listed: path of the photograph as written in `source`.
+      file: path of the image.
+      mask: path of the mask, or None.
+      camtoworld: `[3, 4]` float64 OpenCV pose.
+      size: (width, height) that the intrinsics refer to; None means the image's own size.
+      lens: lens fields of this frame, then those of the whole file.
+      distortion: lens distortion, or None for a pinhole.
+      seen: indices of the capture's points that the photograph shows; None if the format does not
+        tell.
+      reduced: path of an already shrunk copy to read instead of `file`, or None.
     """
 
     source: pathlib.Path
@@ -41,18 +42,21 @@ class Frame(NamedTuple):
 
     @property
     def label(self) -> str:
-        """How messages name it."""
+        """Name of the frame in error messages."""
         return f"{self.source}: frame {self.listed!r}"
 
 
 def frame_intrinsics(
     frame: Frame, width: int, height: int, *, half_pixel: bool = False
 ) -> np.ndarray:
-    """fx, fy, cx, cy `[4]` float64 in pixels of an image of `width` x `height`.
+    """Compute fx, fy, cx, cy `[4]` float64 in pixels of an image of `width` x `height`.
 
-    Focal lengths win over angles, and a frame's own fields over the file's. Pixels are square and
-    the principal point is the middle of the image where nothing else is said. `half_pixel` is for
-    files with integer pixel centers: it moves the principal point that they give by +0.5.
+    Focal lengths win over angles of view, and a frame's own fields win over the file's. By default
+    pixels are square and the principal point is the middle of the image. `half_pixel` is for files
+    with integer pixel centers: it adds 0.5 to the principal point that they give.
+
+    Raises:
+      SceneError: a field is wrong, or no field gives a focal length.
     """
     for lens in frame.lens:
         focal = _focal(frame.label, lens, width, height)
@@ -69,13 +73,13 @@ def frame_intrinsics(
 
 
 def check_photographs(path: pathlib.Path, frames: Sequence[Frame]) -> None:
-    """Complain in one sentence of all photographs that `path` lists and that do not exist."""
+    """Raise one `SceneError` for all photographs that `path` lists but that do not exist."""
     missing = [frame.listed for frame in frames if not frame.file.is_file()]
     if missing:
         first = ", ".join(missing[:3]) + (", ..." if len(missing) > 3 else "")
         raise SceneError(
             f"{path}: {len(missing)} of {len(frames)} listed images do not exist ({first}): "
-            "restore them or drop their frames."
+            "restore them or remove their frames."
         )
 
 

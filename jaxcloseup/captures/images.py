@@ -1,4 +1,4 @@
-"""Photographs from disk: decoding, transparency, downscaling and padding."""
+"""Decode, downscale and pad photographs and masks."""
 
 import pathlib
 from collections.abc import Sequence
@@ -10,13 +10,13 @@ from jaxcloseup.scene import SceneError
 
 
 def read_file(path: pathlib.Path) -> np.ndarray:
-    """The bytes of a picture's file, as uint8 `[N]`.
+    """Read the bytes of an image file as uint8 `[N]`.
 
     Raises:
-      SceneError: it is missing or may not be read.
+      SceneError: the file is missing or cannot be read.
     """
     try:
-        # `cv2.imread` fails on non-ASCII paths on some systems; decoding from memory never does.
+        # `cv2.imread` fails on non-ASCII paths on some systems; decoding from memory does not.
         return np.fromfile(path, np.uint8)
     except OSError as error:
         raise SceneError(f"{path} cannot be read ({error.strerror}): restore the file.") from error
@@ -29,20 +29,19 @@ def read_image(
     keep_alpha: bool = False,
     data: np.ndarray | None = None,
 ) -> np.ndarray:
-    """A photograph as uint8 `[H, W, 3]`, red first.
+    """Read a photograph as uint8 RGB, `[H, W, 3]`.
 
-    Gray becomes RGB, 16 bits become 8, and transparency is composited over the gray level
-    `background` in [0, 1]. Pixels stay as they are stored: an EXIF orientation is not applied,
-    because cameras are solved for, and transforms refer to, the stored pixels.
+    Gray becomes RGB, 16 bits become 8, and transparent pixels are composited over the background.
+    The EXIF orientation is ignored, because cameras refer to the stored pixels.
 
     Args:
-      path: of the file.
-      background: behind transparent pixels.
-      keep_alpha: composite over black, and give alpha as a fourth channel if the file has one.
-      data: the file's bytes where they have been read already.
+      path: path of the file.
+      background: gray level in [0, 1] behind transparent pixels.
+      keep_alpha: composite over black, and return alpha as a fourth channel if the file has one.
+      data: bytes of the file, if already read.
 
     Raises:
-      SceneError: the file is missing, truncated, damaged or not a picture of 8 or 16 bits.
+      SceneError: the file is missing, truncated, damaged or not an image of 8 or 16 bits.
     """
     image, alpha = _decode(path, read_file(path) if data is None else data), None
     if image.ndim == 2:
@@ -59,12 +58,12 @@ def read_image(
 
 
 def read_mask(path: pathlib.Path, *, data: np.ndarray | None = None) -> np.ndarray:
-    """A mask as uint8 `[H, W]`: white counts, black and transparent do not."""
+    """Read a mask as uint8 `[H, W]`: white is 255; black and transparent pixels are 0."""
     return read_image(path, background=0.0, data=data)[..., 0]
 
 
 def downscale_image(image: np.ndarray, factor: int) -> np.ndarray:
-    """Average areas of `factor` x `factor` pixels; a remainder is spread over all of them."""
+    """Shrink `[H, W, ...]` to `[H // factor, W // factor, ...]` by averaging equal areas."""
     if factor == 1:
         return image
     height, width = (max(1, side // factor) for side in image.shape[:2])
@@ -72,7 +71,7 @@ def downscale_image(image: np.ndarray, factor: int) -> np.ndarray:
 
 
 def pad_images(images: Sequence[np.ndarray], height: int, width: int) -> np.ndarray:
-    """Stack `[h, w, ...]` images of any sizes into the top left of `[V, height, width, ...]`."""
+    """Stack `[h, w, ...]` images into the top left of zeros `[V, height, width, ...]`."""
     stack = np.zeros((len(images), height, width, *images[0].shape[2:]), images[0].dtype)
     for target, image in zip(stack, images, strict=True):
         target[: image.shape[0], : image.shape[1]] = image
@@ -87,10 +86,12 @@ def _decode(path: pathlib.Path, data: np.ndarray) -> np.ndarray:
         except cv2.error as error:
             large = "MAX_IMAGE" in str(error) or error.code == cv2.Error.StsNoMem
     if large:
-        raise SceneError(f"{path} says that it is too large to decode: shrink or export it again.")
+        raise SceneError(
+            f"{path} is too large to decode, or its header is damaged: shrink or export it again."
+        )
     if image is None:
         raise SceneError(
-            f"{path} is not a readable image, or it is truncated: copy or export it again."
+            f"{path} is not a readable image or is truncated: copy or export it again."
         )
     if image.dtype == np.uint16:
         image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
@@ -102,10 +103,10 @@ def _decode(path: pathlib.Path, data: np.ndarray) -> np.ndarray:
 
 
 def _is_truncated_jpeg(data: bytes) -> bool:
-    """Whether a JPEG ends before its end marker; some decoders then return gray without a word.
+    """Whether a JPEG ends before its end marker; some decoders silently fill the rest with gray.
 
-    Segments before the scan are skipped by their lengths, since a thumbnail inside one of them has
-    an end marker of its own. In the scan itself ff d9 can be nothing else.
+    The search skips the segments before the scan, since a thumbnail in one of them has its own end
+    marker. Inside the scan, ff d9 is always the end marker.
     """
     if not data.startswith(b"\xff\xd8"):
         return False

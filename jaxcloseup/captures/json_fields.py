@@ -1,4 +1,4 @@
-"""Checks of the values that files give; messages name the file and the field."""
+"""Read JSON files and check values from capture files; errors name the file and the field."""
 
 import json
 import math
@@ -11,13 +11,15 @@ import numpy as np
 from jaxcloseup.scene import SceneError
 
 
-_LARGEST = int(sys.float_info.max)  # whole numbers in JSON have no bound
+_LARGEST = int(sys.float_info.max)  # JSON integers can exceed any float
 
 
 def number(label: str, key: str, value: Any, *, above: float = -math.inf) -> float:
-    """`value` as a float, which must be finite and greater than `above`."""
+    """Return `value` as a float; raise `SceneError` unless it is finite and exceeds `above`."""
     if isinstance(value, int) and abs(value) > _LARGEST:
-        raise SceneError(f"{label}: {key} has {len(str(value))} digits, too many: correct it.")
+        raise SceneError(
+            f"{label}: {key} has {len(str(value))} digits, too many for a number: correct it."
+        )
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise SceneError(f"{label}: {key} must be a finite number, got {value!r}: correct it.")
     if value <= above:
@@ -25,8 +27,8 @@ def number(label: str, key: str, value: Any, *, above: float = -math.inf) -> flo
     return float(value)
 
 
-def side(label: str, key: str, value: Any) -> int:
-    """`value` as an image's width or height in pixels."""
+def image_side(label: str, key: str, value: Any) -> int:
+    """Return `value` as an image's width or height in pixels; raise `SceneError` below 1."""
     pixels = number(label, key, value, above=0)
     if pixels < 1:
         raise SceneError(f"{label}: {key} must be at least 1 pixel, got {value}: correct it.")
@@ -34,7 +36,7 @@ def side(label: str, key: str, value: Any) -> int:
 
 
 def affine_transform(label: str, key: str, value: Any) -> np.ndarray:
-    """A `[3, 4]` float64 matrix out of a 3x4 or 4x4 list of lists."""
+    """Return a 3x4 or 4x4 list of lists as a `[3, 4]` float64 matrix, or raise `SceneError`."""
     try:
         matrix = np.array(value, np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -42,21 +44,23 @@ def affine_transform(label: str, key: str, value: Any) -> np.ndarray:
     if matrix.shape not in ((3, 4), (4, 4)):
         raise SceneError(f"{label}: {key} must be a 4x4 matrix of numbers: correct it.")
     if not np.isfinite(matrix).all():
-        raise SceneError(f"{label}: {key} holds a value that is not finite: drop or correct it.")
+        raise SceneError(f"{label}: {key} holds a value that is not finite: remove or correct it.")
     if len(matrix) == 4 and not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
-        raise SceneError(f"{label}: {key} must end in the row 0, 0, 0, 1: it may be transposed.")
+        raise SceneError(
+            f"{label}: {key} must end in the row 0, 0, 0, 1: correct it; it may be transposed."
+        )
     return matrix[:3]
 
 
 def rigid_transform(label: str, key: str, value: Any) -> np.ndarray:
-    """As `affine_transform`, and made of a rotation and a position."""
+    """Like `affine_transform`, but the matrix must consist of a rotation and a position."""
     matrix = affine_transform(label, key, value)
     rotation = matrix[:, :3]
     error = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if error > 1e-3:
         raise SceneError(
-            f"{label}: {key} is not rigid, its rotation is off by {error:.2g}: scale positions "
-            "only, and leave the rotation's columns orthogonal and of unit length."
+            f"{label}: {key} is not rigid, its rotation is off by {error:.2g}: make the rotation's "
+            "columns orthogonal and of unit length, and scale only the position."
         )
     if np.linalg.det(rotation) < 0:
         raise SceneError(f"{label}: {key} mirrors space: flip one axis of its rotation.")
@@ -64,7 +68,15 @@ def rigid_transform(label: str, key: str, value: Any) -> np.ndarray:
 
 
 def read_object(path: pathlib.Path, holds: str) -> dict[str, Any]:
-    """The object of a JSON file, which `holds` what a sentence on another file would miss."""
+    """Read the object in a JSON file.
+
+    Args:
+      path: path of the file.
+      holds: what the object should hold, for error messages.
+
+    Raises:
+      SceneError: the file cannot be read, or it does not hold a JSON object.
+    """
     try:
         fields = json.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
@@ -77,7 +89,7 @@ def read_object(path: pathlib.Path, holds: str) -> dict[str, Any]:
         raise SceneError(f"{path}: not UTF-8 text: save it again as UTF-8.") from error
     except (ValueError, RecursionError) as error:
         raise SceneError(
-            f"{path}: nested too deep, or a number of thousands of digits: is it the right file?"
+            f"{path}: nested too deep, or a number has thousands of digits: is it the right file?"
         ) from error
     if not isinstance(fields, dict):
         raise SceneError(f"{path}: not an object with {holds}: is it the right file?")

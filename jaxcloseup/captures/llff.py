@@ -1,8 +1,8 @@
-"""LLFF's `poses_bounds.npy`, with the photographs in `images/`.
+"""Read LLFF's `poses_bounds.npy`, with the photographs in `images/`.
 
-Each row holds a 3 x 5 matrix and two depths. The matrix's columns are the camera's axes (down,
-right, backward) and its position in the world, then height, width and focal length in pixels; the
-depths bound what the camera sees.
+Each row holds a 3 x 5 matrix and two depths. The columns of the matrix are the camera's axes (down,
+right, backward), its position in the world, and (height, width, focal length) in pixels. The depths
+bound what the camera sees.
 """
 
 import pathlib
@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 
 from jaxcloseup.captures.frames import Frame
-from jaxcloseup.captures.json_fields import number, rigid_transform, side
+from jaxcloseup.captures.json_fields import image_side, number, rigid_transform
 from jaxcloseup.captures.masks import list_photographs
 from jaxcloseup.scene import SceneError
 
 
 def read_llff(file: pathlib.Path, photographs: pathlib.Path) -> tuple[dict[str, Any], list[Frame]]:
-    """`near` and `far` of all photographs together, and the frames.
+    """Read the fields `near` and `far` of the whole capture, and the frames.
 
-    Rows belong to the photographs sorted by name. Near is 0.9 of the least bound, as in NeRF's own
-    loader, and far the greatest.
+    Rows belong to the photographs sorted by name. Near is 0.9 of the smallest near bound, as in
+    NeRF's own loader, and far is the largest far bound.
 
     Raises:
       SceneError: names the file and the row, and says what to do.
@@ -29,20 +29,22 @@ def read_llff(file: pathlib.Path, photographs: pathlib.Path) -> tuple[dict[str, 
         rows = np.load(file, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise SceneError(
-            f"{file} is not a whole NumPy file of numbers: copy or export it again."
+            f"{file} is truncated or not a NumPy file of numbers: copy or export it again."
         ) from error
     if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
         shape = " x ".join(map(str, getattr(rows, "shape", ()))) or "nothing"
         raise SceneError(
-            f"{file} holds {shape}: it must be N x 17, a row for each photograph; export it again."
+            f"{file} has shape {shape} instead of N x 17, one row per photograph: export it again."
         )
     if rows.dtype.kind not in "fiu":
-        raise SceneError(f"{file} holds {rows.dtype} values and not numbers: export it again.")
+        raise SceneError(
+            f"{file} holds {rows.dtype} values instead of real numbers: export it again."
+        )
     files = list_photographs(photographs)
     if len(files) != len(rows):
         raise SceneError(
-            f"{file} has {len(rows)} poses and {photographs} {len(files)} photographs: restore "
-            "those that are missing, or take out those without a pose."
+            f"{file} has {len(rows)} poses but {photographs} has {len(files)} photographs: restore "
+            "missing photographs, or remove those without a pose."
         )
     frames = [_frame(file, path, row) for path, row in zip(files, rows, strict=True)]
     near, far = 0.9 * float(rows[:, 15].min()), float(rows[:, 16].max())
@@ -52,7 +54,7 @@ def read_llff(file: pathlib.Path, photographs: pathlib.Path) -> tuple[dict[str, 
 def _frame(file: pathlib.Path, photograph: pathlib.Path, row: np.ndarray) -> Frame:
     label = f"{file}: row of {photograph.name}"
     height, width, focal = row[4:15:5].tolist()
-    size = side(label, "width", width), side(label, "height", height)
+    size = image_side(label, "width", width), image_side(label, "height", height)
     focal = number(label, "focal length", focal, above=0)
     near, far = (
         number(label, name, value, above=0)

@@ -1,4 +1,4 @@
-"""Load a capture: photographs, cameras, points and depth range of one folder."""
+"""Load a capture: the photographs, cameras, points and depth range of one folder."""
 
 import logging
 import pathlib
@@ -8,11 +8,11 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcloseup.captures.bounds import near_far_from_cameras, near_far_from_points
-from jaxcloseup.captures.checks import check_weights, warn_sizes
+from jaxcloseup.captures.depth_range import near_far_from_cameras, near_far_from_points
 from jaxcloseup.captures.formats import Listing, read_listing
 from jaxcloseup.captures.images import pad_images
 from jaxcloseup.captures.json_fields import affine_transform, number
+from jaxcloseup.captures.photo_checks import check_sizes, check_weights
 from jaxcloseup.captures.photo_reading import Photo, Reading, read_photos
 from jaxcloseup.captures.splits import unique_names
 from jaxcloseup.captures.triangulation import triangulate
@@ -21,7 +21,7 @@ from jaxcloseup.photographs import Views
 from jaxcloseup.scene import NearFarWarning, Scene, SceneError
 
 
-_LEAST_POINTS = 100  # triangulated; fewer tell too little of where a scene is
+_MIN_POINTS = 100  # fewer triangulated points say too little about where the scene is
 
 _log = logging.getLogger(__name__)
 
@@ -36,14 +36,14 @@ def load_capture(
     """
     try:
         if not path.is_dir():
-            raise SceneError(f"{path} is not a folder: give the one that holds the capture.")
+            raise SceneError(f"{path} is not a folder: give the folder that holds the capture.")
         listing = read_listing(
             path, format=format, split=split, zoom=reading.zoom, downscale=reading.downscale
         )
-    except OSError as error:  # of folders; what reads a file says more
+    except OSError as error:  # from listing folders; reading a file raises SceneError
         raise SceneError(
-            f"{error.filename or path!s:.200} cannot be read ({error.strerror}): permit reading "
-            "it, or correct its name where a file lists it."
+            f"{error.filename or path!s:.200} cannot be read ({error.strerror}): make it readable, "
+            "or correct its name in the file that lists it."
         ) from error
     for note in listing.notes:
         _log.info(note)
@@ -58,8 +58,7 @@ def _load(listing: Listing, reading: Reading) -> Scene:
         transform = affine_transform(str(listing.file), "applied_transform", transform)
         if np.linalg.matrix_rank(transform[:, :3]) < 3:
             raise SceneError(
-                f"{listing.file}: applied_transform flattens space, so that nothing leads back: "
-                "correct it."
+                f"{listing.file}: applied_transform flattens space and has no inverse: correct it."
             )
     scale = listing.fields.get("applied_scale", 1.0)
     scale = number(str(listing.file), "applied_scale", scale, above=0)
@@ -67,7 +66,7 @@ def _load(listing: Listing, reading: Reading) -> Scene:
     parts = read_photos(listing.frames, reading)
     photos = [photo for members in parts.values() for photo in members]
     check_weights(listing.folder, listing.frames, photos, reading)
-    warn_sizes(listing.file.parent, photos)
+    check_sizes(listing.file.parent, photos)
     intrinsics = np.stack([photo.intrinsics(reading.half_pixel) for photo in photos])
     camtoworld = np.stack([photo.frame.camtoworld for photo in photos])
     sizes = np.array([photo.size for photo in photos])
@@ -124,11 +123,15 @@ def _load(listing: Listing, reading: Reading) -> Scene:
 def _with_points(
     listing: Listing, photos: Sequence[Photo], camtoworld: np.ndarray, intrinsics: np.ndarray
 ) -> Listing:
-    """A listing without points, with those that its training photographs agree on.
+    """Add points triangulated from the training photographs to a listing without points.
 
-    `photos` are these, and the first of the poses and intrinsics are theirs.
+    Args:
+      listing: listing without points.
+      photos: training photographs.
+      camtoworld: `[V, 3, 4]` poses of all photographs, those of `photos` first.
+      intrinsics: `[V, 4]` intrinsics, in the same order.
     """
-    count = len(photos)  # held-out photographs tell nothing of what they show
+    count = len(photos)  # held-out photographs must not leak into training
     if count < 2:
         return listing
     points, rgb = triangulate(
@@ -137,11 +140,11 @@ def _with_points(
         camtoworld[:count],
         intrinsics[:count],
     )
-    if len(points) < _LEAST_POINTS:
+    if len(points) < _MIN_POINTS:
         return listing
     note = (
-        f"{listing.folder.resolve().name} comes without points: {len(points)} were triangulated "
-        f"from features of its {count} training photographs"
+        f"{listing.folder.resolve().name} has no points: {len(points)} were triangulated from "
+        f"features of its {count} training photographs"
     )
     _log.info(note)
     return listing._replace(points=points, rgb=rgb, notes=(*listing.notes, note))
@@ -166,10 +169,10 @@ def _near_far(
         low, high = estimate or near_far_from_cameras(camtoworld)
         near, far = near or low, far or high
         absent = " and ".join(key for key in ("near", "far") if key not in given)
-        if source == "poses" or listing.format != "colmap":  # no field of COLMAP's could be given
+        if source == "poses" or listing.format != "colmap":  # COLMAP has no such field
             warnings.warn(
-                f"{label}: no {absent}; from the {source}, near {near:.4g} and far {far:.4g} are "
-                "used: give both in world units if they do not hold the scene.",
+                f"{label}: no {absent}; estimated near {near:.4g} and far {far:.4g} from the "
+                f"{source}: give both in world units if they do not enclose the scene.",
                 NearFarWarning,
                 stacklevel=2,
             )

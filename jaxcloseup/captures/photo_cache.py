@@ -1,7 +1,7 @@
-"""Reduced photographs on disk: to decode large ones takes most of the time that loading takes.
+"""Cache shrunk photographs on disk, because decoding large ones dominates loading time.
 
-They lie in `$XDG_CACHE_HOME/jaxcloseup/photographs` under the hash of all that makes them, so that
-nothing there is ever out of date, and anything may be deleted.
+The cache is `$XDG_CACHE_HOME/jaxcloseup/photographs`. Each file is named by a hash of everything
+that determines it, so no file is ever out of date, and any file may be deleted.
 """
 
 import contextlib
@@ -14,18 +14,22 @@ import numpy as np
 from jaxcloseup.files import cache_folder, write_file
 
 
-_DIGEST = 32  # bytes of SHA-256, before the content that they are of
+_DIGEST = 32  # bytes of SHA-256 in front of the content
 
 
 def content_hash(data: bytes | np.ndarray | None) -> str | None:
-    """A name for the content of a file, or None for that of no file."""
+    """Hash the content of a file; None stays None."""
     return None if data is None else hashlib.sha256(data).hexdigest()
 
 
-def kept(key: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """`make()`, from disk where it was made for the same `key` before.
+def cached(key: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Return `make()`, or its result from the cache if the same `key` was made before.
 
-    What is damaged there is made again, and what cannot be written is not kept.
+    A damaged file is made again. If the cache cannot be written, nothing is cached.
+
+    Args:
+      key: everything that determines the result.
+      make: returns the arrays to cache.
     """
     name = hashlib.sha256(key.encode()).hexdigest()
     path = cache_folder() / "jaxcloseup" / "photographs" / f"{name}.photo"

@@ -1,4 +1,4 @@
-"""Photographs made ready, a few at a time: decoded, masked, straightened and downscaled."""
+"""Read photographs, a few at a time: decode, mask, undistort, downscale and crop them."""
 
 import concurrent.futures
 import contextlib
@@ -13,30 +13,30 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from jaxcloseup.captures.distortion import Remap, undistort, undistortion
+from jaxcloseup.captures.distortion import Remap, undistort, undistortion_map
 from jaxcloseup.captures.frames import Frame, frame_intrinsics
 from jaxcloseup.captures.images import downscale_image, read_file, read_image, read_mask
-from jaxcloseup.captures.photo_cache import content_hash, kept
+from jaxcloseup.captures.photo_cache import cached, content_hash
 from jaxcloseup.scene import SceneError
 
 
 ALPHA_MODES = ("blend", "mask")
-_MOST_AT_ONCE = 4  # each holds a few times its own size: 12 megapixels take some 100 MB
-_CODE = ("photographs.py", "images.py", "distortion.py")
-_BYTES_PER_PIXEL = 12  # of what stays: as read, padded, and weights in float32, at the worst moment
+_MAX_CONCURRENT = 4  # each needs a few times its own size: 12 megapixels take about 100 MB
+_SOURCES = ("photo_reading.py", "images.py", "distortion.py")
+_BYTES_PER_PIXEL = 12  # peak of what stays: as read, padded, and weights in float32
 
 
 class Reading(NamedTuple):
-    """How photographs are made ready.
+    """How to read photographs; `load_scene` documents the options.
 
     Attributes:
-      downscale: whole number by which they shrink, by averaging areas.
-      zoom: whole number by which they shrink further; if not 1, the frames of `test` are close-ups,
-        parts of training photographs that do not.
+      downscale: positive integer factor by which to shrink photographs, by averaging areas.
+      zoom: further such factor; if not 1, the `test` frames become crops of training photographs
+        that skip this factor.
       background: gray level in [0, 1] behind transparent pixels.
-      half_pixel: whether the files count pixel centers at whole numbers.
-      alpha_mode: one of `ALPHA_MODES`: transparent pixels show the background, or weigh less.
-      invert_masks: whether white is what masks ignore.
+      half_pixel: whether the files put pixel centers at integers.
+      alpha_mode: one of `ALPHA_MODES`; transparent pixels show the background or weigh less.
+      invert_masks: whether masks mark ignored pixels in white.
     """
 
     downscale: int = 1
@@ -48,16 +48,16 @@ class Reading(NamedTuple):
 
 
 class Photo(NamedTuple):
-    """A photograph after downscaling, or a part of it.
+    """A photograph after downscaling, or a crop of it.
 
     Attributes:
-      frame: what was read.
-      rgb: `[H, W, 3]` uint8.
-      mask: `[H, W]` uint8, 255 where it counts.
-      stored_size: the (width, height) that the photograph had before.
-      scaled: the (width, height) of the whole photograph at this scale; of one that is trimmed so
-        that a whole number of pixels become one, possibly fractions.
-      corner: (x, y) in it of the part's first pixel.
+      frame: frame that was read.
+      rgb: `[H, W, 3]` uint8 colors.
+      mask: `[H, W]` uint8 weights, 255 where the pixel counts fully.
+      stored_size: (width, height) of the file's image.
+      scaled: (width, height) of the whole photograph at this scale, before trimming; may be
+        fractional.
+      corner: (x, y) of the crop's first pixel in the whole photograph at this scale.
     """
 
     frame: Frame
@@ -69,35 +69,36 @@ class Photo(NamedTuple):
 
     @property
     def size(self) -> tuple[int, int]:
-        """Its (width, height)."""
+        """Width and height in pixels."""
         return self.rgb.shape[1], self.rgb.shape[0]
 
     def intrinsics(self, half_pixel: bool) -> np.ndarray:
-        """fx, fy, cx, cy `[4]` in its pixels; `half_pixel` as `Reading` has it."""
+        """Compute fx, fy, cx, cy `[4]` in pixels; `half_pixel` as in `Reading`."""
         whole = _resized_intrinsics(self.frame, self.stored_size, self.scaled, half_pixel)
         return whole - np.array([0, 0, *self.corner])
 
 
 def read_photos(splits: Mapping[str, Sequence[Frame]], reading: Reading) -> dict[str, list[Photo]]:
-    """The photographs of each split; at full size no more than `_MOST_AT_ONCE` are in memory.
+    """Read the photographs of each split, at most `_MAX_CONCURRENT` at full size in memory.
 
     Raises:
-      SceneError: a photograph or its mask that cannot be read, sizes that do not fit, or more
-        photographs than fit into memory.
+      SceneError: a photograph or mask cannot be read, their sizes differ, or the photographs do not
+        fit into memory.
     """
-    # A close-up is cut while the photograph that it is a part of is there anyway.
+    # Close-ups are cropped while their photograph is in memory anyway.
     parts = splits.get("test", ()) if reading.zoom > 1 else ()
     closeups = {frame.file for frame in parts}
-    whole = {split: of for split, of in splits.items() if not closeups or split != "test"}
+    whole = {split: members for split, members in splits.items() if not closeups or split != "test"}
     frames = [frame for members in whole.values() for frame in members]
     read = functools.partial(
         _read_photo,
         reading=reading,
-        find_remap=_one_at_a_time(functools.lru_cache(maxsize=2)(undistortion)),  # mostly one lens
+        # Most captures have one lens.
+        find_remap=_one_at_a_time(functools.lru_cache(maxsize=2)(undistortion_map)),
     )
     first = read(frames[0], frames[0].file in closeups)
     _check_memory(first[0], len(frames), reading)
-    workers = min(_MOST_AT_ONCE, os.cpu_count() or 1)
+    workers = min(_MAX_CONCURRENT, os.cpu_count() or 1)
     # OpenCV decodes without Python's lock.
     with concurrent.futures.ThreadPoolExecutor(workers) as pool:
         each = pool.map(read, frames[1:], [frame.file in closeups for frame in frames[1:]])
@@ -109,22 +110,22 @@ def read_photos(splits: Mapping[str, Sequence[Frame]], reading: Reading) -> dict
 
 
 def _check_memory(photo: Photo, count: int, reading: Reading) -> None:
-    """Refuse what would not fit, were all photographs like this one, before it is read."""
+    """Raise before reading `count` photographs of this size that would not fit into memory."""
     needed = _BYTES_PER_PIXEL * count * photo.mask.size
     if needed > (held := _memory()):
         width, height = photo.size
-        least = math.ceil(reading.downscale * math.sqrt(needed / held))
+        smallest = math.ceil(reading.downscale * math.sqrt(needed / held))
         raise SceneError(
-            f"{photo.frame.file.parent}: {count} photographs of {width} x {height} pixels take "
-            f"{needed / 2**30:.1f} GiB, and this computer has {held / 2**30:.1f}: choose a "
-            f"downscale of at least {least}."
+            f"{photo.frame.file.parent}: {count} photographs of {width} x {height} pixels need "
+            f"{needed / 2**30:.1f} GiB, but this computer has {held / 2**30:.1f}: choose a "
+            f"downscale of at least {smallest}."
         )
 
 
 def _memory() -> int:
-    """Bytes of this computer, or of the container."""
+    """Memory of this computer, or of the container, in bytes."""
     held = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    with contextlib.suppress(OSError, ValueError):  # "max" is no limit
+    with contextlib.suppress(OSError, ValueError):  # the file says "max" without a limit
         held = min(held, int(pathlib.Path("/sys/fs/cgroup/memory.max").read_text()))
     return held
 
@@ -132,7 +133,7 @@ def _memory() -> int:
 def _resized_intrinsics(
     frame: Frame, stored: tuple[int, int], wanted: tuple[float, float], half_pixel: bool
 ) -> np.ndarray:
-    """fx, fy, cx, cy in pixels of an image of size `wanted`, for a photograph of size `stored`."""
+    """Compute fx, fy, cx, cy for the photograph of size `stored` resized to `wanted`."""
     size = frame.size or stored
     return frame_intrinsics(frame, *size, half_pixel=half_pixel) * np.tile(
         np.divide(wanted, size), 2
@@ -140,7 +141,7 @@ def _resized_intrinsics(
 
 
 def _one_at_a_time(function: Callable[..., Remap]) -> Callable[..., Remap]:
-    """So that threads that ask for the same map wait for one rather than each make theirs."""
+    """Lock a cached function, so that concurrent threads compute each map once."""
     lock = threading.Lock()
 
     def locked(*arguments):
@@ -153,28 +154,29 @@ def _one_at_a_time(function: Callable[..., Remap]) -> Callable[..., Remap]:
 def _read_photo(
     frame: Frame, closeup: bool, *, reading: Reading, find_remap: Callable[..., Remap]
 ) -> list[Photo]:
-    """A photograph and, if `closeup`, the part of it with most detail at its full size."""
+    """Read a photograph and, if `closeup`, its most detailed crop without the zoom factor."""
     picture = read_file(frame.reduced or frame.file)
     mask = read_file(frame.mask) if frame.mask else None
     make = functools.partial(_make_photo, frame, closeup, picture, mask, reading, find_remap)
     if frame.reduced or reading.downscale * reading.zoom == 1:
         return make()
-    # All that the result depends on.
+    # Everything that the result depends on.
     key = ["area", cv2.__version__, _code(), closeup, reading._replace(half_pixel=False)]
     key += [content_hash(picture), content_hash(mask), frame.size, frame.distortion]
     if frame.distortion:
-        # A size that is not known yet is one of which no half can be a cx that is given.
+        # The size may be unknown before decoding. This stand-in is so large that a principal
+        # point that defaults to its middle never equals a given one.
         size = frame.size or (2**30, 2**30)
         key += frame_intrinsics(frame, *size, half_pixel=reading.half_pixel).tolist()
-    arrays = kept(repr(key), lambda: _pack(make()))
+    arrays = cached(repr(key), lambda: _pack(make()))
     return _unpack(frame, arrays)
 
 
 @functools.cache
 def _code() -> list[str]:
-    """Hashes of the modules that decide what becomes of a photograph."""
+    """Hash the modules that determine how a photograph is processed."""
     folder = pathlib.Path(__file__).parent
-    return [content_hash((folder / name).read_bytes()) for name in _CODE]
+    return [content_hash((folder / name).read_bytes()) for name in _SOURCES]
 
 
 def _pack(photos: Sequence[Photo]) -> dict[str, np.ndarray]:
@@ -215,8 +217,8 @@ def _make_photo(
         factors = f"downscale {downscale}"
         factors += f" times zoom {reading.zoom}" if reading.zoom > 1 else ""
         raise SceneError(
-            f"{file} is {width} x {height} pixels, so that {factors} leaves nothing of it: "
-            "take a smaller one."
+            f"{file} is {width} x {height} pixels, and {factors} leaves nothing of it: choose a "
+            "smaller factor."
         )
     mask = None
     if mask_picture is not None:
@@ -226,16 +228,16 @@ def _make_photo(
             mask = cv2.resize(mask, stored, interpolation=cv2.INTER_AREA)
         if mask.shape != (height, width):
             raise SceneError(
-                f"{frame.mask} is {mask.shape[1]} x {mask.shape[0]} pixels and its photograph "
-                f"{width} x {height}: give them one size."
+                f"{frame.mask} is {mask.shape[1]} x {mask.shape[0]} pixels but its photograph is "
+                f"{width} x {height}: give both the same size."
             )
     if frame.distortion:
         intrinsics = _resized_intrinsics(frame, stored, stored, reading.half_pixel)
         remap = find_remap(frame.distortion, tuple(intrinsics.tolist()), width, height)
         if not remap.inside.any():
             raise SceneError(
-                f"{frame.label}: nothing of the photograph is left when its lens is straightened: "
-                "correct the coefficients of its distortion."
+                f"{frame.label}: undistortion leaves nothing of the photograph: correct the "
+                "distortion coefficients."
             )
         whole = np.full((height, width), 255, np.uint8) if mask is None else mask
         rgb, mask = undistort(rgb, whole, remap)
@@ -250,7 +252,7 @@ def _make_photo(
 
 
 def _without_alpha(photo: Photo) -> Photo:
-    """A photograph `[H, W, 4]`, drawn over black, as its own colors and what they weigh."""
+    """Split RGBA `[H, W, 4]`, composited over black, into the file's colors and weights."""
     alpha = photo.rgb[..., 3].astype(np.float32) / 255
     own = photo.rgb[..., :3] / np.maximum(alpha, 1 / 255)[..., None]
     return photo._replace(
@@ -260,20 +262,20 @@ def _without_alpha(photo: Photo) -> Photo:
 
 
 def _check_reduced(frame: Frame, size: tuple[int, int], downscale: int) -> None:
-    """Complain of a size that no way of rounding gives."""
+    """Raise if the shrunk copy's size differs from the expected one by more than rounding."""
     if any(abs(side - whole / downscale) > 1 for side, whole in zip(size, frame.size, strict=True)):
         raise SceneError(
             f"{frame.reduced} is {size[0]} x {size[1]} pixels, which is not {frame.size[0]} x "
-            f"{frame.size[1]} reduced {downscale} times: make it again, or name its folder "
-            "otherwise to have photographs reduced here."
+            f"{frame.size[1]} divided by {downscale}: make it again, or rename its folder to use "
+            "the full-size photographs."
         )
 
 
 def _zoomed(photo: Photo, zoom: int, closeup: bool) -> list[Photo]:
-    """A photograph whose pixels are exactly `zoom` of those before, and perhaps a close-up.
+    """Shrink a photograph exactly `zoom` times and, if `closeup`, crop a part of the same size.
 
-    Both have one size: of the photograph's `zoom` x `zoom` parts the close-up is the one with most
-    detail. A rest at the right and the bottom that fills no pixel is left out.
+    The crop is the most detailed of the photograph's `zoom` x `zoom` parts. Pixels at the right and
+    the bottom that do not fill a shrunk pixel are dropped.
     """
     width, height = (side // zoom for side in photo.size)
     rgb, mask = (image[: height * zoom, : width * zoom] for image in (photo.rgb, photo.mask))
@@ -289,13 +291,13 @@ def _zoomed(photo: Photo, zoom: int, closeup: bool) -> list[Photo]:
     detail = [_detail(rgb[part], mask[part]) for part in parts]
     best = int(np.argmax(detail))
     part = parts[best]
-    # Copied, for a view would keep the whole photograph in memory.
+    # Copy, because a view would keep the whole photograph in memory.
     rgb, mask = rgb[part].copy(), mask[part].copy()
     return [small, photo._replace(rgb=rgb, mask=mask, corner=corners[best])]
 
 
 def _detail(rgb: np.ndarray, mask: np.ndarray) -> float:
-    """The squared differences of neighbors that both count, of brightness, all together."""
+    """Sum the squared brightness differences of neighboring pixels, by their weights."""
     gray = cv2.cvtColor(rgb[..., :3], cv2.COLOR_RGB2GRAY).astype(np.float32)
     weight = mask.astype(np.float32) / 255
     if rgb.shape[-1] == 4:

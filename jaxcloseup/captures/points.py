@@ -1,4 +1,4 @@
-"""Initial points from PLY files."""
+"""Read initial points from PLY files."""
 
 import pathlib
 import warnings
@@ -10,14 +10,14 @@ from jaxcloseup.scene import PointsWarning, SceneError
 
 
 def read_ply_points(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
-    """Positions `[P, 3]` and colors `[P, 3]` in [0, 1], float32, of a PLY file's vertices.
+    """Read positions `[P, 3]` and colors `[P, 3]` in [0, 1], float32, from a PLY file's vertices.
 
-    Any property order and any further properties are fine. Integer colors are scaled by their
-    type's range, floats above 1 by 255; a file without red, green, blue gives mid gray. Points that
-    are not finite are dropped with a warning.
+    Properties may come in any order, and unknown ones are ignored. Integer colors are divided by
+    the maximum of their type; float colors are divided by 255 if any exceeds 1. Without red, green
+    and blue, points are mid gray. Points that are not finite are dropped with a warning.
 
     Raises:
-      SceneError: not a PLY file, cut short, or vertices without x, y, z.
+      SceneError: the file is not PLY, is truncated, or its vertices lack x, y, z.
     """
     try:
         vertices = read_vertices(path)
@@ -43,5 +43,5 @@ def _colors(vertices: np.ndarray) -> np.ndarray:
     rgb = np.stack([vertices[name] for name in names], -1)
     if rgb.dtype.kind in "iu":
         return rgb.astype(np.float32) / np.iinfo(rgb.dtype).max
-    # Floats are meant to lie in [0, 1], but some programs write bytes' values as floats.
+    # Float colors should lie in [0, 1], but some programs write 0 to 255.
     return rgb.astype(np.float32) / (255 if (rgb > 1).any() else 1)

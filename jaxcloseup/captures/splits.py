@@ -1,4 +1,4 @@
-"""Which photographs of a capture are trained on and which are held out."""
+"""Split the photographs of a capture into training and held-out ones."""
 
 import collections
 import json
@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxcloseup.captures.bounds import depths_in_view
+from jaxcloseup.captures.depth_range import depths_in_view
 from jaxcloseup.captures.frames import Frame, frame_intrinsics
 from jaxcloseup.captures.images import read_image
 from jaxcloseup.scene import DuplicateFileWarning, SceneError, UnknownKeyWarning
@@ -26,10 +26,10 @@ class Division(NamedTuple):
     """The photographs of a capture by split.
 
     Attributes:
-      frames: for each split present the photographs, `train` first.
-      notes: sentences on how they were divided.
-      times_nearer: of `closest`, how many times nearer each photograph of `test` is than the median
-        one of `train`; of `zoom`, how many times finer each close-up is; else None.
+      frames: photographs of each split present, `train` first.
+      notes: sentences on how they were split.
+      times_nearer: for `closest`, how many times nearer each `test` photograph is than the median
+        `train` one; for `zoom`, how many times finer each close-up is; otherwise None.
     """
 
     frames: dict[str, list[Frame]]
@@ -37,21 +37,26 @@ class Division(NamedTuple):
     times_nearer: tuple[float, ...] | None = None
 
 
-def listed_split(
+def splits_from_fields(
     file: pathlib.Path, fields: dict[str, Any], frames: Sequence[Frame]
 ) -> dict[str, list[Frame]] | None:
-    """The splits that the fields of a single `transforms.json` list, if they do."""
+    """Read the splits that the fields of a `transforms.json` list; None without lists."""
     lists = {key: (split, fields[key]) for split, key in _LISTS.items() if fields.get(key)}
     by_path = {pathlib.PurePath(frame.listed): frame for frame in frames}
     chosen = _choose(file, lists, lambda name: by_path.get(pathlib.PurePath(name)), "file_path")
     return _with_train(file, chosen, frames) if chosen else None
 
 
-def split_of_file(folder: pathlib.Path, frames: Sequence[Frame]) -> dict[str, list[Frame]] | None:
-    """The splits of a folder's `split.json`, if there is one.
+def splits_from_file(
+    folder: pathlib.Path, frames: Sequence[Frame]
+) -> dict[str, list[Frame]] | None:
+    """Read the splits of a folder's `split.json`; None if it does not exist.
 
-    It is an object with lists `train`, `test`, `test_far` and `unused` of names of photographs;
-    one that is in none of them is not used either, unless there is no `train`.
+    The file is an object with lists of photograph names: `train`, `test`, `test_far` and `unused`.
+    Photographs that no list names are unused, or form `train` if that list is missing.
+
+    Raises:
+      SceneError: the file is not such an object, or a list names an unknown photograph.
     """
     file = folder / "split.json"
     if not file.is_file():
@@ -60,17 +65,19 @@ def split_of_file(folder: pathlib.Path, frames: Sequence[Frame]) -> dict[str, li
         fields = json.loads(file.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, RecursionError) as error:
         raise SceneError(
-            f"{file} is not readable as JSON ({error}): correct or drop it."
+            f"{file} is not readable as JSON ({error}): correct or remove it."
         ) from error
     if not isinstance(fields, dict):
-        raise SceneError(f"{file} is not an object with lists train and test: correct or drop it.")
+        raise SceneError(
+            f"{file} is not an object with lists train and test: correct or remove it."
+        )
     if unknown := sorted(set(fields) - _SPLIT_FILE_KEYS):
         warnings.warn(
-            f"{file}: these fields are not read: {', '.join(unknown)}.",
+            f"{file}: these fields are ignored: {', '.join(unknown)}.",
             UnknownKeyWarning,
             stacklevel=2,
         )
-    # A name that photographs of several folders have says nothing by itself.
+    # A bare name that photographs in several folders share is ambiguous.
     bases = collections.Counter(frame.file.name for frame in frames)
     by_name = {frame.file.name: frame for frame in frames if bases[frame.file.name] == 1}
     by_name |= {frame.listed: frame for frame in frames}
@@ -88,15 +95,18 @@ def divide(
     points: np.ndarray,
     zoom: int = 1,
 ) -> Division:
-    """The photographs as `split` says.
+    """Split the photographs of a capture.
 
     Args:
-      name: of the capture, for notes.
-      frames: all of them.
-      given: as the capture's files divide them, or None where none does.
-      split: one of `SPLITS`. `given` takes every 8th where nothing is; `load_scene` has the rest.
-      points: `[P, 3]` of the world; `closest` needs some.
-      zoom: of `zoom`, how many times finer its close-ups are.
+      name: name of the capture, for notes.
+      frames: all photographs.
+      given: splits that the capture's files list, or None.
+      split: one of `SPLITS`, see `load_scene`; `given` without lists holds out every 8th.
+      points: `[P, 3]` world points, which `closest` needs.
+      zoom: how many times finer the close-ups of `zoom` are.
+
+    Raises:
+      SceneError: `closest` has too few photographs, or no points that they see.
     """
     if split == "given" and given:
         return Division(given)
@@ -110,14 +120,14 @@ def divide(
     return Division(
         parts,
         (
-            f"{name}{reason}: every {TEST_EVERY}th of its {len(frames)} photographs by name, "
-            f"{len(parts.get('test_far', ()))} in all, is test_far",
+            f"{name}{reason}: test_far is every {TEST_EVERY}th of its {len(frames)} photographs "
+            f"by name, {len(parts.get('test_far', ()))} in all",
         ),
     )
 
 
 def unique_names(files: Sequence[pathlib.Path]) -> list[str]:
-    """A name for each file: its stem; where stems clash, its folder's name before it and so on."""
+    """Name each file by its stem; prefix the folder's name, then number, where names clash."""
     stems = [file.stem for file in files]
     names = []
     for file, stem in zip(files, stems, strict=True):
@@ -131,7 +141,7 @@ def unique_names(files: Sequence[pathlib.Path]) -> list[str]:
 
 
 def warn_duplicates(folder: pathlib.Path, splits: dict[str, list[Frame]]) -> None:
-    """Warn of photographs that are listed more than once."""
+    """Warn about photographs that are listed more than once."""
     seen: dict[pathlib.Path, str] = {}
     repeated = []
     for split, members in splits.items():
@@ -142,9 +152,9 @@ def warn_duplicates(folder: pathlib.Path, splits: dict[str, list[Frame]]) -> Non
     if repeated:
         more = ", ..." if len(repeated) > 3 else ""
         warnings.warn(
-            f"{folder} lists {len(repeated)} photographs again: "
-            f"{', '.join(repeated[:3])}{more}; a score on a photograph that was trained on says "
-            "nothing about new views.",
+            f"{folder} lists {len(repeated)} photographs more than once: "
+            f"{', '.join(repeated[:3])}{more}; a score on a training photograph says nothing about "
+            "new views.",
             DuplicateFileWarning,
             stacklevel=2,
         )
@@ -161,26 +171,26 @@ def _every_eighth(frames: Sequence[Frame]) -> dict[str, list[Frame]]:
 
 def _closest(name: str, frames: Sequence[Frame], points: np.ndarray) -> Division:
     if len(frames) < 2:
-        raise SceneError(f"{name}: split closest needs 2 photographs and there is 1: add some.")
+        raise SceneError(f"{name}: split closest needs at least 2 photographs, got 1: add some.")
     sizes = [_size_of_pixel(frame, points) for frame in frames]
     if not np.isfinite(sizes).any():
         raise SceneError(
-            f"{name}: split closest needs points that the photographs see, and there are none: "
-            "load the COLMAP model, or give ply_file_path."
+            f"{name}: split closest needs points that the photographs see, and the capture has "
+            "none: load the COLMAP model, or give ply_file_path."
         )
     nearest = np.argsort(sizes, kind="stable")[: max(1, round(CLOSEST_SHARE * len(frames)))]
     held_out = sorted(nearest.tolist())
     rest = [frame for i, frame in enumerate(frames) if i not in held_out]
     parts = _every_eighth(rest)
     parts = {"train": parts["train"], "test": [frames[i] for i in held_out], **parts}
-    of_file = {frame.file: size for frame, size in zip(frames, sizes, strict=True)}
-    median = np.median([of_file[frame.file] for frame in parts["train"]])
+    size_by_file = {frame.file: size for frame, size in zip(frames, sizes, strict=True)}
+    median = np.median([size_by_file[frame.file] for frame in parts["train"]])
     ratios = tuple(float(median / sizes[i]) for i in held_out)
     note = (
-        f"{name}: the {len(held_out)} nearest of {len(frames)} photographs are test, "
+        f"{name}: test is the {len(held_out)} nearest of {len(frames)} photographs, "
         f"{min(ratios):.2f} to {max(ratios):.2f} times nearer (median {np.median(ratios):.2f}) "
-        f"than the median of {len(parts['train'])} training photographs; "
-        f"{len(parts.get('test_far', ()))} others are test_far"
+        f"than the median of {len(parts['train'])} training photographs; test_far is "
+        f"{len(parts.get('test_far', ()))} others"
     )
     return Division(parts, (note,), ratios)
 
@@ -189,16 +199,15 @@ def _zoom(name: str, frames: Sequence[Frame], zoom: int) -> Division:
     parts = _every_eighth(frames)
     train, test = parts["train"], parts["train"][::TEST_EVERY]
     note = (
-        f"{name}: its {len(train)} training photographs are reduced {zoom} times more, and the "
-        f"part with most detail of every {TEST_EVERY}th of them, not reduced, {len(test)} in all, "
-        f"is test: {zoom} times as fine, from the same places; "
-        f"{len(parts.get('test_far', ()))} others are test_far"
+        f"{name}: its {len(train)} training photographs shrink {zoom} times; test is the most "
+        f"detailed crop of every {TEST_EVERY}th of them, unshrunk, {len(test)} in all, {zoom} "
+        f"times finer from the same positions; test_far is {len(parts.get('test_far', ()))} others"
     )
     return Division({"train": train, "test": test, **parts}, (note,), (float(zoom),) * len(test))
 
 
 def _size_of_pixel(frame: Frame, points: np.ndarray) -> float:
-    """How much of the world a pixel of the original size covers, or infinity if nothing is seen."""
+    """Median world size of a full-size pixel at the points seen; infinity without points."""
     size = frame.size or read_image(frame.file).shape[1::-1]
     intrinsics = frame_intrinsics(frame, *size)
     if frame.seen is None:
@@ -224,7 +233,7 @@ def _choose(
         unlisted = [name for name in names if find(name) is None]
         if unlisted:
             raise SceneError(
-                f"{file}: {key} names {unlisted[0]!r}, which no frame has as its {field} "
+                f"{file}: {key} names {unlisted[0]!r}, which is no frame's {field} "
                 f"({len(unlisted)} of {len(names)} such names): correct it."
             )
         splits[split] = [find(name) for name in names]

@@ -1,7 +1,7 @@
-"""`transforms*.json`: the capture formats of the paper, Blender, instant-ngp and nerfstudio.
+"""Read `transforms*.json`, the format of the paper, Blender, instant-ngp and nerfstudio.
 
-Poses in the files are camera-to-world in OpenGL's frame (x right, y up, z backward). They leave
-this module in OpenCV's (x right, y down, z forward), and nothing else knows of the difference.
+Poses in the files are camera-to-world in OpenGL's frame (x right, y up, z backward). This module
+converts them to OpenCV's (x right, y down, z forward), which everything else uses.
 """
 
 import pathlib
@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxcloseup.captures.distortion import COEFFICIENTS, read_distortion
 from jaxcloseup.captures.frames import Frame, check_photographs, frame_intrinsics
-from jaxcloseup.captures.json_fields import read_object, rigid_transform, side
+from jaxcloseup.captures.json_fields import image_side, read_object, rigid_transform
 from jaxcloseup.scene import SceneError, UnknownKeyWarning
 
 
@@ -25,7 +25,7 @@ _FILE_KEYS = _LENS_KEYS | {
     *("train_filenames", "test_filenames", "val_filenames"),
 }
 _FRAME_KEYS = _LENS_KEYS | {"file_path", "transform_matrix", "mask_path"}
-# Well known, of no bearing on what is loaded, and passed over in silence.
+# Common fields that do not affect loading and are ignored without a warning.
 _UNUSED_KEYS = {
     *("aabb_scale", "scale", "offset", "render_aabb", "sharpness", "rotation", "colmap_im_id"),
     *("orientation_override", "auto_scale_poses_override"),
@@ -35,7 +35,7 @@ _SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 
 
 def read_transforms(path: pathlib.Path) -> tuple[dict[str, Any], list[Frame]]:
-    """The fields of a `transforms*.json` and its frames, all of them checked.
+    """Read and check the fields of a `transforms*.json` and its frames.
 
     Raises:
       SceneError: names the file, the frame and the field, and says what to do.
@@ -43,7 +43,9 @@ def read_transforms(path: pathlib.Path) -> tuple[dict[str, Any], list[Frame]]:
     fields = read_object(path, 'a list of "frames"')
     entries = fields.get("frames")
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise SceneError(f'{path}: "frames" must be a list of objects, one for each photograph.')
+        raise SceneError(
+            f'{path}: "frames" must be a list of objects, one per photograph: correct it.'
+        )
     if not entries:
         raise SceneError(f'{path}: "frames" is empty: list at least one photograph.')
     unknown = set(fields) - _FILE_KEYS
@@ -52,7 +54,7 @@ def read_transforms(path: pathlib.Path) -> tuple[dict[str, Any], list[Frame]]:
     if unknown:
         names = ", ".join(sorted(unknown))
         warnings.warn(
-            f"{path}: these fields are not read: {names}.", UnknownKeyWarning, stacklevel=2
+            f"{path}: these fields are ignored: {names}.", UnknownKeyWarning, stacklevel=2
         )
     frames = [_read_frame(path, fields, entry) for entry in entries]
     check_photographs(path, frames)
@@ -67,14 +69,14 @@ def _read_frame(path: pathlib.Path, fields: dict[str, Any], entry: dict[str, Any
     lens = {**fields, **entry}
     if ("w" in lens) != ("h" in lens):
         raise SceneError(f"{label}: w and h belong together: give both or neither.")
-    size = tuple(side(label, key, lens[key]) for key in "wh" if key in lens)
+    size = tuple(image_side(label, key, lens[key]) for key in "wh" if key in lens)
     if "transform_matrix" not in entry:
         raise SceneError(f"{label}: no transform_matrix: give its camera-to-world pose.")
     pose = rigid_transform(label, "transform_matrix", entry["transform_matrix"])
     mask = entry.get("mask_path") or None
     if not isinstance(mask, str | None):
         raise SceneError(
-            f"{label}: mask_path is {mask!r}: give the path of a mask, or leave it out."
+            f"{label}: mask_path is {mask!r}: give the path of a mask, or remove the field."
         )
     frame = Frame(
         source=path,
@@ -86,12 +88,12 @@ def _read_frame(path: pathlib.Path, fields: dict[str, Any], entry: dict[str, Any
         lens=(entry, fields),
         distortion=read_distortion(label, lens),
     )
-    frame_intrinsics(frame, *(size or (1, 1)))  # complain before any image is decoded
+    frame_intrinsics(frame, *(size or (1, 1)))  # raises before any image is decoded
     return frame
 
 
 def _find(folder: pathlib.Path, listed: str) -> pathlib.Path:
-    """The listed file; formats of Blender's kind leave out the suffix."""
+    """Find the listed file; Blender's datasets leave out the suffix."""
     path = folder / listed.replace("\\", "/")
     candidates = [pathlib.Path(f"{path}{suffix}") for suffix in _SUFFIXES]
     return next((candidate for candidate in candidates if candidate.is_file()), path)

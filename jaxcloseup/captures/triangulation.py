@@ -1,7 +1,7 @@
-"""Points for captures that come with poses and without points.
+"""Triangulate points for captures that have poses but no points.
 
-SIFT features are matched between neighboring photographs and each match is triangulated with the
-known poses. What reprojects badly, or was seen along nearly the same ray twice, is dropped.
+Match SIFT features between neighboring photographs, and triangulate each match with the known
+poses. Drop matches that reproject badly or whose rays are nearly parallel.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,18 +12,19 @@ import numpy as np
 
 
 _LONGEST_SIDE = 1600  # in pixels; larger photographs are searched at this size
-_MOST_FEATURES = 2000  # of a photograph: matching costs their square
+_MAX_FEATURES = 2000  # per photograph; matching cost grows with their square
 _NEIGHBORS = 4
-_WIDEST_VIEWS = np.cos(np.radians(60))  # between optical axes; SIFT finds little beyond 40 degrees
-_RATIO = 0.8  # of the best match's distance to the second best, as in Lowe's paper (2004)
-_MOST_ERROR = 2.0  # in pixels
-_LEAST_ANGLE = np.radians(1.5)  # between rays; below it depth is a guess
+# Cosine of the widest angle between optical axes; SIFT finds few matches beyond 40 degrees.
+_MIN_AXIS_COSINE = np.cos(np.radians(60))
+_RATIO = 0.8  # best over second-best match distance, as in Lowe (2004)
+_MAX_ERROR = 2.0  # in pixels
+_MIN_ANGLE = np.radians(1.5)  # between rays; below it, depth is unreliable
 
 
 class _Features(NamedTuple):
-    """Of one photograph: pixels `[F, 2]` at its own size, descriptors `[F, 128]` and colors.
+    """Features of one photograph: pixels `[F, 2]`, descriptors `[F, 128]` and colors `[F, 3]`.
 
-    The last two are uint8, which is what SIFT's descriptors are: there may be many photographs.
+    Descriptors and colors are uint8 to save memory; SIFT's descriptors are integers anyway.
     """
 
     pixels: np.ndarray
@@ -37,16 +38,18 @@ def triangulate(
     camtoworld: np.ndarray,
     intrinsics: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points that two neighboring photographs agree on. A point may come once for each pair.
+    """Triangulate points that two neighboring photographs both show.
+
+    A surface point may appear once per pair of photographs.
 
     Args:
-      images: `[H, W, 3]` uint8 each, of pinhole cameras; sizes may differ.
-      masks: `[H, W]` uint8 each; features lie where they are 128 or more.
+      images: uint8 pinhole photographs `[H, W, 3]`; sizes may differ.
+      masks: uint8 masks `[H, W]`; features are used where the mask is at least 128.
       camtoworld: `[V, 3, 4]` OpenCV poses.
       intrinsics: `[V, 4]` fx, fy, cx, cy in pixels.
 
     Returns:
-      World points `[P, 3]` and colors `[P, 3]` in [0, 1], float32; possibly none.
+      World points `[P, 3]` and colors `[P, 3]` in [0, 1], float32; P may be 0.
     """
     found = [_find_features(image, mask) for image, mask in zip(images, masks, strict=True)]
     points, colors = [np.zeros((0, 3))], [np.zeros((0, 3))]
@@ -69,23 +72,23 @@ def _find_features(image: np.ndarray, mask: np.ndarray) -> _Features:
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if scale < 1 else image
     usable = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) if scale < 1 else mask
     # Without precise upscaling OpenCV's keypoints are a quarter of a pixel off.
-    sift = cv2.SIFT_create(nfeatures=_MOST_FEATURES, enable_precise_upscale=True)
+    sift = cv2.SIFT_create(nfeatures=_MAX_FEATURES, enable_precise_upscale=True)
     gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
     keypoints, descriptors = sift.detectAndCompute(gray, np.uint8(255) * (usable >= 128))
     if not keypoints:
         return _Features(np.zeros((0, 2)), np.zeros((0, 128), np.uint8), np.zeros((0, 3)))
-    # OpenCV's centers are at whole numbers, ours half a pixel further.
+    # OpenCV puts pixel centers at integers, we at half-integers.
     pixels = (np.array([point.pt for point in keypoints]) + 0.5) / size * [width, height]
     column, row = np.clip(pixels.astype(int), 0, [width - 1, height - 1]).T
     return _Features(pixels, descriptors.astype(np.uint8), image[row, column])
 
 
 def _neighbors(camtoworld: np.ndarray) -> Iterator[tuple[int, int]]:
-    """Pairs of views, each once: the nearest ones to each that look about the same way."""
+    """Yield each pair of neighboring views once: close positions, similar directions."""
     axes, positions = camtoworld[:, :, 2], camtoworld[:, :, 3]
     away = np.linalg.norm(positions[:, None] - positions, axis=-1)
-    # Turning on the spot shows no depth, and a view is not its own neighbor.
-    fit = (axes @ axes.T > _WIDEST_VIEWS) & (away > 1e-6 * away.max())
+    # Rotation in place shows no depth, and a view is not its own neighbor.
+    fit = (axes @ axes.T > _MIN_AXIS_COSINE) & (away > 1e-6 * away.max())
     order = np.argsort(np.where(fit, away, np.inf), axis=1, kind="stable")[:, :_NEIGHBORS]
     pairs = {
         (min(i, j), max(i, j)) for i, row in enumerate(order.tolist()) for j in row if fit[i, j]
@@ -94,7 +97,7 @@ def _neighbors(camtoworld: np.ndarray) -> Iterator[tuple[int, int]]:
 
 
 def _match(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Indices into `a` and `b` of descriptors that are each other's clearly best match."""
+    """Match descriptors that are mutually best and pass the ratio test; indices into both."""
     if len(a) < 2 or len(b) < 2:
         return np.zeros(0, int), np.zeros(0, int)
     similar = _unit(a) @ _unit(b).T
@@ -115,10 +118,10 @@ def _unit(descriptors: np.ndarray) -> np.ndarray:
 def _intersect(
     pixels: tuple[np.ndarray, np.ndarray], camtoworld: np.ndarray, intrinsics: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where pairs of pixels `[M, 2]` of two cameras meet: `[M, 3]`, and whether they do, `[M]`."""
+    """Intersect rays through pixel pairs `[M, 2]`: points `[M, 3]` and validity `[M]`."""
     if not len(pixels[0]):
         return np.zeros((0, 3)), np.zeros(0, bool)
-    # Relative to the first camera and in units of the baseline, so that far worlds stay exact.
+    # Work relative to the first camera in units of the baseline, to keep precision far from 0.
     origin = camtoworld[0, :, 3]
     unit = np.linalg.norm(camtoworld[1, :, 3] - origin)
     rotations = camtoworld[:, :, :3]
@@ -133,7 +136,7 @@ def _intersect(
         camera = (local - c) @ r
         depth = np.where(camera[:, 2] > 1e-6, camera[:, 2], 1e-6)
         error = np.linalg.norm((camera[:, :2] / depth[:, None] - x) * k[:2], axis=-1)
-        good &= (camera[:, 2] > 1e-6) & (error < _MOST_ERROR)
+        good &= (camera[:, 2] > 1e-6) & (error < _MAX_ERROR)
     a, b = local - positions[0], local - positions[1]
     angle = np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, -1))
-    return local * unit + origin, good & (angle > _LEAST_ANGLE)
+    return local * unit + origin, good & (angle > _MIN_ANGLE)

@@ -1,1 +1,64 @@
-"""Cameras, rotations, virtual poses, warps and masks: usable alone in any JAX project."""
+"""Cameras, rotations, virtual poses, warps and masks: usable alone in any JAX project.
+
+Conventions of every module:
+
+- Camera frame: OpenCV, x right, y down, z forward; poses are camera-to-world.
+- Pixels: continuous (x, y); the center of the top-left pixel is (0.5, 0.5).
+- Depth: z-depth in world units, 0 where undefined.
+- Sizes: height before width, as in an array's shape. A function that works on an image of a given
+  size takes `height, width`, the fields of `Camera`; only `forward_warp`, whose size is an option,
+  takes both in one as `shape=(height, width)`.
+- Batches: functions take one camera; batch cameras with `jax.vmap`.
+"""
+
+from jaxcloseup.geometry.cameras import (
+    Camera,
+    pixel_grid,
+    pixels_to_points,
+    pixels_to_rays,
+    points_to_pixels,
+)
+from jaxcloseup.geometry.masks import depth_consistent, in_bounds, rgb_consistent
+from jaxcloseup.geometry.poses import (
+    PoseSettings,
+    closeup_position,
+    four_anchors,
+    perturb_rotation,
+    sample_anchor,
+    sample_closeup_camera,
+)
+from jaxcloseup.geometry.rotations import euler_to_matrix, matrix_to_euler, quaternion_to_matrix
+from jaxcloseup.geometry.union_warp import SourceBlocks, block_sources, union_warp
+from jaxcloseup.geometry.visibility import WarpedImage, sample_where_visible, warp_to
+from jaxcloseup.geometry.warp import ForwardWarp, backward_warp, draw_nearest, forward_warp
+
+
+__all__ = [
+    "Camera",
+    "ForwardWarp",
+    "PoseSettings",
+    "SourceBlocks",
+    "WarpedImage",
+    "backward_warp",
+    "block_sources",
+    "closeup_position",
+    "depth_consistent",
+    "draw_nearest",
+    "euler_to_matrix",
+    "forward_warp",
+    "four_anchors",
+    "in_bounds",
+    "matrix_to_euler",
+    "perturb_rotation",
+    "pixel_grid",
+    "pixels_to_points",
+    "pixels_to_rays",
+    "points_to_pixels",
+    "quaternion_to_matrix",
+    "rgb_consistent",
+    "sample_anchor",
+    "sample_closeup_camera",
+    "sample_where_visible",
+    "union_warp",
+    "warp_to",
+]

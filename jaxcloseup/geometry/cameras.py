@@ -17,7 +17,7 @@ from jaxcloseup.numerics import matmul
 
 @struct.dataclass
 class Camera:
-    """A pinhole camera; stacked cameras carry leading axes on both arrays.
+    """A pinhole camera; stacked cameras have leading axes on both arrays.
 
     Attributes:
       camtoworld: `[3, 4]` rotation and position, camera to world.
@@ -68,7 +68,7 @@ def pixels_to_rays(camera: Camera, pixels: jax.Array) -> tuple[jax.Array, jax.Ar
 
 
 def pixels_to_points(camera: Camera, pixels: jax.Array, depth: jax.Array) -> jax.Array:
-    """World points `[..., 3]` at z-depth `depth[...]` behind `pixels[..., 2]`."""
+    """World points `[..., 3]` seen at `pixels[..., 2]` with z-depth `depth[...]`."""
     chex.assert_equal_shape_prefix([pixels, depth], depth.ndim)
     origins, directions = pixels_to_rays(camera, pixels)
     return origins + depth[..., None] * directions
@@ -82,8 +82,8 @@ def points_to_pixels(camera: Camera, points: jax.Array) -> tuple[jax.Array, jax.
       points: `[..., 3]` in world units.
 
     Returns:
-      `[..., 2]` pixels and `[...]` depths. Where a point is not in front of the camera (depth <= 0)
-      its pixel has no meaning: values and gradients are finite, and the caller tests the depth.
+      `[..., 2]` pixels and `[...]` z-depths. A point with depth <= 0 is not in front of the camera:
+      its pixel and gradients are finite but have no meaning, so callers test the depth.
     """
     _check_camera(camera)
     chex.assert_axis_dimension(points, -1, 3)

@@ -1,4 +1,4 @@
-"""Where a warped pixel may be trusted. All functions are elementwise over `[...]`."""
+"""Tests of warped pixels: inside the image, same depth, same color. Elementwise over `[...]`."""
 
 import chex
 import jax
@@ -23,7 +23,7 @@ def depth_consistent(
     Args:
       observed: `[...]` z-depth read from a depth map; 0 is undefined.
       expected: `[...]` z-depth of the point in that view.
-      tolerance: relative, such as 0.05; infinity accepts any point in front of the camera.
+      tolerance: relative, such as 0.05; infinity accepts every point in front of the camera.
 
     Returns:
       `[...]` bool, False where `expected` is not positive and finite.
@@ -35,7 +35,7 @@ def depth_consistent(
 def rgb_consistent(a: jax.Array, b: jax.Array, tolerance: jax.Array | float) -> jax.Array:
     """Whether two colors `[..., 3]` differ by less than `tolerance` in every channel: `[...]`.
 
-    The paper's mask M, |I' - I*| < epsilon.
+    This is the paper's mask M, |I' - I*| < epsilon.
     """
     chex.assert_equal_shape([a, b])
     return jnp.all(jnp.abs(a - b) < tolerance, axis=-1)

@@ -1,4 +1,4 @@
-"""Virtual close-up cameras, placed between a training camera and the surface that it sees.
+"""Virtual close-up cameras, drawn between a training camera and the surface that it sees.
 
 Symbols as in the paper: anchor X_a, training position t_n, magnification lambda, Euler angles e,
 angular range epsilon.
@@ -21,9 +21,10 @@ class PoseSettings:
     Attributes:
       magnification: `[2]` range (lo, hi) of lambda, how many times nearer the camera comes.
       max_angle: `[]` epsilon, largest change of each Euler angle, radians.
-      anchor_tolerance: `[]` anchors have |D - mean D| < tolerance * mean D; inf: any.
-      look_at: `[]` 1 turns the camera about the anchor, which so stays at its pixel, 0 about
-        itself, as published.
+      anchor_tolerance: `[]` an anchor's depth D has |D - mean D| < tolerance * mean D; inf accepts
+        every pixel.
+      look_at: `[]` 1 turns the camera about the anchor, which stays at its pixel; 0 turns the
+        camera about itself, as published.
     """
 
     magnification: jax.Array
@@ -49,15 +50,15 @@ def sample_anchor(key: jax.Array, depth: jax.Array, weight: jax.Array) -> jax.Ar
     Args:
       key: random key.
       depth: `[H, W]` z-depth; pixels where it is not positive and finite are never drawn.
-      weight: `[H, W]` not negative; pixels of weight 0 are never drawn.
+      weight: `[H, W]` non-negative; pixels of weight 0 are never drawn.
 
     Returns:
-      (x, y) of a pixel center; the top-left one if no pixel can be drawn.
+      (x, y) of a pixel center; the top-left center if no pixel can be drawn.
     """
     chex.assert_rank([depth, weight], 2)
     chex.assert_equal_shape([depth, weight])
     weight = jnp.where((depth > 0) & jnp.isfinite(depth), weight, 0)
-    # First the row, then the pixel in it: two short draws instead of one over the whole image.
+    # Draw the row, then a pixel in it: two short draws instead of one over the whole image.
     key_row, key_column = jax.random.split(key)
     row = jax.random.categorical(key_row, jnp.log(jnp.sum(weight, axis=1)))
     column = jax.random.categorical(key_column, jnp.log(weight[row]))
@@ -67,8 +68,8 @@ def sample_anchor(key: jax.Array, depth: jax.Array, weight: jax.Array) -> jax.Ar
 def four_anchors(height: int, width: int) -> jax.Array:
     """Anchor weights `[height, width]` of the paper's ablation without diverse poses.
 
-    One at the center of each quadrant, 0 elsewhere: the `weight` of `sample_closeup_camera`, with
-    magnification (4, 4) and max_angle 0.
+    The weight is 1 at the center of each quadrant and 0 elsewhere. Pass it as the `weight` of
+    `sample_closeup_camera`, with magnification (4, 4) and max_angle 0.
     """
     rows = jnp.array([height // 4, height // 4, 3 * height // 4, 3 * height // 4])
     columns = jnp.array([width // 4, 3 * width // 4, width // 4, 3 * width // 4])
@@ -80,7 +81,8 @@ def perturb_rotation(
 ) -> jax.Array:
     """Turn a camera by a uniform offset of each Euler angle: e' = e + U(-eps, eps), `[3, 3]`.
 
-    The text prints the interval as centered on e; like the released script, it is centered on 0.
+    `key` is consumed. The paper prints an interval centered on e; this function follows the
+    released script, whose interval is centered on 0.
     """
     chex.assert_shape(rotation, (3, 3))
     offset = jax.random.uniform(key, (3,), rotation.dtype, -1, 1) * max_angle
@@ -99,7 +101,7 @@ def sample_closeup_camera(
     Args:
       key: random key.
       camera: one training camera.
-      depth: `[H, W]` its z-depth; 0 where undefined.
+      depth: `[H, W]` z-depth of its view; 0 where undefined.
       settings: ranges to draw from.
       weight: `[H, W]` anchor weights; 1 everywhere by default.
 
@@ -110,7 +112,7 @@ def sample_closeup_camera(
     key_anchor, key_magnification, key_rotation = jax.random.split(key, 3)
     weight = jnp.ones_like(depth) if weight is None else weight
     defined = (depth > 0) & jnp.isfinite(depth)
-    mean = jnp.mean(depth, where=defined)  # NaN without defined depth, and then nothing is typical
+    mean = jnp.mean(depth, where=defined)  # NaN without any defined depth: no pixel is typical
     typical = jnp.abs(depth - mean) < settings.anchor_tolerance * mean
     pixel = sample_anchor(key_anchor, depth, jnp.where(typical, weight, 0))
     column, row = jnp.floor(pixel).astype(jnp.int32)
@@ -120,7 +122,7 @@ def sample_closeup_camera(
     magnification = low + (high - low) * jax.random.uniform(key_magnification, (), depth.dtype)
     position = closeup_position(anchor, camera.position, magnification)
     rotation = perturb_rotation(key_rotation, camera.rotation, settings.max_angle)
-    # What the camera saw at the anchor's pixel it sees there again after a turn about the anchor.
+    # After a turn about the anchor, the camera still sees the anchor at its pixel.
     turn = matmul(rotation, camera.rotation.T)
     about_anchor = anchor + matmul(turn, (position - anchor)[:, None])[:, 0]
     position = jnp.where(settings.look_at > 0, about_anchor, position)

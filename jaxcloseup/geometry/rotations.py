@@ -34,8 +34,8 @@ def matrix_to_euler(rotation: jax.Array) -> jax.Array:
     m = rotation
     locked = m[..., 0, 0] ** 2 + m[..., 1, 0] ** 2 < jnp.finfo(m.dtype).eps ** 2
     z = jnp.arctan2(jnp.where(locked, 0, m[..., 1, 0]), jnp.where(locked, 1, m[..., 0, 0]))
-    # Take x and y out of Rz^T R = Ry Rx. Near the lock z is mostly rounding error, but x then
-    # absorbs it, where the usual quotients of small entries would not.
+    # Solve Rz^T R = Ry Rx for x and y. Near the lock z is mostly rounding error; x absorbs it here,
+    # while the usual quotients of small entries would not.
     cos_z, sin_z = jnp.cos(z), jnp.sin(z)
     y = jnp.arctan2(-m[..., 2, 0], cos_z * m[..., 0, 0] + sin_z * m[..., 1, 0])
     x = jnp.arctan2(
@@ -45,7 +45,7 @@ def matrix_to_euler(rotation: jax.Array) -> jax.Array:
 
 
 def quaternion_to_matrix(wxyz: jax.Array) -> jax.Array:
-    """Rotation matrices `[..., 3, 3]` of quaternions `[..., 4]`, which are normalized here.
+    """Rotation matrices `[..., 3, 3]` of quaternions `[..., 4]`, which need not be unit.
 
     The zero quaternion gives the identity, with finite gradients.
     """

@@ -1,11 +1,11 @@
 """Forward warp of every pixel of many views into chosen pixels of one virtual view.
 
-The paper's union of forward warps. At full size it has tens of millions of sources of which a
-close-up sees a few, so sources are kept in square blocks with bounding spheres: blocks that cannot
-land in the virtual view are culled whole, and the rest are lifted and projected on the fly, a chunk
-at a time. Most of those miss the chosen pixels: a chunk leaves one bit for each source, and only
-sources whose bit is set are projected again and drawn. Both loops have dynamic lengths, so there is
-no capacity to overflow.
+This is the paper's union of forward warps. A full-size capture has tens of millions of source
+pixels, and a close-up sees few of them. Sources are therefore kept in square blocks with bounding
+spheres. Blocks that cannot land in the virtual view are culled whole; the others are lifted and
+projected on the fly, a chunk at a time. Most sources of a chunk miss the chosen pixels, so a chunk
+leaves one bit per source, and only sources whose bit is set are projected again and drawn. Both
+loops have dynamic lengths, so no capacity can overflow.
 """
 
 import chex
@@ -18,23 +18,23 @@ from jaxcloseup.geometry.warp import NO_SOURCE, ForwardWarp, draw_nearest
 from jaxcloseup.numerics import matmul
 
 
-# Measured on two CPU cores; the result does not depend on them.
-BLOCK = 16  # pixels on the side of a block: culled as one
-CHUNK = 2048  # most blocks projected together
-GROUP = 1024  # least number of sources drawn together
-_WORD = 32  # bits
+# Fastest sizes on two CPU cores; the result does not depend on them.
+BLOCK = 16  # side of a block in pixels
+CHUNK = 2048  # maximum number of blocks projected together
+GROUP = 1024  # minimum number of sources drawn together
+_WORD = 32  # bits per word
 
 
 @struct.dataclass
 class SourceBlocks:
-    """Training pixels with their depth, in square blocks; N blocks of P pixels.
+    """Training pixels with their depth, in N square blocks of P pixels.
 
     Attributes:
       depth: `[N, P]` z-depth in the pixel's own view, 0 where undefined.
-      view: `[N]` int32 which view the block is of.
-      corner: `[N, 2]` int32 (x, y) index of its top-left pixel.
-      center: `[N, 3]` world center of a sphere that holds the block's points.
-      radius: `[N]` radius of that sphere; negative where no pixel has a depth.
+      view: `[N]` int32 index of the block's view.
+      corner: `[N, 2]` int32 (x, y) index of the block's top-left pixel.
+      center: `[N, 3]` center of the block's bounding sphere, world units.
+      radius: `[N]` radius of that sphere; negative if no pixel of the block has a depth.
     """
 
     depth: jax.Array
@@ -47,12 +47,12 @@ class SourceBlocks:
 def block_sources(
     cameras: Camera, depths: jax.Array, weight: jax.Array | None = None
 ) -> SourceBlocks:
-    """Sort training pixels into blocks, once for many warps.
+    """Cut training views into blocks, once for many warps.
 
     Args:
       cameras: stacked cameras `[V]`.
       depths: `[V, H, W]` z-depth, world units; not positive or not finite is undefined.
-      weight: `[V, H, W]` pixels of weight 0 are no sources; none by default.
+      weight: `[V, H, W]` pixels of weight 0 are not sources; 1 everywhere by default.
     """
     chex.assert_rank(depths, 3)
     num_views, height, width = depths.shape
@@ -104,20 +104,20 @@ def union_warp(
     *,
     exclude: jax.Array | int = -1,
 ) -> ForwardWarp:
-    """What all training pixels, forward-warped into a virtual view, leave at some of its pixels.
+    """Forward-warp all training pixels into a virtual view and read the result at chosen pixels.
 
-    The same as `forward_warp` of every source followed by reading `pixels`.
+    The result equals that of `forward_warp` with every source, read at `pixels`.
 
     Args:
       sources: from `block_sources` of the same cameras and depths.
       cameras: stacked cameras `[V]`.
-      values: `[V, H, W, C]` what the training pixels carry, of any type.
+      values: `[V, H, W, C]` values of the training pixels, of any dtype.
       camera: the virtual camera.
-      pixels: `[..., 2]` pixels of the virtual view, inside its image; repeats are fine.
-      exclude: a view whose pixels are no sources; none by default.
+      pixels: `[..., 2]` pixels of the virtual view, inside its image; repeats are allowed.
+      exclude: index of a view whose pixels are not sources; -1 excludes none.
 
     Returns:
-      A `ForwardWarp` with `[...]` in place of `[H, W]`. Nothing is differentiated.
+      A `ForwardWarp` with `[...]` in place of `[H, W]`. Do not differentiate it.
     """
     chex.assert_rank([values, sources.depth], [4, 2])
     return _union_warp(sources, cameras, values, camera, pixels, jnp.asarray(exclude, jnp.int32))
@@ -174,10 +174,10 @@ def _union_warp(sources, cameras, values, camera, pixels, exclude):
 
 @_union_warp.def_vmap
 def _one_after_the_other(size, batched, *arguments):
-    """A batch of warps in turn; one that equals the one before takes over its result.
+    """Compute a batch of warps one after another, and reuse the result of an equal predecessor.
 
-    How much there is to do depends on the data, and done at once all would wait for the most. Arms
-    of a sweep that draw the same camera follow each other.
+    The work of a warp depends on the data, so a batch computed at once would wait for its largest
+    member. Arms of a sweep that draw the same camera follow each other.
     """
 
     def pick(index):
@@ -201,12 +201,12 @@ def _one_after_the_other(size, batched, *arguments):
 
 
 def _may_land(sources, camera):
-    """Whether a block's sphere reaches into the frustum of the camera, `[N]`."""
+    """Whether a block's sphere reaches into the camera's frustum, `[N]`."""
     x, y, z = matmul(sources.center - camera.position[None], camera.rotation).T
     fx, fy, cx, cy = camera.intrinsics
 
     def inside(across, focal, center):
-        # Distance from the frustum's side: positive inside, so that a sphere may reach in.
+        # Signed distance from a side of the frustum, positive inside; a sphere may reach in.
         return (focal * across + center * z) / jnp.hypot(focal, center) >= -sources.radius
 
     return (
@@ -240,7 +240,7 @@ def _pixel_to_virtual(cameras, camera):
 
 
 def _project(sources, block, offset, depth, affine, camera):
-    """Flat target pixel (-1 for none) and depth of pixels of blocks; indices broadcast."""
+    """Flat target pixel (-1 for none) and z-depth of sources; `block` and `offset` broadcast."""
     matrix, shift = (array[sources.view[block]] for array in affine)
     corner = sources.corner[block].astype(depth.dtype) + 0.5
     column, row = (index.astype(depth.dtype) for index in (offset % BLOCK, offset // BLOCK))
@@ -260,10 +260,10 @@ def _project(sources, block, offset, depth, affine, camera):
 
 
 def _for_each_hit(hit, count, body, carry):
-    """Fold `body(row[count], column[count], live[count], carry)` over the true of `[N, P]`.
+    """Fold `body(row[count], column[count], live[count], carry)` over true flags `[N, P]`.
 
-    XLA's own compaction, `jnp.nonzero`, writes an index for every flag. Here flags become bits, 32
-    to a word, and the k-th one is found by bisection: over rows, then words, then in its word.
+    `jnp.nonzero` would write an index for every flag. Here flags become bits, 32 to a word, and the
+    k-th set bit is found in three steps: its row, its word, then its place by bisection.
     """
     bits = jnp.left_shift(jnp.uint32(1), jnp.arange(_WORD, dtype=jnp.uint32))
     words = jnp.where(hit.reshape(len(hit), -1, _WORD), bits, 0)

@@ -16,12 +16,12 @@ NO_SOURCE = 2**31 - 1
 
 
 class ForwardWarp(NamedTuple):
-    """What arrived at each target pixel.
+    """The nearest source at each target pixel.
 
     Attributes:
-      values: `[H, W, C]` values of the nearest source, 0 where nothing arrived.
-      depth: `[H, W]` its depth in the target view, infinity where nothing arrived.
-      hit: `[H, W]` whether anything arrived.
+      values: `[H, W, C]` values of that source, 0 where no source landed.
+      depth: `[H, W]` its z-depth in the target view, infinity where no source landed.
+      hit: `[H, W]` bool, whether a source landed.
     """
 
     values: jax.Array
@@ -36,9 +36,9 @@ def backward_warp(
 
     Args:
       image: `[H, W, C]` float.
-      pixels: `[..., 2]` where to read; anything, NaN included.
+      pixels: `[..., 2]` where to read; any value, NaN included.
       order: 0 for the nearest pixel, 1 for bilinear. The outermost half pixel repeats the border.
-      fill_value: what lies outside the image.
+      fill_value: value of pixels outside the image.
 
     Returns:
       `[..., C]`. Differentiable in `image` and, for order 1, in `pixels`.
@@ -80,12 +80,12 @@ def forward_warp(
     ties apart, not on the order of the sources.
 
     Args:
-      values: `[..., C]` what the sources carry.
-      pixels: `[..., 2]` where they land in the target view.
-      depth: `[...]` their z-depth there; not positive or not finite is not drawn.
+      values: `[..., C]` values of the sources.
+      pixels: `[..., 2]` target pixels where they land.
+      depth: `[...]` their z-depth in the target view; not positive or not finite is not drawn.
       shape: (height, width) of the target.
-      valid: `[...]` bool, sources that count; all by default.
-      into: an earlier result to draw on top of; it wins ties. By default an empty target.
+      valid: `[...]` bool, sources to draw; all by default.
+      into: earlier result to draw onto, which wins ties; an empty target by default.
 
     Returns:
       A `ForwardWarp`, differentiable in `values` and `depth`.
@@ -106,7 +106,7 @@ def forward_warp(
     pixels = jnp.where(usable[:, None], pixels, 0)
     target = _index(pixels[:, 1], height) * width + _index(pixels[:, 0], width)
     target = jnp.where(usable, target, height * width)
-    # What is there already counts as source -1, so that it wins ties.
+    # The earlier result counts as source -1, so that it wins ties.
     there = jnp.where(into.hit, -1, NO_SOURCE).reshape(-1)
     index = jnp.arange(depth.size, dtype=jnp.int32)
     buffer = into.depth.reshape(-1), there
@@ -124,16 +124,16 @@ def forward_warp(
 def draw_nearest(
     buffer: tuple[jax.Array, jax.Array], target: jax.Array, depth: jax.Array, source: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Draw into a z-buffer: the nearest source wins, and among equal depths the lowest.
+    """Draw into a z-buffer: the nearest source wins, and the lowest index among equal depths.
 
     Args:
       buffer: depths `[N]`, inf where empty, and int32 sources `[N]`, `NO_SOURCE` where empty.
-      target: `[M]` int32 where each source falls; N and above are not drawn.
-      depth: `[M]`.
-      source: `[M]` int32 its name.
+      target: `[M]` int32 entry where each source falls; N and above are not drawn.
+      depth: `[M]` depths of the sources.
+      source: `[M]` int32 indices of the sources.
 
     Returns:
-      The buffer, drawn into.
+      The updated buffer.
     """
     before, sources = buffer
     nearest = before.at[target].min(depth, mode="drop")

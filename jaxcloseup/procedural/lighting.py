@@ -1,7 +1,7 @@
-"""Baked light: soft shadows of lamps, ambient occlusion and one bounce, for every face's tile.
+"""Bake light: soft shadows of lamps, ambient occlusion and one bounce, for every face's tile.
 
-Host code in NumPy around `cast_rays`. Entries of light are taken in blocks of neighbors, each with
-only the solids that matter to it, and blocks in threads.
+This is host code in NumPy around `cast_rays`. It computes light in blocks of neighboring entries,
+each with only the solids that can affect it, and runs the blocks in threads.
 """
 
 from typing import NamedTuple
@@ -14,11 +14,17 @@ from jaxcloseup.procedural.shading import GAMMA, Faces, World, mean_colors, samp
 
 
 _BLOCK, _SAMPLES = 256, 16
-_ROUNDS = 2  # times _SAMPLES directions around each entry
+_ROUNDS = 2  # each casts _SAMPLES directions around an entry
 
 
 class Lamp(NamedTuple):
-    """A spherical lamp: `power` is the irradiance at one meter."""
+    """A spherical lamp.
+
+    Attributes:
+      position: center of the lamp in meters.
+      radius: radius of the lamp in meters.
+      power: RGB irradiance at one meter.
+    """
 
     position: tuple[float, float, float]
     radius: float
@@ -26,11 +32,11 @@ class Lamp(NamedTuple):
 
 
 class Ambience(NamedTuple):
-    """Light from everywhere.
+    """Light from all directions.
 
     Attributes:
-      irradiance: what an unoccluded point receives.
-      reach: meters over which an obstacle stops it.
+      irradiance: RGB irradiance of an unoccluded point.
+      reach: distance in meters over which the occlusion by an obstacle fades.
     """
 
     irradiance: tuple[float, float, float]
@@ -40,10 +46,17 @@ class Ambience(NamedTuple):
 def bake_light(
     world: World, lamps: list[Lamp], ambience: Ambience, positions: np.ndarray, normals: np.ndarray
 ) -> np.ndarray:
-    """Light `[L, 4]` at surface points `positions[L, 3]`, encoded as images are.
+    """Bake light at surface points; neighbors in the list should be neighbors in space.
 
-    The last channel is the visible part of the first lamp, not encoded. Neighbors in the list
-    should be neighbors in space.
+    Args:
+      world: solids, faces and textures; its `light` is not used.
+      lamps: lamps; the first one makes highlights.
+      ambience: light from all directions.
+      positions: `[L, 3]` surface points.
+      normals: `[L, 3]` outward unit normals.
+
+    Returns:
+      `[L, 4]` RGB light in the encoding of images, and the visible fraction of the first lamp.
     """
     starts = positions + 5e-4 * normals  # just above the surface
     turns = np.random.default_rng(0).uniform(size=(len(starts), 1, 2))
@@ -65,7 +78,7 @@ def bake_light(
             squared = np.sum(away**2, axis=-1)
             cosine = np.maximum(np.sum(away * normal, axis=-1), 0) / np.sqrt(squared)
             light[:, :3] += (visible * cosine / squared)[:, None] * np.array(lamp.power)
-            light[:, 3] = visible  # the first lamp comes last, and stays
+            light[:, 3] = visible  # the first lamp comes last and overwrites the others
         return light
 
     def from_around(part: slice) -> np.ndarray:
@@ -77,7 +90,7 @@ def bake_light(
             ways = normal[:, None] + 0.999 * _on_sphere(square)
             ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
             hits = cast_rays(world.solids, start[:, None], ways, wanted=wanted)
-            # What shines by itself is as bright as it looks; the rest returns lamp light.
+            # Emitting faces contribute their own color, others the lamp light that they reflect.
             returned = np.asarray(_look_up(direct, world.faces, hits))[..., :3]
             returned = np.where(np.isfinite(hits.depth)[..., None], returned, 0) * albedo[hits.face]
             returned += irradiance * (1 - np.exp(-hits.depth / ambience.reach))[..., None]
@@ -101,7 +114,7 @@ def _look_up(light: jax.Array, faces: Faces, hits: Hit) -> jax.Array:
 def _within(
     solids: Solids, points: np.ndarray, normals: np.ndarray, end: np.ndarray, radius: float
 ) -> np.ndarray:
-    """Which solids `[N]` are above a block's horizon and near the way from it to a ball."""
+    """Which solids `[N]` rise above a block's horizon and lie near its path to a ball."""
     start = points.mean(0)
     radius = max(radius, np.linalg.norm(points - start, axis=-1).max())
     half, center = np.asarray(solids.bound)[..., :3], np.asarray(solids.bound)[..., 3]
@@ -114,7 +127,7 @@ def _within(
 
 
 def _smooth(light: np.ndarray, world: World) -> np.ndarray:
-    """Binomial smoothing within each tile, for the noise of few rays."""
+    """Smooth each tile with a binomial filter, to reduce the noise of few rays."""
     light = light.copy()
     tiles = np.column_stack([world.faces.tile, np.asarray(world.faces.wraps, np.int32)])
     for start, width, height, wraps in np.unique(tiles, axis=0):
@@ -128,7 +141,7 @@ def _smooth(light: np.ndarray, world: World) -> np.ndarray:
 
 
 def _spread(count: int, turns: np.ndarray, offset: float = 0.0) -> np.ndarray:
-    """`[L, count, 2]` well-spread points of the unit square, shifted round by `turns[L, 1, 2]`."""
+    """Well-spread points `[L, count, 2]` of the unit square, shifted by `turns[L, 1, 2]` mod 1."""
     i = np.arange(count)
     lattice = np.stack([(i + 0.5) / count + offset, i * 0.618034 + 7 * offset], -1)
     return (lattice + turns) % 1

@@ -1,8 +1,8 @@
-"""Captures of the built-in scenes: far photographs, close-up test views, and the exact truth.
+"""Load the built-in scenes: far photographs, close-up test views, and the exact surface.
 
-Everything follows from the scene's name: cameras are planned on the exact geometry with fixed
-seeds, at full size, and only then scaled. Photographs are kept on disk, since a full-size capture
-takes minutes; the key covers the source files that draw them.
+A scene's name determines everything: cameras are planned on the exact geometry with fixed seeds, at
+full size, and scaled afterwards. Drawing a full-size capture takes minutes, so photographs are
+cached on disk under a key that covers the source files that draw them.
 """
 
 import functools
@@ -40,9 +40,9 @@ from jaxcloseup.scene import Scene, Surface
 
 PROCEDURAL_SCENES: tuple[str, ...] = tuple(SCENES)
 NUM_TRAIN, NUM_TEST, NUM_FAR = 60, 12, 8
-_SAMPLES = 8  # rays a pixel
+_SAMPLES = 8  # rays per pixel
 _SOURCES = (
-    *("raycast.py", "shading.py", "lighting.py", "modeling.py", "planning.py", "procedural.py"),
+    *("raycast.py", "shading.py", "lighting.py", "modeling.py", "planning.py", "loading.py"),
     *("builtin/*.py", "textures/*.py"),
 )
 
@@ -55,27 +55,30 @@ def procedural_scene(
     exposure_jitter: float = 0.0,
     pose_noise: float = 0.0,
 ) -> Scene:
-    """A built-in scene as if it had been captured, with its exact surface at any pose.
+    """Load a built-in scene like a capture, with its exact surface at any pose.
 
     World units are meters and z is up. Full size is 960 x 540; sizes round up, and focal lengths
-    scale with the true ratio. The three realism options touch the training photographs alone.
+    scale with the exact ratio. The three realism options affect only the training photographs.
 
     Args:
       name: one of `PROCEDURAL_SCENES`.
-      downscale: divisor of the image size.
-      noise: standard deviation of sensor noise, in units of color.
+      downscale: positive integer divisor of the image size.
+      noise: standard deviation of sensor noise, in color units.
       exposure_jitter: standard deviation of the logarithm of each photograph's exposure.
-      pose_noise: standard deviation of reported training positions (meters) and angles (radians).
+      pose_noise: standard deviation of the error of training positions (meters) and angles
+        (radians).
 
     Raises:
-      ValueError: the name is not a built-in scene, or `downscale` is not a positive integer.
+      ValueError: the name is unknown, or `downscale` is not a positive integer.
     """
     if name not in SCENES:
-        raise ValueError(f"no built-in scene {name!r}; there are {', '.join(PROCEDURAL_SCENES)}")
+        raise ValueError(
+            f"no built-in scene {name!r}: choose one of {', '.join(PROCEDURAL_SCENES)}"
+        )
     if downscale < 1 or downscale != int(downscale):
-        raise ValueError(f"downscale must be a positive integer, not {downscale}")
+        raise ValueError(f"downscale must be a positive integer, got {downscale}")
     width, height = -(-WIDTH // downscale), -(-HEIGHT // downscale)
-    capture = _kept(f"{name}-{width}x{height}", lambda: _capture(name, width, height))
+    capture = _cached(f"{name}-{width}x{height}", lambda: _capture(name, width, height))
     splits = {}
     for split in ("train", "test", "test_far"):
         rgb = jnp.asarray(capture[f"{split}_rgb"])
@@ -118,9 +121,9 @@ def _world(name: str) -> shading.World:
     model = SCENES[name]()
 
     def bake(*scene: Any) -> np.ndarray:
-        return _kept(f"{name}-light", lambda: {"light": bake_light(*scene)})["light"]
+        return _cached(f"{name}-light", lambda: {"light": bake_light(*scene)})["light"]
 
-    # The first call may come from inside a trace, whose arrays must not be kept.
+    # The first call may come from inside a trace, whose arrays must not be cached.
     with jax.ensure_compile_time_eval():
         return build_world(model, bake)
 
@@ -130,7 +133,7 @@ def _rng(name: str, stream: int) -> np.random.Generator:
 
 
 def _cameras(poses: np.ndarray, width: int, height: int) -> Camera:
-    """Stacked cameras of `poses[V, 3, 4]`."""
+    """Stack the cameras of `poses[V, 3, 4]`."""
     intrinsics = [FOCAL * width / WIDTH, FOCAL * height / HEIGHT, width / 2, height / 2]
     return Camera(
         camtoworld=jnp.asarray(poses, jnp.float32),
@@ -140,10 +143,10 @@ def _cameras(poses: np.ndarray, width: int, height: int) -> Camera:
     )
 
 
-def _kept(stem: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """`make()`, from disk where it has been made before by these very sources.
+def _cached(stem: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Return `make()`, or its result from the cache if the same sources made it before.
 
-    A cache that cannot be read or written costs time and a warning, never more.
+    A cache that cannot be read or written only costs time and a warning.
     """
     root = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
     path = pathlib.Path(root) / "jaxcloseup" / f"{stem}-{_sources_digest()}.npz"
@@ -152,7 +155,7 @@ def _kept(stem: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.
             with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
                 return dict(stored)
         except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
-            warnings.warn(f"ignoring the unreadable cache {path}: {error}", stacklevel=2)
+            warnings.warn(f"ignoring the unreadable cache file {path}: {error}", stacklevel=2)
     made = make()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -165,7 +168,7 @@ def _kept(stem: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.
                 os.unlink(file.name)
                 raise
     except OSError as error:
-        warnings.warn(f"cannot keep {path}: {error}", stacklevel=2)
+        warnings.warn(f"cannot write the cache file {path}: {error}", stacklevel=2)
     return made
 
 
@@ -180,11 +183,11 @@ def _sources_digest() -> str:
 
 
 def _capture(name: str, width: int, height: int) -> dict[str, np.ndarray]:
-    """All that is kept of a capture, from scratch."""
+    """Draw the arrays of a capture that the cache holds."""
     world, rig = _world(name), SCENES[name]().rig
     rng = _rng(name, 0)
     far = plan_far(world.solids, rig, rng, NUM_TRAIN + NUM_FAR)
-    held_out = np.s_[2 :: (NUM_TRAIN + NUM_FAR) // NUM_FAR + 1]  # between the others
+    held_out = np.s_[2 :: (NUM_TRAIN + NUM_FAR) // NUM_FAR + 1]  # evenly among the others
     train, test_far = np.delete(far, held_out, axis=0), far[held_out]
     closeups = plan_closeups(world.solids, rig, train, rng, NUM_TEST)
 
@@ -218,7 +221,7 @@ def _capture(name: str, width: int, height: int) -> dict[str, np.ndarray]:
 def _sparse_points(
     world: shading.World, poses: np.ndarray, rgb: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """About 5000 surface points `[P, 3]` at training pixels, with the photographs' colors."""
+    """Sample about 5000 surface points `[P, 3]` at training pixels, with their colors `[P, 3]`."""
     views, height, width = rgb.shape[:3]
     count = 5000 // views * views
     view = np.repeat(np.arange(views), count // views)
@@ -235,7 +238,7 @@ def _sparse_points(
 def _degrade(
     views: Views, rng: np.random.Generator, noise: float, exposure_jitter: float, pose_noise: float
 ) -> Views:
-    """Photographs and reported poses as a hand-held camera and its calibration would give them."""
+    """Degrade photographs and poses as a hand-held camera and its calibration would."""
     poses, rgb = np.array(views.cameras.camtoworld, np.float64), np.array(views.rgb)
     for pose, image in zip(poses, rgb, strict=True):
         pose[:, :3] = pose[:, :3] @ turn(*np.rad2deg(pose_noise * rng.normal(size=3)))

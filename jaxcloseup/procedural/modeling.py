@@ -1,6 +1,6 @@
 """Building blocks of the procedural scenes: solids with finishes, assembled into a `World`.
 
-The world is in meters with z up. Sizes are full extents (diameters, not radii).
+World units are meters and z is up. Sizes are full extents (diameters, not radii).
 """
 
 from collections.abc import Callable
@@ -24,22 +24,22 @@ from jaxcloseup.procedural.raycast import (
 from jaxcloseup.procedural.textures import draw_texture
 
 
-# Scenes padded alike share compilations.
+# Scenes padded to the same sizes share compilations.
 _PAD_SOLIDS, _PAD_FACES, _PAD_LIGHT, _PAD_TEXTURES = 192, 1024, 3 << 15, 24
 
 
 class Finish(NamedTuple):
-    """What a face is made of.
+    """The material of a face.
 
     Attributes:
-      texture: name of a color texture.
-      size: meters a repeat of the texture; None stretches `region` once over the face.
-      detail: name of a texture of fine structure.
-      detail_size: meters a repeat of the detail.
-      tint: factor on the color.
+      texture: name of the color texture.
+      size: meters per repeat of the texture; None stretches `region` once over the face.
+      detail: name of the texture of fine structure.
+      detail_size: meters per repeat of the detail.
+      tint: RGB factor on the color.
       gloss: strength of the highlight.
-      grain: turn the texture along the longer side of the face.
-      shines: the face is seen as it is drawn, without light or shadow.
+      grain: whether to align the texture with the longer side of the face.
+      shines: whether the face shows its own color, without light or shadow.
       region: (left, top, right, bottom) part of the texture, in [0, 1].
     """
 
@@ -55,7 +55,17 @@ class Finish(NamedTuple):
 
 
 class Solid(NamedTuple):
-    """One solid: its kind, pose, full size, taper, the finish of each face, and light texel."""
+    """A solid before assembly.
+
+    Attributes:
+      kind: PLANE, BOX, SPHERE or CYLINDER.
+      center: `[3]` center in the world.
+      size: `[3]` full extents in meters.
+      rotation: `[3, 3]` rotation from the solid to the world.
+      taper: growth of a cylinder's radius with local z, in (-1, 1).
+      finishes: finish of each face.
+      texel: side of a baked light texel in meters.
+    """
 
     kind: int
     center: np.ndarray
@@ -67,14 +77,14 @@ class Solid(NamedTuple):
 
 
 class Rig(NamedTuple):
-    """Where the far photographs are taken from, and what deserves a close look.
+    """The positions of the far cameras, and the subjects of close-ups.
 
     Attributes:
-      target: `[3]` what the far cameras look at.
-      distance: (lo, hi) meters from it.
-      azimuth: (lo, hi) degrees about z, 0 straight in front (from -y).
+      target: (x, y, z) point that the far cameras look at.
+      distance: (lo, hi) meters between the cameras and the target.
+      azimuth: (lo, hi) degrees about z; 0 is straight in front, at -y.
       elevation: (lo, hi) degrees above the horizon.
-      interests: (x, y, z, radius) balls in which close-up views find their subjects.
+      interests: (x, y, z, radius) balls that hold the subjects of close-ups.
     """
 
     target: tuple[float, float, float]
@@ -85,7 +95,7 @@ class Rig(NamedTuple):
 
 
 class Model(NamedTuple):
-    """A scene before rendering: what is there, what lights it, and how it is photographed."""
+    """A scene before rendering: its solids, its light and its camera rig."""
 
     solids: list[Solid]
     lamps: list[Lamp]  # the first one makes the highlight
@@ -94,7 +104,7 @@ class Model(NamedTuple):
 
 
 def turn(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> np.ndarray:
-    """Rotation by degrees about x, then y, then z."""
+    """Rotation matrix `[3, 3]` by degrees about x, then y, then z."""
     matrix = np.eye(3)
     for axis, angle in enumerate(np.deg2rad([x, y, z])):
         i, j = [(1, 2), (2, 0), (0, 1)][axis]
@@ -126,12 +136,12 @@ def block(low, high, finish, **options) -> Solid:
 
 
 def sphere(center, size, finish, *, rotation=None, texel=0.03) -> Solid:
-    """A sphere of diameter `size`, or an ellipsoid of three."""
+    """A sphere of diameter `size`, or an ellipsoid with three diameters."""
     return _solid(SPHERE, center, np.broadcast_to(size, 3), finish, rotation, 0.0, texel, None)
 
 
 def cylinder(base, height, bottom, top, finish, *, rotation=None, texel=0.03, faces=None) -> Solid:
-    """A round solid on `base`, of diameters `bottom` and `top`; its faces are side, bottom, top."""
+    """A cylinder or cone on `base` with diameters `bottom` and `top`; faces: side, bottom, top."""
     rotation = np.eye(3) if rotation is None else rotation
     center = np.asarray(base, float) + rotation @ [0, 0, height / 2]
     size, taper = ((bottom + top) / 2, (bottom + top) / 2, height), (top - bottom) / (top + bottom)
@@ -150,7 +160,7 @@ def rod(start, end, thickness, finish, *, texel=0.03) -> Solid:
 
 
 def sheet(center, size, finish, *, facing="+z", rotation=None, texel=0.03) -> Solid:
-    """A flat rectangle (width, height) facing an axis, upright when seen from there."""
+    """A flat rectangle (width, height) that faces along an axis and is upright seen from there."""
     frames = {
         "+z": np.eye(3), "-z": turn(x=180),
         "-y": turn(x=90), "+y": turn(x=90, z=180), "-x": turn(x=90, z=-90), "+x": turn(x=90, z=90),
@@ -160,7 +170,7 @@ def sheet(center, size, finish, *, facing="+z", rotation=None, texel=0.03) -> So
 
 
 def build_world(model: Model, bake: Callable[..., np.ndarray] = bake_light) -> shading.World:
-    """The model, ready to render; `bake` makes its light, or finds what was made before."""
+    """Assemble a model for rendering; `bake` computes its light or loads it from a cache."""
     solids = sorted(model.solids, key=lambda solid: solid.kind)
     to_world = np.stack([np.column_stack([s.rotation * (s.size / 2), s.center]) for s in solids])
     names: list[str] = []
@@ -194,7 +204,7 @@ def build_world(model: Model, bake: Callable[..., np.ndarray] = bake_light) -> s
         padding = [(0, -len(rows) % _PAD_FACES)] + [(0, 0)] * (values.ndim - 1)
         return jnp.asarray(np.pad(values, padding, mode="edge").astype(kind))
 
-    # Padding stays untouched, and so costs no memory.
+    # The padding is never written, so it takes no memory.
     texels = np.zeros((-(-len(names) // _PAD_TEXTURES) * _PAD_TEXTURES, shading.TEXELS), np.uint32)
 
     def fill(row: int) -> None:
@@ -234,7 +244,7 @@ def _extent(solid: Solid, side: int) -> np.ndarray:
 def _layout(
     solid: Solid, side: int, finish: Finish, extent: np.ndarray, index: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Maps `[2, 3]` from chart to texture and to detail repeats; rows of a texture run down."""
+    """Affine maps `[2, 3]` from chart to texture and detail repeats; texture rows run down."""
     flip = solid.kind == BOX and side in (0, 3, 4)
     upright = np.array([[-1.0 if flip else 1.0, 0, float(flip)], [0, -1, 1]])
     meters = np.diag(extent) @ upright

@@ -1,7 +1,7 @@
-"""Where the built-in scenes are photographed from: far views on an arc, close-ups that are turned.
+"""Plan the cameras of the built-in scenes: far views on an arc, and rotated close-ups.
 
-NumPy float64 throughout, with rays cast on the exact solids. Poses are camera-to-world `[3, 4]` in
-OpenCV axes; a view is a pose with the one full-size pinhole of all built-in captures.
+The code uses NumPy float64 and casts rays on the exact solids. Poses are camera-to-world `[3, 4]`
+in OpenCV axes. All views share one full-size pinhole camera.
 """
 
 from typing import NamedTuple
@@ -20,9 +20,10 @@ class Closeups(NamedTuple):
     """Close-up test views.
 
     Attributes:
-      poses: `[V, 3, 4]`.
-      subjects: `[V, 3]` the surface point each one looks at.
-      magnification: `[V]` distance of the nearest training camera to the subject over its own.
+      poses: `[V, 3, 4]` poses.
+      subjects: `[V, 3]` surface point that each view looks at.
+      magnification: `[V]` distance from the nearest training camera to the subject, over the
+        distance from the close-up to the subject.
     """
 
     poses: np.ndarray
@@ -33,7 +34,13 @@ class Closeups(NamedTuple):
 def pose_looking_at(
     position: np.ndarray, target: np.ndarray, turned: tuple[float, float, float] | np.ndarray
 ) -> np.ndarray:
-    """An upright pose with z towards `target`, then turned by radians (pitch, yaw, roll)."""
+    """Build an upright pose that looks at `target`, then rotate it by `turned`.
+
+    Args:
+      position: `[3]` camera position.
+      target: `[3]` point to look at.
+      turned: (pitch, yaw, roll) in radians.
+    """
     forward = np.subtract(target, position) / np.linalg.norm(np.subtract(target, position))
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -43,7 +50,7 @@ def pose_looking_at(
 
 
 def grid_rays(poses: np.ndarray, columns: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Origins `[V, 1, 3]` and directions `[V, rows * columns, 3]` evenly over each view."""
+    """Spread rays evenly over views: origins `[V, 1, 3]`, directions `[V, rows * columns, 3]`."""
     x = ((np.arange(columns) + 0.5) / columns - 0.5) * WIDTH / FOCAL
     y = ((np.arange(rows) + 0.5) / rows - 0.5) * HEIGHT / FOCAL
     xy = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
@@ -51,15 +58,15 @@ def grid_rays(poses: np.ndarray, columns: int, rows: int) -> tuple[np.ndarray, n
     return poses[:, None, :, 3], np.einsum("pj,vij->vpi", in_camera, poses[:, :, :3])
 
 
-def seen_by(solids: Solids, points: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """How many of the views `[V, 3, 4]` show each of the surface points `[P, 3]`."""
+def count_views(solids: Solids, points: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """Count the views `[V, 3, 4]` that show each of the surface points `[P, 3]`."""
     away = points[:, None] - poses[None, :, :, 3]
     in_camera = np.einsum("pvi,vij->pvj", away, poses[:, :, :3])
     depth = np.maximum(in_camera[..., 2], 1e-6)
     inside = (in_camera[..., 2] > 0.05) & (
         np.abs(in_camera[..., :2] / depth[..., None]) < np.array([WIDTH, HEIGHT]) / (2 * FOCAL)
     ).all(-1)
-    # Rays are asked only about points inside the frame.
+    # Cast rays only to points inside the image.
     count = np.zeros(len(points), int)
     which, view = np.nonzero(inside)
     if len(which):
@@ -69,7 +76,7 @@ def seen_by(solids: Solids, points: np.ndarray, poses: np.ndarray) -> np.ndarray
 
 
 def plan_far(solids: Solids, rig: Rig, rng: np.random.Generator, count: int) -> np.ndarray:
-    """`count` far poses `[count, 3, 4]` in order of azimuth, none with anything just before it."""
+    """Plan far poses `[count, 3, 4]` in order of azimuth, with free space in front of each."""
     poses = []
     for k in range(count):
         azimuth = np.interp(k + 0.5, [0, count], rig.azimuth)
@@ -91,23 +98,24 @@ def plan_far(solids: Solids, rig: Rig, rng: np.random.Generator, count: int) -> 
 def plan_closeups(
     solids: Solids, rig: Rig, train: np.ndarray, rng: np.random.Generator, count: int
 ) -> Closeups:
-    """`count` close-ups: each 2 to 8 times nearer to a subject than the nearest training view.
+    """Plan `count` close-ups, each 2 to 8 times nearer to its subject than any training view.
 
-    The camera goes round its subject by 12 to 45 degrees from the line of a training view, and does
-    not point straight at it. It is kept only if free space joins it to its subject, nothing is
-    just before it, and training views see the subject and most of the rest of its image.
+    Each camera lies 12 to 45 degrees off the line from its subject to a training view, and does not
+    point straight at the subject. A candidate is kept only if nothing blocks its view of the
+    subject, no surface is right in front of it, and training views see the subject and most of the
+    rest of its image.
     """
     chosen = []
     for k in range(count):
         magnification = 2.1 * (7.6 / 2.1) ** ((k * 5 % count + 0.5) / count)
         for attempt in range(8 * len(rig.interests)):
-            # Two tries at each subject, then on to the next.
+            # Try each subject twice, then move on to the next.
             interest = np.array(rig.interests[(k + attempt // 2) % len(rig.interests)])
             found = _closeup(solids, interest, magnification, train, rng)
             if found is not None:
                 break
         else:
-            raise ValueError("no close-up can be placed; change the interests of the scene's rig")
+            raise ValueError("no close-up fits: change the interests of the scene's rig")
         chosen.append(found)
     poses, subjects = (np.stack(column) for column in zip(*chosen, strict=True))
     nearest = np.linalg.norm(train[None, :, :, 3] - subjects[:, None], axis=-1).min(1)
@@ -119,7 +127,7 @@ def _closeup(
     solids: Solids, interest: np.ndarray, magnification: float, train: np.ndarray,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray] | None:  # fmt: skip
-    """The first good one of a handful of random candidates, if any."""
+    """Return the pose and subject of the first good random candidate, or None."""
     views = train[rng.integers(len(train), size=_CANDIDATES), :, 3]
     aims = interest[:3] + interest[3] * _in_ball(rng, _CANDIDATES)
     hit = cast_rays(solids, views, aims - views)
@@ -150,7 +158,7 @@ def _closeup(
         origins, directions = grid_rays(poses[i : i + 1], 16, 9)
         depths = cast_rays(solids, origins, directions).depth[..., None]
         shown = (origins + depths * directions)[0]
-        views_of = seen_by(solids, np.concatenate([subjects[i : i + 1], shown]), train)
+        views_of = count_views(solids, np.concatenate([subjects[i : i + 1], shown]), train)
         if views_of[0] >= 3 and np.mean(views_of[1:] >= 3) > 0.75:
             return poses[i], subjects[i]
     return None

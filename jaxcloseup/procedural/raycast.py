@@ -1,13 +1,13 @@
 """Exact ray casting of solids: planes, boxes, spheres and cylinders.
 
-Every solid is an affine image of a unit one: the square |x|, |y| <= 1 at z = 0, the cube
-[-1, 1]^3, the unit sphere, and the cylinder of |z| <= 1 whose radius is 1 + taper z. Rays are moved
-into that frame, so bricks, slats, plates, ellipsoids and flower pots need no code of their own.
+Every solid is an affine image of a unit solid: the square |x|, |y| <= 1 at z = 0, the cube
+[-1, 1]^3, the unit sphere, or the cylinder |z| <= 1 with radius 1 + taper z. Rays are transformed
+into that frame, so slats, ellipsoids and flower pots need no code of their own.
 
-A point on a solid has a *face* (an integer, counted through all solids) and a *chart* coordinate
-(two numbers in [0, 1]^2 on that face), which is where textures and baked light are looked up.
+A point on a solid has a *face* (an integer, numbered through all solids) and a *chart* coordinate
+(two numbers in [0, 1]^2 on that face), at which textures and baked light are looked up.
 
-`cast_ray` takes one ray, to be batched with `jax.vmap`; `cast_rays` serves host code.
+`cast_ray` casts one ray and is batched with `jax.vmap`; `cast_rays` serves host code.
 """
 
 import concurrent.futures
@@ -22,20 +22,20 @@ from flax import struct
 
 
 PLANE, BOX, SPHERE, CYLINDER = range(4)
-FACES_OF = (1, 6, 1, 3)  # a box: -x +x -y +y -z +z; a cylinder: side, bottom, top
+FACES_OF = (1, 6, 1, 3)  # box: -x +x -y +y -z +z; cylinder: side, bottom, top
 
 
 @struct.dataclass
 class Solids:
-    """Solids sorted by kind, and padding behind them.
+    """Solids sorted by kind, followed by padding.
 
     Attributes:
       to_local: `[N, 3, 4]` affine map from the world to the unit solid.
-      bound: `[N, 3, 4]` half axes (columns) and center of a box around it, in the world.
+      bound: `[N, 3, 4]` half axes (columns) and center of a bounding box, in the world.
       taper: `[N]` growth of a cylinder's radius with local z, in (-1, 1).
-      kind: `[N]` int32: PLANE, BOX, SPHERE or CYLINDER.
-      first_face: `[N]` int32, the first of its faces.
-      bounds: `[5]` int32; solids of kind k are bounds[k] <= i < bounds[k + 1].
+      kind: `[N]` int32 kind: PLANE, BOX, SPHERE or CYLINDER.
+      first_face: `[N]` int32 number of the solid's first face.
+      bounds: `[5]` int32; solids i of kind k satisfy bounds[k] <= i < bounds[k + 1].
     """
 
     to_local: jax.Array
@@ -47,12 +47,12 @@ class Solids:
 
 
 class Hit(NamedTuple):
-    """Where a ray first meets a solid.
+    """The first crossing of a ray with a solid.
 
     Attributes:
-      depth: ray parameter (z-depth, for camera rays); inf where nothing is met.
-      normal: `[3]` unit world normal on the ray's side; 0 where nothing is met.
-      face: int32 face; 0 where nothing is met.
+      depth: ray parameter (z-depth for camera rays); inf if the ray hits nothing.
+      normal: `[3]` unit world normal on the ray's side; 0 if the ray hits nothing.
+      face: int32 face number; 0 if the ray hits nothing.
       chart: `[2]` position on the face, in [0, 1].
     """
 
@@ -65,10 +65,17 @@ class Hit(NamedTuple):
 def make_solids(
     kind: np.ndarray, to_world: np.ndarray, taper: np.ndarray, *, pad_to: int = 1
 ) -> Solids:
-    """Solids from affine maps `to_world[N, 3, 4]` of unit solids, already sorted by `kind[N]`.
+    """Build solids from affine maps of unit solids.
 
-    The number of solids is padded to a multiple of `pad_to`, so that scenes of similar size share
-    one compilation; padding is never met and costs no time.
+    Args:
+      kind: `[N]` kinds, in ascending order.
+      to_world: `[N, 3, 4]` affine maps from the unit solids to the world.
+      taper: `[N]` growth of a cylinder's radius with local z, in (-1, 1).
+      pad_to: the number of solids is padded to a multiple of this, so that scenes of similar size
+        share one compilation. Rays never hit padding, and it costs no time.
+
+    Raises:
+      ValueError: the solids are not sorted by kind.
     """
     kind = np.asarray(kind, np.int32)
     if np.any(np.diff(kind) < 0):
@@ -94,7 +101,7 @@ def make_solids(
 def cast_ray(
     solids: Solids, origin: jax.Array, direction: jax.Array, *, nearest: float = 1e-4
 ) -> Hit:
-    """The first crossing of a ray `origin[3] + depth * direction[3]` with depth > `nearest`."""
+    """Find a ray's first crossing `origin[3] + depth * direction[3]` with depth > `nearest`."""
     chex.assert_shape([origin, direction], (3,))
     ray = (*origin, *direction)
 
@@ -116,7 +123,7 @@ def cast_ray(
 
 
 def keep_solids(solids: Solids, wanted: jax.Array) -> Solids:
-    """Only the solids with `wanted[N]`, so that a bundle of rays need not try the others."""
+    """Keep only the solids with `wanted[N]`, so that rays skip the others."""
     index = jnp.arange(wanted.shape[0])
     kind = jnp.where(wanted & (index < solids.bounds[-1]), solids.kind, 4)
     order = jnp.argsort(kind, stable=True)
@@ -125,9 +132,10 @@ def keep_solids(solids: Solids, wanted: jax.Array) -> Solids:
 
 
 def in_pyramid(solids: Solids, apex: jax.Array, corners: jax.Array) -> jax.Array:
-    """Which solids `[N]` may be met by rays from `apex[3]` between four directions `[4, 3]`.
+    """Which solids `[N]` rays from `apex[3]` between the directions `corners[4, 3]` may hit.
 
-    The corners go round; a solid is left out only where its box lies beyond one side.
+    The corners are in cyclic order. The test is conservative: it excludes a solid only if its
+    bounding box lies beyond one side of the pyramid.
     """
     sides = jnp.cross(corners, jnp.roll(corners, -1, axis=0))
     sides = sides * jnp.sign(jnp.sum(sides * corners.sum(0)[None], axis=-1, keepdims=True))
@@ -143,9 +151,15 @@ def cast_rays(
     *,
     wanted: np.ndarray | None = None,
 ) -> Hit:
-    """First hits of many rays `[..., 3]` as NumPy arrays `[...]`, trying `wanted[N]` solids only.
+    """Find the first hits `[...]` of many rays `[..., 3]`, as NumPy arrays.
 
-    Rays are cast 4096 at a time, whatever their number: one compilation answers every question.
+    Rays are cast in chunks of 4096, so that one compilation serves any number of rays.
+
+    Args:
+      solids: `N` solids.
+      origins: `[..., 3]` origins, broadcast against `directions`.
+      directions: `[..., 3]` directions.
+      wanted: `[N]` bool, the solids to test; None tests all.
     """
     shape = np.broadcast_shapes(origins.shape, directions.shape)[:-1]
     count, chunk = int(np.prod(shape)), 4096
@@ -162,8 +176,8 @@ def cast_rays(
 
 
 def map_in_threads(fn: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
-    """`fn` of each item, two at a time, since XLA keeps to one core in loops as small as ours."""
-    first = fn(items[0])  # alone: threads would each compile what they share
+    """Map `fn` over items, two at a time, because XLA runs such small loops on one core."""
+    first = fn(items[0])  # alone, so that threads do not compile the same code twice
     with concurrent.futures.ThreadPoolExecutor(2) as pool:
         return [first, *pool.map(fn, items[1:])]
 
@@ -177,17 +191,17 @@ def _cast(solids: Solids, wanted: jax.Array, origins: jax.Array, directions: jax
 
 
 def _apply(affine: jax.Array, x: jax.Array, y: jax.Array, z: jax.Array, w: float) -> list:
-    """An affine map, written out: no accelerator rounds it as it would a small matrix product."""
+    """Apply an affine map, written out, since accelerators round small matrix products coarsely."""
     return [row[0] * x + row[1] * y + row[2] * z + row[3] * w for row in affine]
 
 
 def _first_crossing(
     crossings: Callable, to_local: jax.Array, taper: jax.Array, ray: tuple, nearest: float
 ) -> jax.Array:
-    """Smallest ray parameter above `nearest` at which one solid is crossed, or inf."""
+    """Smallest ray parameter above `nearest` at which the ray crosses one solid, or inf."""
     o, d = _apply(to_local, *ray[:3], 1.0), _apply(to_local, *ray[3:], 0.0)
-    # Start from the ray's closest approach to the center: from afar, a thin rail would otherwise
-    # drown in the rounding of b^2 - 4ac.
+    # Start at the ray's closest approach to the center: for a distant thin rail, b^2 - 4ac would
+    # otherwise lose all precision.
     start = -_dot(o, d) / _dot(d, d)
     p = [a + start * b for a, b in zip(o, d, strict=True)]
     best = jnp.float32(jnp.inf)
@@ -247,7 +261,7 @@ def _cylinder(p: list, d: list, taper: jax.Array) -> list:
 def _describe(
     solids: Solids, origin: jax.Array, direction: jax.Array, depth: jax.Array, index: jax.Array
 ) -> Hit:
-    """Normal, face and chart of a crossing."""
+    """Compute the normal, face and chart of a crossing."""
     is_hit = index >= 0
     index = jnp.maximum(index, 0)
     point = origin + jnp.where(is_hit, depth, 0) * direction
@@ -277,7 +291,7 @@ def _describe(
     around = jnp.stack([jnp.arctan2(y, x) / jnp.pi, z])
     chart = jnp.select([is_plane, is_box, is_cap], [square, box_chart, cap_chart], around)
 
-    # Normals go by the transpose of the map to the unit solid.
+    # Normals transform by the transpose of the map to the unit solid.
     normal = sum(to_local[i, :3] * normal[i] for i in range(3))
     normal = normal / jnp.sqrt(jnp.sum(normal * normal))
     normal = jnp.where(jnp.sum(normal * direction) > 0, -normal, normal)

@@ -1,9 +1,9 @@
-"""Color of ray-cast solids: filtered textures, baked soft light, supersampled pixels.
+"""Shade ray-cast solids: filtered textures, baked soft light, supersampled pixels.
 
-Light is baked once for each scene: every face carries a small tile of light values (soft shadows of
-the lamps, ambient occlusion and one bounce), so that a diffuse point has one color from everywhere
-and a rendered sample costs one ray. Textures are pyramids read at the level that matches a
-sample's footprint on the surface: far views resolve what they should, close-ups resolve more.
+Light is baked once per scene: every face carries a small tile of light values (soft shadows of the
+lamps, ambient occlusion and one bounce). A diffuse point thus has the same color from everywhere,
+and a sample costs one ray. Textures are pyramids, read at the level that matches the sample's
+footprint on the surface, so that close-ups resolve more detail than far views.
 """
 
 from collections.abc import Callable
@@ -20,29 +20,29 @@ from jaxcloseup.procedural.raycast import Hit, Solids, cast_ray, in_pyramid, kee
 from jaxcloseup.scene import Surface
 
 
-TEXTURE_SIZE = 1024  # texels a side, of every texture
+TEXTURE_SIZE = 1024  # side of every texture in texels
 LEVELS = TEXTURE_SIZE.bit_length()
-TEXELS = (4 * TEXTURE_SIZE**2 - 1) // 3  # of a texture with all its halvings
+TEXELS = (4 * TEXTURE_SIZE**2 - 1) // 3  # texels of a whole pyramid
 GAMMA = 1 / 2.2
 _SHININESS = 60.0
-_TILE = 24  # pixels a side that share a list of solids
+_TILE = 24  # side in pixels of image tiles that share a list of solids
 
 
 @struct.dataclass
 class Faces:
-    """How each face looks.
+    """The appearance of each face.
 
     Attributes:
-      texture: `[F]` int32 color texture.
-      detail: `[F]` int32 fine texture; the color is multiplied by twice its value.
+      texture: `[F]` int32 index of the color texture.
+      detail: `[F]` int32 index of the detail texture; twice its value multiplies the color.
       uv: `[F, 2, 3]` affine map from the chart to texture repeats.
-      detail_uv: `[F, 2, 3]` the same for the fine texture.
-      pitch: `[F, 2]` repeats per world unit, of texture and detail.
+      detail_uv: `[F, 2, 3]` the same map for the detail texture.
+      pitch: `[F, 2]` repeats per world unit of texture and detail.
       tint: `[F, 3]` factor on the color.
       gloss: `[F]` strength of the highlight.
-      emission: `[F]` 1 where the face shines by itself, else 0.
-      tile: `[F, 3]` int32 first entry, width and height of its tile of light.
-      wraps: `[F]` 1 where the tile is periodic in its first coordinate, else 0.
+      emission: `[F]` 1 if the face shows its own color, unlit; else 0.
+      tile: `[F, 3]` int32 first entry, width and height of the face's tile of light.
+      wraps: `[F]` 1 if the tile is periodic in its first coordinate, else 0.
     """
 
     texture: jax.Array
@@ -59,14 +59,15 @@ class Faces:
 
 @struct.dataclass
 class World:
-    """Everything a ray can find.
+    """A scene ready for rendering.
 
     Attributes:
-      solids: the shapes.
-      faces: their finish.
+      solids: shapes of the scene.
+      faces: appearance of their faces.
       texels: `[K, M]` uint32 packed RGB, the pyramids of K periodic textures.
-      light: `[L, 4]` baked light, encoded as images are: rgb, and how much of the lamp is visible.
-      lamp: `[3]` position of the first lamp, whose highlight shows.
+      light: `[L, 4]` baked RGB light in the encoding of images, and the visible fraction of the
+        first lamp.
+      lamp: `[3]` position of the first lamp, which makes the highlights.
     """
 
     solids: Solids
@@ -77,7 +78,7 @@ class World:
 
 
 def pack_pyramid(image: np.ndarray) -> np.ndarray:
-    """A square texture `[S, S, 3]` in [0, 1] and its halvings, `[M]` uint32."""
+    """Pack a square texture `[S, S, 3]` in [0, 1] and its pyramid as `[M]` uint32."""
     image = np.clip(image, 0, 1).astype(np.float32)
     levels = []
     for level in range(LEVELS):
@@ -92,7 +93,7 @@ def pack_pyramid(image: np.ndarray) -> np.ndarray:
 def sample_texture(
     texels: jax.Array, texture: jax.Array, uv: jax.Array, level: jax.Array
 ) -> jax.Array:
-    """Color `[3]` of periodic pyramid `texels[texture]` at `uv[2]` repeats, between levels."""
+    """Sample `[3]` of the periodic pyramid `texels[texture]` at `uv[2]` repeats, trilinearly."""
     level = jnp.clip(level, 0, LEVELS - 1)
     fine = jnp.minimum(jnp.floor(level), LEVELS - 2).astype(jnp.int32)
     levels = fine + jnp.arange(2)
@@ -108,7 +109,7 @@ def sample_texture(
 
 
 def _corners(xy: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The four integer neighbors `[..., 4, 2]` of points `[..., 2]`, and bilinear weights."""
+    """The four integer neighbors `[..., 4, 2]` of points `[..., 2]`, and their bilinear weights."""
     low = jnp.floor(xy)
     part = (xy - low)[..., None, :]
     far = jnp.array([[0, 0], [1, 0], [0, 1], [1, 1]]).reshape((1,) * (xy.ndim - 1) + (4, 2))
@@ -117,7 +118,7 @@ def _corners(xy: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def sample_light(light: jax.Array, faces: Faces, hit: Hit) -> jax.Array:
-    """Baked light `[C]` at a hit, bilinear in the tile of its face."""
+    """Sample the baked light `[C]` at a hit, bilinearly in the tile of its face."""
     first, width, height = faces.tile[hit.face]
     corner, weight = _corners(hit.chart * jnp.stack([width, height]).astype(jnp.float32) - 0.5)
     x, y = corner.T
@@ -127,7 +128,7 @@ def sample_light(light: jax.Array, faces: Faces, hit: Hit) -> jax.Array:
 
 
 def surface_color(world: World, hit: Hit, footprint: jax.Array) -> jax.Array:
-    """Unlit color `[3]` of a patch as wide as `footprint`, in world units."""
+    """Mean unlit color `[3]` of a surface patch `footprint` world units wide."""
     faces, face = world.faces, hit.face
     chart = jnp.append(hit.chart, 1.0)
     texels = jnp.maximum(footprint * faces.pitch[face] * TEXTURE_SIZE, 1e-6)
@@ -141,7 +142,7 @@ def surface_color(world: World, hit: Hit, footprint: jax.Array) -> jax.Array:
 
 
 def radiance(world: World, origin: jax.Array, direction: jax.Array, spread: jax.Array) -> jax.Array:
-    """Color `[3]` along one ray; `spread` is its pixel's width at unit depth."""
+    """Color `[3]` along one ray; `spread` is the width of its sample at unit depth."""
     hit = cast_ray(world.solids, origin, direction)
     depth = jnp.where(jnp.isfinite(hit.depth), hit.depth, 0)
     facing = jnp.maximum(jnp.abs(jnp.sum(hit.normal * direction)), 0.02)
@@ -157,7 +158,7 @@ def radiance(world: World, origin: jax.Array, direction: jax.Array, spread: jax.
 
 
 def render_rgb(world: World, camera: Camera, *, samples: int = 8) -> jax.Array:
-    """Image `[H, W, 3]`: means over pixels, by `samples` rays on a lattice."""
+    """Render an image `[H, W, 3]`; each pixel is the mean of `samples` rays on a lattice."""
     offsets = lattice(samples)
     spread = 1 / jnp.sqrt(camera.intrinsics[0] * camera.intrinsics[1] * samples)
 
@@ -173,7 +174,7 @@ def render_rgb(world: World, camera: Camera, *, samples: int = 8) -> jax.Array:
 
 
 def render_geometry(solids: Solids, camera: Camera) -> tuple[jax.Array, jax.Array]:
-    """Exact z-depth `[H, W]` (0 where empty) and world normal `[H, W, 3]` at pixel centers."""
+    """Render exact z-depth `[H, W]` (0 if empty) and world normals `[H, W, 3]` at pixel centers."""
 
     def center(solids: Solids, pixel: jax.Array) -> tuple[jax.Array, jax.Array]:
         hit = cast_ray(solids, *pixels_to_rays(camera, pixel))
@@ -183,9 +184,9 @@ def render_geometry(solids: Solids, camera: Camera) -> tuple[jax.Array, jax.Arra
 
 
 def _map_pixels(fn: Callable[..., Any], solids: Solids, camera: Camera) -> Any:
-    """`fn(solids, pixel[2])` at every pixel, `[H, W]` on every leaf.
+    """Evaluate `fn(solids, pixel[2])` at every pixel; every leaf becomes `[H, W, ...]`.
 
-    One small tile of the image after another, each with just the solids that it may show.
+    The image is processed in small tiles, each with only the solids that it may show.
     """
     rows, columns = -(-camera.height // _TILE), -(-camera.width // _TILE)
     corners = jnp.array([[0, 0], [_TILE, 0], [_TILE, _TILE], [0, _TILE]], jnp.float32)
@@ -207,13 +208,13 @@ def _map_pixels(fn: Callable[..., Any], solids: Solids, camera: Camera) -> Any:
 
 
 def render_surface(world: World, camera: Camera, *, samples: int = 8) -> Surface:
-    """What `camera` truly sees."""
+    """Render the exact image, depth and normals that `camera` sees."""
     rgb = render_rgb(world, camera, samples=samples)
     return Surface(rgb, *render_geometry(world.solids, camera))
 
 
 def lattice(count: int) -> jax.Array:
-    """`[count, 2]` well-spread offsets in (-0.5, 0.5)^2, of mean 0."""
+    """Well-spread offsets `[count, 2]` in (-0.5, 0.5)^2 with mean 0."""
     i = np.arange(count)
     golden = (np.sqrt(5) - 1) / 2
     xy = np.stack([(i + 0.5) / count, (i * golden + 0.5) % 1], axis=-1)
@@ -226,7 +227,7 @@ def mean_colors(texels: jax.Array) -> np.ndarray:
 
 
 def _unpack(packed: jax.Array) -> jax.Array:
-    """RGB `[3, ...]` in [0, 1] of packed bytes."""
+    """Unpack RGB `[3, ...]` in [0, 1] from bytes."""
     rgb = [(packed >> shift) & 255 for shift in (0, 8, 16)]
     return jnp.stack(rgb).astype(jnp.float32) / 255
 

@@ -1,14 +1,58 @@
-"""Differentiable 2-D Gaussian splatting in plain JAX: discs, projection, a tile rasterizer."""
+"""Differentiable 2-D Gaussian splatting in plain JAX: surfels, rasterizer, trainable field."""
 
-from jaxcloseup.splats.rasterize import RasterizeConfig
+from jaxcloseup.splats.adaptive import AdaptiveConfig, OffsetSurfels
+from jaxcloseup.splats.density import DensityControl, density_control
+from jaxcloseup.splats.field import (
+    SurfelBuffers,
+    SurfelConfig,
+    SurfelFieldAux,
+    camera_extent,
+    surfel_field,
+    surfel_optimizer,
+    with_expected_depth,
+)
+from jaxcloseup.splats.mcmc import McmcConfig
+from jaxcloseup.splats.projection import Discs, project_discs, to_camera
+from jaxcloseup.splats.rasterize import Footprints, RasterizeConfig, SplatImage, rasterize
+from jaxcloseup.splats.regularizers import (
+    depth_to_normal,
+    normal_inconsistency,
+    scale_free_distortion,
+)
 from jaxcloseup.splats.render import SurfelAux, render_surfels
-from jaxcloseup.splats.surfels import Surfels, surfels_from_points
+from jaxcloseup.splats.spherical_harmonics import rgb_to_sh, sh_basis, sh_to_rgb
+from jaxcloseup.splats.surfels import Surfels, random_points, surfels_from_points
 
 
 __all__ = [
+    "AdaptiveConfig",
+    "DensityControl",
+    "Discs",
+    "Footprints",
+    "McmcConfig",
+    "OffsetSurfels",
     "RasterizeConfig",
+    "SplatImage",
     "SurfelAux",
+    "SurfelBuffers",
+    "SurfelConfig",
+    "SurfelFieldAux",
     "Surfels",
+    "camera_extent",
+    "density_control",
+    "depth_to_normal",
+    "normal_inconsistency",
+    "project_discs",
+    "random_points",
+    "rasterize",
     "render_surfels",
+    "rgb_to_sh",
+    "scale_free_distortion",
+    "sh_basis",
+    "sh_to_rgb",
+    "surfel_field",
+    "surfel_optimizer",
     "surfels_from_points",
+    "to_camera",
+    "with_expected_depth",
 ]

@@ -1,10 +1,12 @@
-"""Surfels as a radiance field: 2-D Gaussian splatting (Huang et al., SIGGRAPH 2024), trainable.
+"""Surfels as a radiance field: trainable 2-D Gaussian splatting (Huang et al., SIGGRAPH 2024).
 
-Whole images only. Normals are pulled towards the surface and light along a ray to one depth, with
-weights that depend on no unit of length; density is controlled at a fixed capacity.
+The field renders whole images only. Its regularizers align normals with the surface and gather
+the light along a ray at one depth; their weights do not depend on the unit of length.
 """
 
 import dataclasses
+import functools
+from collections.abc import Hashable
 from typing import Any, NamedTuple
 
 import chex
@@ -17,16 +19,8 @@ from jaxcloseup.field import RadianceField, Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.metrics import fit_colors, ssim
 from jaxcloseup.numerics import matmul, safe_divide
-from jaxcloseup.splats.adaptive import (
-    AdaptiveConfig,
-    ProbedSurfels,
-    apply_probe,
-    measure_pull,
-    refine,
-    reset_opacities,
-    with_probe,
-)
-from jaxcloseup.splats.mcmc import McmcConfig, relocate, wander
+from jaxcloseup.splats.density import DensityControl, density_control
+from jaxcloseup.splats.mcmc import McmcConfig
 from jaxcloseup.splats.rasterize import RasterizeConfig
 from jaxcloseup.splats.regularizers import (
     depth_to_normal,
@@ -37,7 +31,7 @@ from jaxcloseup.splats.render import SurfelAux, render_surfels
 from jaxcloseup.splats.surfels import Surfels, surfels_from_points
 
 
-_UNCHANGED_SHARE = 0.3  # of the loss of colors as they are, where images may change them
+_UNCHANGED_SHARE = 0.3  # share of the image loss on unchanged colors when images may change theirs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,28 +39,32 @@ class SurfelConfig:
     """Surfels and their training; lengths are in extents of the capture.
 
     Attributes:
-      capacity: how many surfels there can be.
-      sh_degree: of the color's spherical harmonics.
-      sh_every: steps after which one more degree is drawn.
-      initial_opacity: of surfels at the initial points.
-      depth: "median" or "expected": what the field calls depth, labels are made with, and normals
-        are held against; arms of a sweep may have labels from the other.
+      capacity: largest number of surfels.
+      sh_degree: degree of the color's spherical harmonics, 0 to 3.
+      sh_every: steps after which rendering uses one more degree.
+      initial_opacity: opacity of surfels at the initial points.
+      depth: "median" or "expected". The regularizer compares normals with this depth, and a new
+        field renders it for labels; `with_expected_depth` changes the rendered one.
       background: gray level in [0, 1] behind the scene; None is black.
-      color_ridge: in training each image may change its colors by an affine map, to which this
-        is the resistance, see `fit_colors`; None allows none. Rendered images have no such change:
-        a part of the loss holds their colors to the photographs' as they are.
-      ssim_weight: share of 1 - SSIM in the loss; the rest is the absolute difference.
-      normal_weight: of the disagreement between normals and depth.
-      distortion_weight: of the spread of light along a ray, for a mean depth of 1.
-      regularize_from: step from which these two count.
-      opacity_weight: of the mean opacity.
-      scale_weight: of the mean scale.
-      means_lr: learning rate of the means, first and at `decay_steps`.
-      decay_steps: see `means_lr`; it stays there.
-      late_lr_scale: factor on all learning rates from `decay_steps` on.
-      sh_lr, opacity_lr, scale_lr, rotation_lr: Adam's; 1/20 of `sh_lr` for what depends
-        on the direction.
-      density: when surfels move, appear and vanish, by either rule; None for never.
+      color_ridge: in training, each image may change its colors by an affine map; this is the
+        resistance to it, see `fit_colors`, and None allows no change. Rendered images have no such
+        change: part of the loss compares their unchanged colors with the photographs.
+      ssim_weight: share of 1 - SSIM in the image loss; the absolute difference has the rest.
+      normal_weight: weight of the disagreement between normals and depth.
+      distortion_weight: weight of the spread of light along a ray, scaled to a mean depth of 1.
+      regularize_from: first step with the normal and distortion losses.
+      opacity_weight: weight of the mean opacity.
+      scale_weight: weight of the mean scale.
+      means_lr: learning rate of the means at step 0 and from step `means_lr_steps` on; it decays
+        exponentially in between.
+      means_lr_steps: steps over which `means_lr` decays.
+      late_lr_scale: factor on all learning rates from step `means_lr_steps` on.
+      sh_lr: Adam's learning rate of the constant color; view-dependent color has 1/20 of it.
+      opacity_lr: Adam's learning rate of the opacity logits.
+      scale_lr: Adam's learning rate of the log scales.
+      rotation_lr: Adam's learning rate of the quaternions.
+      density: config of a density control, which moves, adds and removes surfels, see
+        `density_control`; None has none.
       raster: static sizes of the rasterizer.
     """
 
@@ -84,25 +82,25 @@ class SurfelConfig:
     opacity_weight: float = 0.01
     scale_weight: float = 0.01
     means_lr: tuple[float, float] = (1.6e-4, 1.6e-6)
-    decay_steps: int = 30_000
+    means_lr_steps: int = 30_000
     late_lr_scale: float = 1.0
     sh_lr: float = 2.5e-3
     opacity_lr: float = 5e-2
     scale_lr: float = 5e-3
     rotation_lr: float = 1e-3
-    density: McmcConfig | AdaptiveConfig | None = dataclasses.field(default_factory=McmcConfig)
+    density: Hashable | None = dataclasses.field(default_factory=McmcConfig)
     raster: RasterizeConfig = dataclasses.field(default_factory=RasterizeConfig)
 
 
 @struct.dataclass
 class SurfelBuffers:
-    """What surfels keep beside their parameters.
+    """State of the surfel field that is not differentiated.
 
     Attributes:
-      alive: `[N]` bool.
-      degree: `[]` int32 degree of spherical harmonics that is drawn.
-      regularize: `[]` 1 once regularizers count, before that 0.
-      expected: `[]` 1 where the expected depth is what the field calls depth, 0 where the median.
+      alive: `[N]` bool; dead surfels are not drawn.
+      degree: `[]` int32 degree of spherical harmonics that is rendered.
+      regularize: `[]` 1 where the normal and distortion losses count, else 0.
+      expected: `[]` 1 where `Rendering.depth` is the expected depth, 0 where it is the median.
     """
 
     alive: jax.Array
@@ -112,12 +110,12 @@ class SurfelBuffers:
 
 
 class SurfelFieldAux(NamedTuple):
-    """What else the field renders.
+    """Private part of the surfel field's renderings.
 
     Attributes:
-      surfels: of `render_surfels`.
-      penalty: `[H, W]` the regularizers of each pixel.
-      prior: `[]` the regularizers of opacities and scales.
+      surfels: the `aux` of `render_surfels`.
+      penalty: `[H, W]` weighted normal and distortion losses.
+      prior: `[]` weighted mean opacity and scale.
     """
 
     surfels: SurfelAux
@@ -128,17 +126,30 @@ class SurfelFieldAux(NamedTuple):
 def surfel_field(config: SurfelConfig, *, extent: float) -> RadianceField:
     """Surfels as a field of whole images.
 
+    Where `Rendering.overflow` is not 0, `config.raster.capacity` was too small and the image is
+    wrong. Check it outside `jax.jit`; then build the field again with twice the capacity and repeat
+    the call. Parameters and buffers fit every capacity, so nothing else changes:
+
+        while int(field.render(params, buffers, camera, None, None).overflow) > 0:
+            raster = dataclasses.replace(config.raster, capacity=2 * config.raster.capacity)
+            config = dataclasses.replace(config, raster=raster)
+            field = surfel_field(config, extent=extent)
+
+    In training the metric "overflow" is the same count: repeat the steps from the state before.
+
     Args:
       config: static.
       extent: size of the capture in world units, such as `camera_extent`.
 
     Raises:
       ValueError: a setting is out of range.
+      TypeError: `config.density` is not the config of a density control.
     """
     if config.depth not in ("median", "expected"):
-        raise ValueError(f'SurfelConfig.depth is "median" or "expected", not "{config.depth}"')
+        raise ValueError(f'SurfelConfig.depth must be "median" or "expected", not "{config.depth}"')
     if not extent > 0:
         raise ValueError(f"extent must be a positive length, not {extent}")
+    control = _density_control(config, extent)
 
     def init(key: jax.Array, points: jax.Array, rgb: jax.Array) -> tuple[Surfels, SurfelBuffers]:
         surfels, alive = surfels_from_points(
@@ -149,11 +160,9 @@ def surfel_field(config: SurfelConfig, *, extent: float) -> RadianceField:
             sh_degree=config.sh_degree,
             opacity=config.initial_opacity,
         )
-        if isinstance(config.density, AdaptiveConfig):
-            surfels = with_probe(surfels)
         expected = jnp.float32(config.depth == "expected")
         schedule = _schedule(config, jnp.zeros((), jnp.int32))
-        return surfels, SurfelBuffers(alive, *schedule, expected)
+        return control.init(surfels), SurfelBuffers(alive, *schedule, expected)
 
     def render(
         params: Surfels,
@@ -162,206 +171,171 @@ def surfel_field(config: SurfelConfig, *, extent: float) -> RadianceField:
         pixels: jax.Array | None,
         key: jax.Array | None,
     ) -> Rendering:
-        del key  # nothing is random
+        del key  # rendering is deterministic
         if pixels is not None:
             raise ValueError("surfels render whole images: pixels must be None")
-        band = jnp.repeat(jnp.arange(4), jnp.array([1, 3, 5, 7]), total_repeat_length=16)
-        drawn = (band[: params.sh.shape[1]] <= buffers.degree)[None, :, None]
-        surfels = params.replace(sh=jnp.where(drawn, params.sh, 0))
-        if isinstance(surfels, ProbedSurfels):
-            surfels = apply_probe(surfels, camera)
+        surfels = control.before_render(_limit_degree(params, buffers.degree), camera)
         background = None if config.background is None else jnp.full(3, config.background)
         image = render_surfels(surfels, buffers.alive, camera, config.raster, background=background)
-        median, expected = image.aux.median_depth, image.depth
-        surface = median if config.depth == "median" else expected
-
-        inconsistency = normal_inconsistency(
-            image.aux.normal, depth_to_normal(camera, surface), image.alpha
+        penalty = buffers.regularize * _penalty(image, camera, config)
+        prior = _prior(params, buffers.alive, config, extent)
+        return image._replace(
+            depth=jnp.where(buffers.expected > 0, image.depth, image.aux.median_depth),
+            aux=SurfelFieldAux(image.aux, penalty, prior),
         )
-        typical = safe_divide(jnp.sum(image.alpha * image.depth), jnp.sum(image.alpha))
-        distortion = scale_free_distortion(image.aux.distortion, jax.lax.stop_gradient(typical))
-        # Of what is right before a camera, in views that nobody took, it has no bound.
-        distortion = distortion / (1 + distortion)
-        penalty = config.normal_weight * inconsistency + config.distortion_weight * distortion
-        number = jnp.sum(buffers.alive, dtype=image.rgb.dtype)
-
-        def mean(values):
-            return safe_divide(jnp.sum(jnp.where(buffers.alive, values, 0)), number)
-
-        opacity = mean(jax.nn.sigmoid(params.opacity_logits))
-        scale = mean(jnp.mean(jnp.exp(params.log_scales), axis=-1)) / extent
-        prior = config.opacity_weight * opacity + config.scale_weight * scale
-        aux = SurfelFieldAux(image.aux, buffers.regularize * penalty, prior)
-        depth = jnp.where(buffers.expected > 0, expected, median)
-        return Rendering(image.rgb, depth, image.alpha, aux)
-
-    def loss(
-        rendering: Rendering, target_rgb: jax.Array, weight: jax.Array
-    ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        return _loss(rendering, target_rgb, weight, config)
 
     def adapt(key: jax.Array, state: Any) -> Any:
-        return _adapt(key, state, config, extent)
+        degree, regularize = _schedule(config, state.step)
+        buffers = state.buffers.replace(degree=degree, regularize=regularize)
+        return control.adapt(key, state.replace(buffers=buffers))
 
+    loss = functools.partial(_loss, config=config)
     return RadianceField(init=init, render=render, loss=loss, adapt=adapt)
 
 
+def with_expected_depth(buffers: SurfelBuffers, expected: bool) -> SurfelBuffers:
+    """Buffers with which the field renders, and labels use, the expected or the median depth."""
+    return buffers.replace(expected=jnp.full_like(buffers.expected, expected))
+
+
 def camera_extent(cameras: Camera) -> jax.Array:
-    """Size `[]` of a capture in world units: 1.1 times the reach of its cameras from their middle.
+    """Size `[]` of a capture in world units: 1.1 times the cameras' largest distance to their mean.
 
     Args:
-      cameras: stacked `[V]`; of a single camera the extent is 0.
+      cameras: stacked `[V]`; a single camera has extent 0.
     """
     offset = cameras.position - jnp.mean(cameras.position, axis=0, keepdims=True)
     return 1.1 * jnp.max(jnp.linalg.norm(offset, axis=-1))
 
 
 def surfel_optimizer(config: SurfelConfig, *, extent: float) -> optax.GradientTransformation:
-    """Adam with a learning rate for each kind of parameter, that of the means decaying."""
+    """Adam with one learning rate for each kind of parameter, and the density control's records.
 
+    Args:
+      config: static.
+      extent: size of the capture in world units.
+    """
+    adam = optax.chain(optax.scale_by_adam(eps=1e-15), _scale_by_learning_rates(config, extent))
+    return _density_control(config, extent).wrap_optimizer(adam)
+
+
+def means_lr_at(config: SurfelConfig, step: jax.Array) -> jax.Array:
+    """Learning rate `[]` of the means at a step, in extents, without `late_lr_scale`."""
+    first, last = config.means_lr
+    share = jnp.minimum(step.astype(jnp.float32) / config.means_lr_steps, 1)
+    return first * (last / first) ** share
+
+
+def _late_lr_scale_at(config, step):
+    return jnp.where(step < config.means_lr_steps, 1, config.late_lr_scale)
+
+
+def _scale_by_learning_rates(config, extent):
     def init(params):
         del params
         return optax.ScaleByScheduleState(count=jnp.zeros((), jnp.int32))
 
     def update(updates, state, params=None):
         del params
-        by_band = jnp.full(updates.sh.shape[1], config.sh_lr / 20).at[0].set(config.sh_lr)
-        rates = jax.tree.map(lambda leaf: 0.0, updates).replace(
-            means=means_lr(config, state.count) * extent,
+        sh_lr = jnp.full(updates.sh.shape[1], config.sh_lr / 20).at[0].set(config.sh_lr)
+        # Parameters that a density control adds are not trained: their learning rate is 0.
+        learning_rates = jax.tree.map(lambda leaf: 0.0, updates).replace(
+            means=means_lr_at(config, state.count) * extent,
             log_scales=config.scale_lr,
             quaternions=config.rotation_lr,
             opacity_logits=config.opacity_lr,
-            sh=by_band[None, :, None],
+            sh=sh_lr[None, :, None],
         )
-        late = _late(config, state.count)
-        updates = jax.tree.map(lambda rate, update: -late * rate * update, rates, updates)
+        late = _late_lr_scale_at(config, state.count)
+        updates = jax.tree.map(lambda lr, update: -late * lr * update, learning_rates, updates)
         return updates, optax.ScaleByScheduleState(count=state.count + 1)
 
-    rescale = optax.GradientTransformation(init, update)
-    adam = optax.chain(optax.scale_by_adam(eps=1e-15), rescale)
-    if isinstance(config.density, AdaptiveConfig):
-        return optax.chain(measure_pull(), adam)
-    return adam
+    return optax.GradientTransformation(init, update)
 
 
-def _late(config, step):
-    return jnp.where(step < config.decay_steps, 1, config.late_lr_scale)
+def _density_control(config: SurfelConfig, extent: float) -> DensityControl:
+    def means_lr(step):
+        return _late_lr_scale_at(config, step) * means_lr_at(config, step) * extent
 
-
-def means_lr(config: SurfelConfig, step: jax.Array) -> jax.Array:
-    """Learning rate of the means at a step, in extents: from first to last along an exponential."""
-    first, last = config.means_lr
-    share = jnp.minimum(step.astype(jnp.float32) / config.decay_steps, 1)
-    return first * (last / first) ** share
-
-
-def _loss(rendering, target_rgb, weight, config):
-    chex.assert_equal_shape([rendering.rgb, target_rgb])
-    chex.assert_shape(weight, target_rgb.shape[:-1])
-    total = jnp.sum(weight)
-
-    def mean(values):
-        return safe_divide(jnp.sum(weight * values), total)
-
-    # What weighs nothing must not show in windows beside it either.
-    counts = weight[..., None] > 0
-
-    def distance(seen):
-        target = jnp.where(counts, target_rgb, jax.lax.stop_gradient(seen))
-        difference = mean(jnp.mean(jnp.abs(seen - target), axis=-1))
-        similarity = ssim(seen, target, weight=weight)
-        dissimilarity = jnp.where(jnp.isnan(similarity), 0, 1 - similarity)
-        return (1 - config.ssim_weight) * difference + config.ssim_weight * dissimilarity
-
-    seen = rendering.rgb
-    image = distance(seen)
-    if config.color_ridge is not None:
-        data = jax.lax.stop_gradient(seen), target_rgb, weight
-        matrix, offset = fit_colors(*data, ridge=config.color_ridge)
-        matrix = jnp.where(total > 0, matrix, jnp.eye(3, dtype=matrix.dtype))
-        seen = matmul(seen, matrix[None]) + jnp.where(total > 0, offset, 0)[None, None]
-        # Colors that are free in every photograph would drift away from all of them.
-        image = _UNCHANGED_SHARE * image + (1 - _UNCHANGED_SHARE) * distance(seen)
-    prior = jnp.where(total > 0, rendering.aux.prior, 0)
-    off = jnp.where(counts, jnp.clip(seen, 0, 1) - target_rgb, 0)
-    squared = mean(jnp.mean(off**2, axis=-1))
-    metrics = {
-        "psnr": -10 * jnp.log10(squared),
-        "overflow": rendering.aux.surfels.overflow.astype(jnp.float32),
-    }
-    return image + mean(rendering.aux.penalty) + prior, metrics
+    return density_control(config.density, extent=extent, means_lr=means_lr)
 
 
 def _schedule(config, step):
+    """Degree of spherical harmonics, and whether the normal and distortion losses count."""
     degree = jnp.minimum(step // config.sh_every, config.sh_degree).astype(jnp.int32)
     return degree, (step >= config.regularize_from).astype(jnp.float32)
 
 
-def _adapt(key, state, config, extent):
-    degree, regularize = _schedule(config, state.step)
-    buffers = state.buffers.replace(degree=degree, regularize=regularize)
-    state = state.replace(buffers=buffers)
-    density = config.density
-    if density is None:
-        return state
-    due = (state.step % density.every == 0) & (state.step > density.start)
-    due &= state.step < density.stop
-    if isinstance(density, AdaptiveConfig):
-        return _adapt_classically(key, state, density, due, extent)
-    key_relocate, key_wander = jax.random.split(key)
-
-    def move(state):
-        surfels, alive, changed = relocate(key_relocate, state.params, state.buffers.alive, density)
-        return _replace_surfels(state, surfels, alive, changed)
-
-    state = jax.lax.cond(due, move, lambda state: state, state)
-    rate = _late(config, state.step) * means_lr(config, state.step) * extent
-    surfels = wander(key_wander, state.params, state.buffers.alive, rate, density)
-    return state.replace(params=surfels)
+def _limit_degree(surfels, degree):
+    """Surfels without spherical harmonics above a degree `[]`."""
+    band = jnp.repeat(jnp.arange(4), jnp.array([1, 3, 5, 7]), total_repeat_length=16)
+    drawn = (band[: surfels.sh.shape[1]] <= degree)[None, :, None]
+    return surfels.replace(sh=jnp.where(drawn, surfels.sh, 0))
 
 
-def _adapt_classically(key, state, density, due, extent):
-    def grow(state):
-        pull, adam = state.opt_state
-        remove_huge = state.step > density.reset_every
-        surfels, alive, new = refine(
-            key,
-            state.params,
-            state.buffers.alive,
-            pull,
-            density,
-            extent=extent,
-            remove_huge=remove_huge,
-        )
-        none = jax.tree.map(jnp.zeros_like, pull)
-        return _replace_surfels(state.replace(opt_state=(none, adam)), surfels, alive, new)
-
-    def fade(state):
-        pull, (moments, rates) = state.opt_state
-        mu, nu = (
-            moment.replace(opacity_logits=jnp.zeros_like(moment.opacity_logits))
-            for moment in (moments.mu, moments.nu)
-        )
-        return state.replace(
-            params=reset_opacities(state.params, density),
-            opt_state=(pull, (moments._replace(mu=mu, nu=nu), rates)),
-        )
-
-    state = jax.lax.cond(due, grow, lambda state: state, state)
-    faded = (state.step % density.reset_every == 0) & (state.step < density.stop) & (state.step > 0)
-    return jax.lax.cond(faded, fade, lambda state: state, state)
-
-
-def _replace_surfels(state, surfels, alive, changed):
-    """The state with other surfels, of which the optimizer forgets those that changed."""
-
-    def forget(leaf):
-        if leaf.ndim == 0 or leaf.shape[0] != changed.shape[0]:
-            return leaf
-        return jnp.where(changed.reshape(-1, *(1,) * (leaf.ndim - 1)), 0, leaf)
-
-    return state.replace(
-        params=surfels,
-        buffers=state.buffers.replace(alive=alive),
-        opt_state=jax.tree.map(forget, state.opt_state),
+def _penalty(image, camera, config):
+    """Weighted normal and distortion losses `[H, W]`."""
+    surface = image.aux.median_depth if config.depth == "median" else image.depth
+    inconsistency = normal_inconsistency(
+        image.aux.normal, depth_to_normal(camera, surface), image.alpha
     )
+    typical = safe_divide(jnp.sum(image.alpha * image.depth), jnp.sum(image.alpha))
+    distortion = scale_free_distortion(image.aux.distortion, jax.lax.stop_gradient(typical))
+    # Distortion is unbounded for surfaces very near a virtual camera.
+    distortion = distortion / (1 + distortion)
+    return config.normal_weight * inconsistency + config.distortion_weight * distortion
+
+
+def _prior(surfels, alive, config, extent):
+    """Weighted mean opacity and scale `[]` of living surfels."""
+    number = jnp.sum(alive, dtype=surfels.means.dtype)
+
+    def mean(values):
+        return safe_divide(jnp.sum(jnp.where(alive, values, 0)), number)
+
+    opacity = mean(jax.nn.sigmoid(surfels.opacity_logits))
+    scale = mean(jnp.mean(jnp.exp(surfels.log_scales), axis=-1)) / extent
+    return config.opacity_weight * opacity + config.scale_weight * scale
+
+
+def _loss(
+    rendering: Rendering, target_rgb: jax.Array, weight: jax.Array, *, config: SurfelConfig
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    chex.assert_equal_shape([rendering.rgb, target_rgb])
+    chex.assert_shape(weight, target_rgb.shape[:-1])
+    total = jnp.sum(weight)
+    seen = rendering.rgb
+    image = _image_loss(seen, target_rgb, weight, config.ssim_weight)
+    if config.color_ridge is not None:
+        seen = _match_colors(seen, target_rgb, weight, config.color_ridge)
+        matched = _image_loss(seen, target_rgb, weight, config.ssim_weight)
+        # Without a loss on unchanged colors, they would drift away from all photographs.
+        image = _UNCHANGED_SHARE * image + (1 - _UNCHANGED_SHARE) * matched
+    prior = jnp.where(total > 0, rendering.aux.prior, 0)
+    error = jnp.where(weight[..., None] > 0, jnp.clip(seen, 0, 1) - target_rgb, 0)
+    squared = _weighted_mean(jnp.mean(error**2, axis=-1), weight)
+    penalty = _weighted_mean(rendering.aux.penalty, weight)
+    return image + penalty + prior, {"psnr": -10 * jnp.log10(squared)}
+
+
+def _weighted_mean(values, weight):
+    return safe_divide(jnp.sum(weight * values), jnp.sum(weight))
+
+
+def _image_loss(seen, target_rgb, weight, ssim_weight):
+    """Absolute difference and 1 - SSIM, a weighted mean `[]` over pixels."""
+    # Pixels of weight 0 must not show in SSIM's windows at other pixels either.
+    target = jnp.where(weight[..., None] > 0, target_rgb, jax.lax.stop_gradient(seen))
+    difference = _weighted_mean(jnp.mean(jnp.abs(seen - target), axis=-1), weight)
+    similarity = ssim(seen, target, weight=weight)
+    dissimilarity = jnp.where(jnp.isnan(similarity), 0, 1 - similarity)
+    return (1 - ssim_weight) * difference + ssim_weight * dissimilarity
+
+
+def _match_colors(seen, target_rgb, weight, ridge):
+    """Rendered colors after the affine map that takes them closest to the target."""
+    data = jax.lax.stop_gradient(seen), target_rgb, weight
+    matrix, offset = fit_colors(*data, ridge=ridge)
+    any_weight = jnp.sum(weight) > 0
+    matrix = jnp.where(any_weight, matrix, jnp.eye(3, dtype=matrix.dtype))
+    return matmul(seen, matrix[None]) + jnp.where(any_weight, offset, 0)[None, None]

@@ -1,12 +1,12 @@
 """Surfels to planar homographies and exact boxes, for one camera.
 
-A disc with center mu, unit tangents t_u, t_v, normal n = t_u x t_v and radii s_u, s_v meets the ray
-r (r_z = 1) of a pixel at depth z with local coordinates (u, v). All of
+A pixel's ray r, with r_z = 1, meets a disc with center mu, unit tangents t_u, t_v, normal
+n = t_u x t_v and radii s_u, s_v at depth z with local coordinates (u, v). The three quantities
 
     u / z = r.(t_v x mu) / (s_u n.mu),    v / z = r.(mu x t_u) / (s_v n.mu),    1 / z = r.n / n.mu
 
-are affine in the pixel: they are the rows of `Footprints`, taken about the projected center, where
-they are (0, 0, 1 / mu_z) without rounding.
+are affine in the pixel: they are the rows of `Footprints.homography`, taken about the projected
+center, where they are (0, 0, 1 / mu_z) without rounding.
 """
 
 from typing import NamedTuple
@@ -23,17 +23,17 @@ from jaxcloseup.splats.rasterize import Footprints
 from jaxcloseup.splats.surfels import Surfels
 
 
-LOW_PASS = 2.0  # 1/px^2: the screen-space floor is a Gaussian of sigma = sqrt(1/2) pixel
+LOW_PASS = 2.0  # 1/px^2: no splat is drawn smaller than a Gaussian of sigma = sqrt(1/2) pixel
 EDGE_ON = 1e-4  # |cos| between normal and line of sight below which a disc is not drawn
 MAX_LOG_SCALE = 30.0  # beyond it, products of scales leave the range of float32
 
 
 class Discs(NamedTuple):
-    """Discs in one camera's frame, world units.
+    """`N` discs in one camera's frame, in world units.
 
     Attributes:
-      center: `[N, 3]`.
-      axes: `[N, 3, 3]`, columns are the unit tangents t_u, t_v and the normal.
+      center: `[N, 3]` centers.
+      axes: `[N, 3, 3]` rotations; columns are the unit tangents t_u, t_v and the normal.
       scales: `[N, 2]` standard deviations along the tangents.
     """
 
@@ -43,7 +43,7 @@ class Discs(NamedTuple):
 
 
 def to_camera(surfels: Surfels, camera: Camera) -> tuple[Discs, jax.Array]:
-    """Discs in the camera's frame, and their world normals `[N, 3]` turned towards the camera."""
+    """Discs in the camera's frame, and their normals `[N, 3]`, world frame, facing the camera."""
     axes = quaternion_to_matrix(surfels.quaternions)
     offset = surfels.means - camera.position[None]
     normal = axes[..., 2]
@@ -59,14 +59,17 @@ def to_camera(surfels: Surfels, camera: Camera) -> tuple[Discs, jax.Array]:
 def project_discs(
     discs: Discs, opacity: jax.Array, payload: jax.Array, camera: Camera, *, near: float
 ) -> Footprints:
-    """Homographies and boxes of discs; what cannot be seen has opacity 0 and an empty box.
+    """Homographies and boxes of discs; invisible discs get opacity 0 and an empty box.
 
     Args:
       discs: `N` discs in the frame of `camera`.
       opacity: `[N]` in [0, 1].
-      payload: `[N, F]`.
-      camera: gives intrinsics and image size.
-      near: positive z-depth before which nothing is drawn; a disc may reach through it.
+      payload: `[N, F]` values to blend.
+      camera: one camera; only its intrinsics and image size are used.
+      near: positive z-depth; nothing nearer is drawn, and a disc may reach through it.
+
+    Raises:
+      ValueError: `near` is not positive.
     """
     if near <= 0:
         raise ValueError(f"near must be a positive depth, not {near}")
@@ -77,12 +80,12 @@ def project_discs(
     inverse_depth = 1 / jnp.where(ahead, depth, 1)
     center = mu[:, :2] * inverse_depth[:, None] * focal + principal
 
-    # A center far outside the image, or behind the camera, is no good origin for numbers that are
-    # needed within it. Any other pixel will do, if the low-pass about it stays out of sight.
+    # A center far outside the image, or behind the camera, is a poor origin for numbers that are
+    # evaluated inside it. Any other pixel serves if the low-pass about it stays out of sight.
     margin = jnp.maximum(size, 16)
     within = jnp.all((center > -margin) & (center < size + margin), axis=-1, keepdims=True)
     centered = ahead[:, None] & within
-    # In the image, for those behind the camera, it is a corner of pixels, never a pixel's center.
+    # Discs behind the camera are anchored at a corner of pixels, never at a pixel's center.
     corner = jnp.floor(size / 2)
     elsewhere = jnp.where(ahead[:, None], jnp.clip(center, -margin, size + margin), corner)
     anchor = jnp.where(centered, center, lax.stop_gradient(elsewhere))
@@ -100,9 +103,11 @@ def project_discs(
     at_anchor = jnp.sum(covectors * ray[:, None], axis=-1)
     at_center = jnp.stack([jnp.zeros_like(depth), jnp.zeros_like(depth), inverse_depth], axis=-1)
     constants = jnp.where(centered, at_center, at_anchor)
-    rows = jnp.concatenate([constants[..., None], covectors[..., :2] / focal[:, None]], axis=-1)
+    homography = jnp.concatenate(
+        [constants[..., None], covectors[..., :2] / focal[:, None]], axis=-1
+    )
 
-    # What is drawn where has no derivative, nor has a disc's extent in depth.
+    # Neither the box nor the disc's range of depth has a derivative.
     discs, opacity_now, center = lax.stop_gradient((discs, opacity, center))
     cutoff = jnp.sqrt(2 * jnp.log(jnp.maximum(opacity_now / ALPHA_MIN, 1)))
     reach = cutoff * safe_norm(discs.axes[:, 2, :2] * discs.scales)
@@ -112,7 +117,7 @@ def project_discs(
     box = jnp.where(ahead[:, None], _unite(box, _low_pass_box(center, cutoff)), box)
     return Footprints(
         anchor=anchor,
-        rows=rows,
+        homography=homography,
         opacity=jnp.where(drawn, opacity, 0),
         low_pass=jnp.where(ahead, LOW_PASS, 1e9),
         inverse_depth=jnp.stack([1 / farthest, 1 / nearest], axis=-1),
@@ -123,14 +128,14 @@ def project_discs(
 
 
 def _disc_box(discs: Discs, cutoff: jax.Array, camera: Camera, near: float) -> jax.Array:
-    """Exact bounds `[N, 4]` in pixels of the part with z >= near of discs of radius `cutoff`.
+    """Exact bounds `[N, 4]` in pixels of discs of radius `cutoff[N]`, cut off at z = near.
 
-    The visible part is convex, so its image is bounded by points of its rim: those where a
-    coordinate is stationary along the circle, and the ends of the chord at which z = near.
+    The visible part is convex, so points of its rim bound its image: those where a coordinate is
+    stationary along the circle, and the ends of the chord at z = near.
     """
-    # Rounding must not cost a pixel that just reaches the cutoff.
+    # The margin keeps pixels that only just reach the cutoff in spite of rounding.
     radii = (1.001 * cutoff)[:, None] * discs.scales
-    # Coordinates of the rim are a cos + b sin + c, with a triple of [N] for each of x, y, z.
+    # Each coordinate x, y, z of the rim is a cos + b sin + c, a triple of [N].
     circle = [
         (axes[:, 0] * radii[:, 0], axes[:, 1] * radii[:, 1], discs.center[:, i])
         for i, axes in enumerate(jnp.moveaxis(discs.axes, 1, 0))
@@ -160,7 +165,7 @@ def _disc_box(discs: Discs, cutoff: jax.Array, camera: Camera, near: float) -> j
 
 
 def _on_circle(coordinate, point):
-    """A coordinate (a, b, c) `[N]` of the rim at (cos, sin)."""
+    """The value `[N]` of a coordinate (a, b, c) of the rim at a point (cos, sin)."""
     return coordinate[0] * point[0] + coordinate[1] * point[1] + coordinate[2]
 
 
@@ -171,7 +176,7 @@ def _meet_circle(a, b, c):
     squared = a * a + b * b
     discriminant = squared - c * c
     root = jnp.sqrt(jnp.maximum(discriminant, 0))
-    # A line that vanishes is met everywhere: a disc without extent, of which any point will do.
+    # For a disc without extent the equation vanishes, and any point of its rim serves.
     divisor = jnp.where(squared == 0, 1, squared)
     points = [
         ((-c * a - s * b * root) / divisor, (-c * b + s * a * root) / divisor) for s in (-1, 1)

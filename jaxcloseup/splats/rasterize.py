@@ -1,7 +1,7 @@
-"""Planar homographies to images: the part of splatting that knows neither surfels nor cameras.
+"""Splats to images: the part of splatting that knows neither surfels nor cameras.
 
-Every splat is three affine functions of the pixel, a reference pixel and a payload (`Footprints`).
-A 3-D Gaussian's ellipse is the special case of a constant inverse depth.
+A splat is a planar homography, a reference pixel and a payload, see `Footprints`. The ellipse of a
+3-D Gaussian is the special case of a constant inverse depth.
 """
 
 import dataclasses
@@ -15,21 +15,21 @@ from flax import struct
 from jax import lax
 
 from jaxcloseup.numerics import safe_divide
-from jaxcloseup.splats.kernel import composite, pack
+from jaxcloseup.splats.kernel import blend_tiles, pack
 from jaxcloseup.splats.tiling import tile_lists
 
 
 @dataclasses.dataclass(frozen=True)
 class RasterizeConfig:
-    """Static sizes of the rasterizer; none of them changes the image.
+    """Static sizes of the rasterizer; except for `near`, none changes an image whose pairs fit.
 
     Attributes:
-      capacity: how many (tile, splat) pairs fit. What does not fit is counted in `overflow`, the
-        farthest splats are left out, and the caller renders again with a larger capacity.
-      near: positive z-depth in world units before which nothing is drawn.
+      capacity: largest number of (tile, splat) pairs. `overflow` counts the pairs beyond it, which
+        are those of the farthest splats; render again with a larger capacity.
+      near: positive z-depth in world units; nothing nearer is drawn.
       tile: side of a tile in pixels.
-      chunk: splats of a tile that are evaluated at once.
-      block: tiles that are evaluated at once.
+      chunk: number of a tile's splats that the kernel evaluates at once.
+      block: number of tiles that the kernel evaluates at once.
     """
 
     capacity: int = 2**18
@@ -41,27 +41,29 @@ class RasterizeConfig:
 
 @struct.dataclass
 class Footprints:
-    """What is drawn, `N` splats in any order.
+    """`N` splats in any order, ready to be drawn.
 
-    At pixel q, with d = (1, q - anchor), the local coordinates are (u, v) = (rows[0].d, rows[1].d)
-    / (rows[2].d) and the z-depth is 1 / (rows[2].d). The opacity falls as exp(-rho / 2) with
-    rho = min(u^2 + v^2, low_pass |q - anchor|^2).
+    At pixel q, with d = (1, q - anchor) and the homography H, the local coordinates are
+    (u, v) = (H[0].d, H[1].d) / (H[2].d) and the z-depth is 1 / (H[2].d). The opacity falls as
+    exp(-rho / 2) with rho = min(u^2 + v^2, low_pass |q - anchor|^2).
 
     Attributes:
-      anchor: `[N, 2]` reference pixel, the projected center wherever the low-pass can be seen.
-      rows: `[N, 3, 3]` affine functions: columns multiply 1, x - anchor_x, y - anchor_y.
-      opacity: `[N]` in [0, 1]; 0 is never drawn.
-      low_pass: `[N]` inverse variance of the screen-space floor; very large is none. No gradient.
-      inverse_depth: `[N, 2]` range to which 1/z is held where the low-pass wins. The derivative
-        there is that of the depth at the anchor.
-      payload: `[N, F]` what is composited: colors, normals, anything.
-      order: `[N]` z-depth, positive, by which splats are sorted. No gradient.
-      box: `[N, 4]` bounds (x0, y0, x1, y1) in pixels of all that is not fainter than `ALPHA_MIN`;
-        empty where x1 < x0. No gradient.
+      anchor: `[N, 2]` reference pixel: the projected center wherever the low-pass is visible.
+      homography: `[N, 3, 3]` map from pixels to (u, v, 1) / z; its columns multiply 1, x - anchor_x
+        and y - anchor_y.
+      opacity: `[N]` in [0, 1]; splats of opacity 0 are not drawn.
+      low_pass: `[N]` inverse variance, in 1/px^2, of the smallest screen-space Gaussian; a very
+        large value has no effect. No gradient.
+      inverse_depth: `[N, 2]` lower and upper limit of 1/z where the low-pass gives rho. At a limit,
+        the derivative is that of the depth at the anchor.
+      payload: `[N, F]` values to blend, such as colors and normals.
+      order: `[N]` positive z-depth by which splats are sorted. No gradient.
+      box: `[N, 4]` bounds (x0, y0, x1, y1) in pixels outside which the splat is fainter than
+        `ALPHA_MIN`; empty where x1 < x0. No gradient.
     """
 
     anchor: jax.Array
-    rows: jax.Array
+    homography: jax.Array
     opacity: jax.Array
     low_pass: jax.Array
     inverse_depth: jax.Array
@@ -70,7 +72,7 @@ class Footprints:
     box: jax.Array
 
 
-class Composite(NamedTuple):
+class SplatImage(NamedTuple):
     """An image of footprints, before any background.
 
     Attributes:
@@ -78,9 +80,9 @@ class Composite(NamedTuple):
       alpha: `[H, W]` sum of w_i.
       depth: `[H, W]` expected z-depth, sum of w_i z_i / alpha; 0 where alpha is 0.
       median_depth: `[H, W]` z-depth of the splat that takes the transmittance to 1/2, else of the
-        last one; 0 where there is none.
+        last drawn splat; 0 where no splat is drawn.
       distortion: `[H, W]` sum over pairs i < j of w_i w_j (1/z_i - 1/z_j)^2.
-      overflow: `[]` int32, pairs that did not fit into the capacity.
+      overflow: `[]` int32 number of (tile, splat) pairs that did not fit into the capacity.
     """
 
     payload: jax.Array
@@ -93,15 +95,15 @@ class Composite(NamedTuple):
 
 def rasterize(
     footprints: Footprints, config: RasterizeConfig, *, height: int, width: int
-) -> Composite:
-    """Composite `footprints` into an image of `height` x `width` pixels.
+) -> SplatImage:
+    """Blend splats front to back into an image of `height` x `width` pixels.
 
-    Differentiable in anchor, rows, opacity and payload. Deterministic; ties in `order` go to the
-    lower index.
+    Differentiable in anchor, homography, opacity and payload. Deterministic; of two splats with the
+    same `order`, the one with the lower index is in front.
     """
     count, features = footprints.payload.shape
     chex.assert_shape(footprints.anchor, (count, 2))
-    chex.assert_shape(footprints.rows, (count, 3, 3))
+    chex.assert_shape(footprints.homography, (count, 3, 3))
     chex.assert_shape([footprints.opacity, footprints.low_pass, footprints.order], (count,))
     chex.assert_shape(footprints.inverse_depth, (count, 2))
     chex.assert_shape(footprints.box, (count, 4))
@@ -116,24 +118,24 @@ def rasterize(
         capacity=config.capacity,
     )
     table = pack(footprints)
-    sums, median = composite(config, table, lists)
+    sums, median = blend_tiles(config, table, lists)
     image = functools.partial(_untile, height=height, width=width, tile=config.tile)
     payload = jnp.moveaxis(jax.vmap(image, in_axes=1)(sums[:, :features]), 0, -1)
     depth, alpha, first, second = (image(sums[:, features + i]) for i in range(4))
-    return Composite(
+    return SplatImage(
         payload=payload,
         alpha=alpha,
         depth=safe_divide(depth, alpha),
         median_depth=image(median),
-        # The moments are about the inverse depth of the first contributor, whose weight is at least
-        # ALPHA_MIN: without that shift a converged surface would lose every digit of its spread.
+        # The moments are about the inverse depth of the first drawn splat, whose weight is at least
+        # ALPHA_MIN. Without that shift a converged surface would lose every digit of its spread.
         distortion=jnp.maximum(alpha * second - first * first, 0),
         overflow=lists.overflow,
     )
 
 
 def _untile(tiles: jax.Array, *, height: int, width: int, tile: int) -> jax.Array:
-    """Pixels `[T, P]` of all tiles in row-major order to an image `[H, W]`."""
+    """Arrange the pixels `[T, P]` of tiles in row-major order as an image `[H, W]`."""
     down, across = -(-height // tile), -(-width // tile)
     image = tiles.reshape(down, across, tile, tile).swapaxes(1, 2)
     return image.reshape(down * tile, across * tile)[:height, :width]

@@ -1,6 +1,6 @@
-"""Losses that pull surfels onto a surface: normals that agree with depth, and depth without spread.
+"""Losses per pixel, unreduced, that gather surfels on a surface.
 
-All are per pixel and unreduced.
+One makes normals agree with depth; the other removes the spread of depth along a ray.
 """
 
 import chex
@@ -13,9 +13,13 @@ from jaxcloseup.numerics import safe_norm
 
 
 def depth_to_normal(camera: Camera, depth: jax.Array) -> jax.Array:
-    """World normals `[H, W, 3]`, towards the camera, of depth `[H, W]` by central differences.
+    """Normals `[H, W, 3]` of a depth map by central differences, world frame, facing the camera.
 
-    Exact on planes. Zero, with zero gradient, at the border and beside pixels without depth.
+    Exact on planes. Normals are 0, with gradient 0, at the border and beside pixels without depth.
+
+    Args:
+      camera: one camera.
+      depth: `[H, W]` z-depth; 0 where it is undefined.
     """
     chex.assert_shape(depth, (camera.height, camera.width))
     pixels = pixel_grid(camera.height, camera.width).astype(depth.dtype)
@@ -32,12 +36,12 @@ def depth_to_normal(camera: Camera, depth: jax.Array) -> jax.Array:
 
 
 def normal_inconsistency(normal: jax.Array, depth_normal: jax.Array, alpha: jax.Array) -> jax.Array:
-    """alpha (1 - <normal, depth_normal>) `[H, W]`, and 0 where there is no `depth_normal`.
+    """alpha (1 - <normal, depth_normal>) `[H, W]`; 0 where `depth_normal` is undefined.
 
     Args:
-      normal: `[H, W, 3]` composited normals, not normalized, as rendered.
-      depth_normal: `[H, W, 3]` of `depth_to_normal`.
-      alpha: `[H, W]`, which weighs and gets no gradient.
+      normal: `[H, W, 3]` rendered normals, not normalized.
+      depth_normal: `[H, W, 3]` from `depth_to_normal`.
+      alpha: `[H, W]` weight; it gets no gradient.
     """
     chex.assert_equal_shape([normal, depth_normal])
     defined = jnp.any(depth_normal != 0, axis=-1)
@@ -49,8 +53,8 @@ def scale_free_distortion(distortion: jax.Array, reference_depth: jax.Array | fl
     """Distortion of m = 1 - reference_depth / z, which does not depend on the unit of length.
 
     Args:
-      distortion: as rendered, of inverse depths.
-      reference_depth: such as the median depth of the scene. The published mapping of z with planes
-        n = 0.2 and f = 100 is that of n f / (f - n) = 0.2004.
+      distortion: rendered distortion of inverse depths.
+      reference_depth: a typical depth of the scene in world units. The published mapping of z with
+        planes n = 0.2 and f = 100 has the reference depth n f / (f - n) = 0.2004.
     """
     return reference_depth**2 * distortion

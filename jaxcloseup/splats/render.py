@@ -1,4 +1,4 @@
-"""Surfels to images."""
+"""Renders surfels by 2-D Gaussian splatting."""
 
 from typing import NamedTuple
 
@@ -16,14 +16,15 @@ from jaxcloseup.splats.surfels import Surfels
 
 
 class SurfelAux(NamedTuple):
-    """What surfels render besides color, expected depth and alpha.
+    """Images of surfels besides color, expected depth and alpha.
 
     Attributes:
-      normal: `[H, W, 3]` sum of w_i n_i in the world's frame, towards the camera, not normalized.
-      median_depth: `[H, W]` z-depth at which half of the light is lost; 0 where nothing is hit.
+      normal: `[H, W, 3]` sum of w_i n_i, world frame, facing the camera, not normalized.
+      median_depth: `[H, W]` z-depth at which the transmittance falls to 1/2, else that of the last
+        drawn surfel; 0 where no surfel is drawn.
       distortion: `[H, W]` sum over pairs i < j of w_i w_j (1/z_i - 1/z_j)^2.
-      overflow: `[]` (tile, surfel) pairs that did not fit: if not 0 the image is wrong; render it
-        again with a larger `RasterizeConfig.capacity`.
+      overflow: `[]` int32 number of (tile, surfel) pairs that did not fit; the image is wrong where
+        it is not 0.
     """
 
     normal: jax.Array
@@ -43,17 +44,21 @@ def render_surfels(
     """Render a whole image by 2-D Gaussian splatting (Huang et al. 2024).
 
     Differentiable in the surfels, the background and the camera's pose and intrinsics; batch over
-    cameras with `jax.vmap`. Depth is where rays meet the discs, not the depth of their centers.
+    cameras with `jax.vmap`. Depth is the depth at which rays meet the discs, not that of their
+    centers.
+
+    The image is right only where `overflow` is 0. It is an array, so check it outside `jax.jit`;
+    where it is not 0, double `config.capacity` and render again.
 
     Args:
       surfels: `N` surfels.
-      alive: `[N]` bool, False is not drawn.
+      alive: `[N]` bool; dead surfels are not drawn.
       camera: one camera.
-      config: static sizes.
-      background: `[3]` color behind everything, black if None.
+      config: static sizes of the rasterizer.
+      background: `[3]` color behind everything; None is black.
 
     Returns:
-      A `Rendering` of `[H, W]` pixels whose `aux` is a `SurfelAux`.
+      A `Rendering` of `[H, W]` pixels with `normal` and `overflow`, whose `aux` is a `SurfelAux`.
     """
     count = alive.shape[0]
     chex.assert_shape(surfels.means, (count, 3))
@@ -77,4 +82,4 @@ def render_surfels(
         chex.assert_shape(background, (3,))
         rgb = rgb + (1 - image.alpha)[..., None] * background[None, None]
     aux = SurfelAux(normal, image.median_depth, image.distortion, image.overflow)
-    return Rendering(rgb, image.depth, image.alpha, aux)
+    return Rendering(rgb, image.depth, image.alpha, aux, normal=aux.normal, overflow=aux.overflow)

@@ -13,11 +13,14 @@ _CONSTANT = math.sqrt(1 / (4 * math.pi))
 def sh_basis(directions: jax.Array, degree: int) -> jax.Array:
     """Orthonormal basis `[..., (degree + 1)^2]` at unit `directions[..., 3]`, `degree` 0 to 3.
 
-    Ordered by degree, then order, with the signs (-1)^m in which trained splats are exchanged.
+    Functions are ordered by degree, then order, with the signs (-1)^m that splat files use.
+
+    Raises:
+      ValueError: `degree` is not 0 to 3.
     """
     chex.assert_axis_dimension(directions, -1, 3)
     if degree not in range(4):
-        raise ValueError(f"spherical harmonics have degree 0 to 3 here, not {degree}")
+        raise ValueError(f"spherical harmonics must have degree 0 to 3, not {degree}")
     x, y, z = jnp.moveaxis(directions, -1, 0)
     xx, yy, zz = x * x, y * y, z * z
     root = lambda numerator, denominator: math.sqrt(numerator / (denominator * math.pi))  # noqa: E731
@@ -46,11 +49,11 @@ def sh_basis(directions: jax.Array, degree: int) -> jax.Array:
 
 
 def sh_to_rgb(sh: jax.Array, directions: jax.Array) -> jax.Array:
-    """Colors `[..., 3]` seen along unit `directions[..., 3]`: max(0, 1/2 + sum_k Y_k sh_k).
+    """Colors max(0, 1/2 + sum_k Y_k sh_k) `[..., 3]` along viewing directions.
 
     Args:
       sh: `[..., (L + 1)^2, 3]` coefficients.
-      directions: from the camera to the splat, world frame.
+      directions: `[..., 3]` unit vectors from the camera to the splat, world frame.
     """
     degree = math.isqrt(sh.shape[-2]) - 1
     chex.assert_axis_dimension(sh, -2, (degree + 1) ** 2)
@@ -59,5 +62,5 @@ def sh_to_rgb(sh: jax.Array, directions: jax.Array) -> jax.Array:
 
 
 def rgb_to_sh(rgb: jax.Array) -> jax.Array:
-    """Constant coefficients `[..., 3]` that show `rgb[..., 3]` in all directions."""
+    """Constant coefficients `[..., 3]` that give the color `rgb[..., 3]` in all directions."""
     return (rgb - 0.5) / _CONSTANT

@@ -1,6 +1,6 @@
-"""Surfels: oriented discs with a Gaussian profile, the unknowns of 2-D Gaussian splatting.
+"""Surfels: oriented discs with a Gaussian profile, the parameters of 2-D Gaussian splatting.
 
-Parameters are stored before their activations, as logarithms and logits: all numbers are valid.
+Parameters are stored before their activations, as logarithms and logits, so any number is valid.
 """
 
 import math
@@ -23,9 +23,9 @@ class Surfels:
     Attributes:
       means: `[N, 3]` centers.
       log_scales: `[N, 2]` logarithms of the standard deviations along the two tangents.
-      quaternions: `[N, 4]` (w, x, y, z), of any length; the rotation's columns are the two tangents
-        and the normal.
-      opacity_logits: `[N]`.
+      quaternions: `[N, 4]` (w, x, y, z), any length; the rotation's columns are the two tangents
+        and the normal, in the world frame.
+      opacity_logits: `[N]` logits of the opacity.
       sh: `[N, (L + 1)^2, 3]` spherical harmonics of the color.
     """
 
@@ -45,18 +45,19 @@ def surfels_from_points(
     sh_degree: int,
     opacity: float = 0.1,
 ) -> tuple[Surfels, jax.Array]:
-    """Surfels at points, as large as the gaps between them, turned at random; `key` is consumed.
+    """Randomly oriented surfels at points, as large as the gaps between them.
 
     Args:
-      key: for the rotations, and for choosing points where there are more than `capacity`.
-      points: `[P, 3]` world points; those that are not finite are dropped.
+      key: random key for the rotations, and for the choice of points where `P` exceeds `capacity`;
+        consumed.
+      points: `[P, 3]` world points; points that are not finite are dropped.
       rgb: `[P, 3]` colors in [0, 1].
-      capacity: `N`; rows without a point are dead.
-      sh_degree: degree `L` of the color's harmonics, 0 to 3; all but the constant start at 0.
+      capacity: number `N` of rows; rows without a point are dead.
+      sh_degree: degree `L` of the color's harmonics, 0 to 3; view-dependent ones start at 0.
       opacity: initial opacity.
 
     Returns:
-      The surfels and `alive [N]`, False where there is none.
+      The surfels, and `alive [N]` bool, True where a row has a point.
     """
     chex.assert_shape([points, rgb], (None, 3))
     chex.assert_equal_shape([points, rgb])
@@ -84,17 +85,17 @@ def surfels_from_points(
 def random_points(
     key: jax.Array, cameras: Camera, *, near: float, far: float, count: int
 ) -> jax.Array:
-    """Random points `[count, 3]` that many cameras see, for captures without any.
+    """Random world points `[count, 3]` that many cameras see, for captures without points.
 
-    Eight times as many are drawn along random pixels of random cameras, uniformly in inverse depth,
-    and those that most cameras have in their images are kept. `key` is consumed.
+    Eight times as many points are drawn, along random pixels of random cameras and uniformly in
+    inverse depth. The points that lie in the images of the most cameras are kept.
 
     Args:
-      key: random key.
+      key: random key; consumed.
       cameras: stacked `[V]`.
-      near: least z-depth, world units.
-      far: largest z-depth.
-      count: how many.
+      near: smallest z-depth in world units.
+      far: largest z-depth in world units.
+      count: number of points.
     """
     key_view, key_pixel, key_depth = jax.random.split(key, 3)
     view = jax.random.randint(key_view, (8 * count,), 0, cameras.intrinsics.shape[0])
@@ -118,10 +119,16 @@ def _pad_rows(array: jax.Array, rows: int) -> jax.Array:
 
 
 def neighbor_distance(points: jax.Array, valid: jax.Array, *, rows: int = 256) -> jax.Array:
-    """Root mean square distance `[P]` to the three nearest other valid points of `points[P, 3]`.
+    """Root mean square distance `[P]` from each point to its three nearest valid neighbors.
 
-    Exact, by comparing all pairs: a few seconds for 100k points. At least sqrt(1e-7), so that
-    duplicates keep a size; points with fewer than three neighbors take those they have.
+    The search is exact and compares all pairs, which takes a few seconds for 100k points. The
+    result is at least sqrt(1e-7), so that duplicates keep a size. A point with fewer than three
+    neighbors uses the neighbors it has.
+
+    Args:
+      points: `[P, 3]` points.
+      valid: `[P]` bool; other points are nobody's neighbor.
+      rows: number of points compared at once; static.
     """
     count = points.shape[0]
     padded = jnp.pad(points, ((0, -count % rows), (0, 0)))

@@ -1,6 +1,7 @@
-"""Which splats touch which tile, nearest first: a fixed number of sorted (tile, splat) pairs.
+"""Lists of the splats that touch each tile, nearest first, as sorted (tile, splat) pairs.
 
-Tiles are squares of pixels in row-major order. Shapes are static; what does not fit is counted.
+Tiles are squares of pixels in row-major order. The number of pairs is static; pairs that do not fit
+are left out and counted.
 """
 
 import chex
@@ -15,15 +16,17 @@ LARGEST = 2**31 - 1
 
 @struct.dataclass
 class TileLists:
-    """The lists of all tiles, tiles of similar length side by side in blocks of `B`.
+    """The lists of all `T` tiles, in blocks of `B` tiles whose lists have similar lengths.
 
     Attributes:
       splats: `[capacity]` indices of splats, tile after tile, each tile's nearest first.
-      starts, counts: `[blocks, B]` a tile's part of `splats`; 0 for tiles that only fill a block.
+      starts: `[blocks, B]` index into `splats` at which a tile's list starts.
+      counts: `[blocks, B]` length of a tile's list; 0 for tiles that only fill the last block.
       origins: `[blocks, B, 2]` x and y of a tile's first pixel.
-      tile: `[blocks, B]` which tile of the image it is.
-      slot: `[T]` where tile t is found in the flattened blocks.
-      overflow: `[]` pairs that did not fit, those of the farthest splats; `LARGEST` if countless.
+      tile: `[blocks, B]` row-major index of the tile in the image.
+      slot: `[T]` place of each tile in the flattened blocks.
+      overflow: `[]` int32 number of pairs that did not fit, which are those of the farthest splats;
+        `LARGEST` where the number of pairs may exceed int32.
     """
 
     splats: jax.Array
@@ -48,10 +51,14 @@ def tile_lists(
     """Sort (tile, splat) pairs by tile, then by `order[N]`, then by index.
 
     Args:
-      box: `[N, 4]` bounds (x0, y0, x1, y1) in pixels of what each splat touches; a splat is listed
-        in the tiles that hold a pixel *center* within, and nowhere if x1 < x0 or y1 < y0.
-      order: `[N]` depth of each splat.
-      height, width, tile, block, capacity: static sizes.
+      box: `[N, 4]` bounds (x0, y0, x1, y1) in pixels of each splat. A tile lists the splats whose
+        box holds one of its pixel *centers*; a box with x1 < x0 or y1 < y0 is empty.
+      order: `[N]` depth of each splat, not negative.
+      height: image height in pixels; static.
+      width: image width in pixels; static.
+      tile: side of a tile in pixels; static.
+      block: number of tiles in a block; static.
+      capacity: largest number of pairs; static.
     """
     chex.assert_shape(box, (order.shape[0], 4))
     count = order.shape[0]
@@ -60,7 +67,7 @@ def tile_lists(
     extent = jnp.maximum(last - first + 1, 0)
     pairs = extent[:, 0] * extent[:, 1]
 
-    # Pairs are laid out by depth rank, so whatever overflows is what lies farthest away.
+    # Pairs are laid out by depth rank, so those of the farthest splats overflow.
     by_depth = _nearest_first(order)
     pairs, first, columns = pairs[by_depth], first[by_depth], jnp.maximum(extent[by_depth, 0], 1)
     ends = jnp.cumsum(pairs)
@@ -77,7 +84,7 @@ def tile_lists(
     starts = jnp.searchsorted(tile_of, jnp.arange(across * down + 1, dtype=jnp.int32))
     starts = starts.astype(jnp.int32)
     counts = starts[1:] - starts[:-1]
-    # Blocks run in lockstep: with tiles of equal length side by side little of that is idle.
+    # A block runs as long as its longest list, so lists of similar length share a block.
     padding = -(across * down) % block
     longest_first = jnp.argsort(-counts, stable=True).astype(jnp.int32)
     slot = jnp.argsort(longest_first).astype(jnp.int32)
@@ -95,8 +102,8 @@ def tile_lists(
 
 
 def _tile_range(box: jax.Array, size: jax.Array, tile: int) -> tuple[jax.Array, jax.Array]:
-    """First and last tile `[N, 2]` (x, y) with pixel centers in the box; last < first: none."""
-    # Clip before the cast: a box may reach to the horizon, and integers do not.
+    """First and last tile `[N, 2]` (x, y) with pixel centers in the box; last < first if none."""
+    # Clip before the cast: a box may reach to infinity, which int32 cannot hold.
     edge = (size - 1).astype(box.dtype)[None]
     first = jnp.clip(jnp.ceil(box[:, :2] - 0.5), 0, edge + 1).astype(jnp.int32)
     last = jnp.clip(jnp.floor(box[:, 2:] - 0.5), -1, edge).astype(jnp.int32)
@@ -105,10 +112,10 @@ def _tile_range(box: jax.Array, size: jax.Array, tile: int) -> tuple[jax.Array, 
 
 
 def _nearest_first(order: jax.Array) -> jax.Array:
-    """Indices `[N]` that sort `order`, not negative, ties by index.
+    """Indices `[N]` that sort a non-negative `order[N]`, ties by index.
 
-    XLA's CPU sorts lone integers several times faster than pairs: float32 is sorted digit by digit,
-    the last first, each as wide as leaves room for the position beside it in one integer.
+    XLA's CPU backend sorts single integers several times faster than pairs. So float32 is sorted
+    digit by digit, the last digit first; a digit and a position share one integer.
     """
     count = order.shape[0]
     place = jnp.arange(count, dtype=jnp.uint32)
@@ -118,13 +125,13 @@ def _nearest_first(order: jax.Array) -> jax.Array:
     keys = lax.bitcast_convert_type(order, jnp.uint32)
     by_key = place
     for shift in range(0, 32, 32 - width):
-        digit = (keys[by_key] >> shift) << width  # what lies above the digit is shifted out
+        digit = (keys[by_key] >> shift) << width  # the shift drops higher digits
         by_key = by_key[lax.sort(digit | place) & (2**width - 1)]
     return by_key.astype(jnp.int32)
 
 
 def _sort_pairs(tile, rank, tiles: int, ranks: int):
-    """Sort pairs by (tile, rank). One packed key sorts several times faster than two."""
+    """Sort pairs by (tile, rank); one packed key sorts several times faster than two."""
     bits = max(ranks - 1, 1).bit_length()
     if tiles <= 2 ** (32 - bits):
         key = lax.sort((tile.astype(jnp.uint32) << bits) | rank.astype(jnp.uint32))

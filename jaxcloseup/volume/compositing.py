@@ -1,4 +1,4 @@
-"""Volume rendering: what a ray sees of the densities and colors sampled along it."""
+"""Volume rendering: a ray's color, alpha and depth from the samples along it."""
 
 from typing import NamedTuple
 
@@ -9,21 +9,21 @@ import jax.numpy as jnp
 from jaxcloseup.numerics import safe_divide
 
 
-_INFINITE = 1e10  # length of the last interval: whatever lies beyond the last sample
-_EMPTY = 1e-10  # alpha up to which nothing is seen: depth and its gradient would overflow
+_INFINITE = 1e10  # length of the last interval, which stands for the rest of the ray
+_EMPTY = 1e-10  # a ray of less alpha is empty: its depth and gradient would overflow
 
 
 class Composite(NamedTuple):
-    """What rays `[...]` see.
+    """The samples of rays `[...]`, composited.
 
     Attributes:
-      weights: `[..., S]` the share of each sample, `w_i = T_i (1 - exp(-sigma_i delta_i))`.
-      rgb: `[..., 3]` weighted colors, nothing added behind them.
-      alpha: `[...]` sum of the weights.
-      depth: `[...]` weighted mean z-depth; 0 where alpha is 0 (below 1e-10).
-      expected_depth: `[...]` weighted sum of z-depths, which is depth times alpha.
-      median_depth: `[...]` z-depth of the sample at which the transmittance falls below one half;
-        0 where it never does.
+      weights: `[..., S]` share of each sample, `w_i = T_i (1 - exp(-sigma_i delta_i))`.
+      rgb: `[..., 3]` weighted sum of colors, without a background.
+      alpha: `[...]` sum of weights.
+      depth: `[...]` weighted mean z-depth; 0 where alpha is below 1e-10.
+      expected_depth: `[...]` weighted sum of z-depths, equal to depth times alpha.
+      median_depth: `[...]` z-depth of the sample at which transmittance falls below one half; 0
+        where it never does.
     """
 
     weights: jax.Array
@@ -42,9 +42,9 @@ def composite(
     Args:
       rgb: `[..., S, 3]` colors of the samples.
       density: `[..., S]` non-negative, per world unit.
-      depth: `[..., S]` ascending z-depths; each sample stands for the interval up to the next, the
-        last one for all the rest of its ray.
-      ray_length: `[...]` length of the ray's direction: world units for each unit of depth.
+      depth: `[..., S]` ascending z-depths; each sample stands for the interval up to the next, and
+        the last sample for the rest of its ray.
+      ray_length: `[...]` length of the ray's direction, in world units per unit of z-depth.
     """
     chex.assert_equal_shape([density, depth])
     chex.assert_shape(rgb, (*density.shape, 3))
@@ -52,7 +52,7 @@ def composite(
     delta = jnp.diff(depth, axis=-1) * ray_length[..., None]
     optical = density[..., :-1] * delta
     last = density[..., -1:] * _INFINITE * ray_length[..., None]
-    # Optical depth in front of each sample: a sum, so nothing is lost where transmittance is tiny.
+    # Optical depth in front of each sample. A sum stays precise where transmittance is tiny.
     before = jnp.concatenate([jnp.zeros_like(last), jnp.cumsum(optical, axis=-1)], axis=-1)
     transmittance = jnp.exp(-before)
     weights = transmittance * -jnp.expm1(-jnp.concatenate([optical, last], axis=-1))

@@ -1,4 +1,4 @@
-"""Positional encoding. Arrays here are features first, `[features, samples]`, for the network."""
+"""Positional encoding. Arrays are features first, `[features, samples]`, as the networks want."""
 
 import chex
 import jax
@@ -13,16 +13,16 @@ def positional_encoding(x: jax.Array, num_octaves: int) -> jax.Array:
 
     Args:
       x: `[C, M]` coordinates, roughly within [-1, 1].
-      num_octaves: how many k; 0 returns `x`.
+      num_octaves: number of octaves k; 0 returns `x`.
 
     Returns:
-      `[C * (1 + 2 num_octaves), M]`: x; sin x, cos x; sin 2x, cos 2x; ... of all coordinates each.
+      `[C * (1 + 2 num_octaves), M]`: x; sin x; cos x; sin 2x; cos 2x; ..., each for C coordinates.
     """
     chex.assert_rank(x, 2)
     if num_octaves == 0:
         return x
-    # Phases are in turns, where doubling is exact and so is dropping whole turns: what error is
-    # left is the rounding of x. One product makes them all, and the input comes along.
+    # Phases are in turns: doubling them and dropping whole turns are exact, so the only error left
+    # is the rounding of x. One product makes all phases and passes the input through.
     octaves = np.repeat(2.0 ** np.arange(num_octaves), 2)
     factors = np.concatenate([[2 * np.pi], octaves])
     lags = np.concatenate([[0.0], np.tile([0.25, 0.0], num_octaves)])  # sine lags a quarter turn
@@ -35,8 +35,8 @@ def positional_encoding(x: jax.Array, num_octaves: int) -> jax.Array:
 
 
 def _cos_of_turns(turns: jax.Array) -> jax.Array:
-    """cos(2 pi turns) to 1e-7. On a CPU, where `jnp.cos` is not vectorized, 20 times its speed."""
-    # As the sine of an angle in [-pi/2, pi/2], by its series up to the 11th power.
+    """cos(2 pi turns) to 1e-7, on a CPU 20 times as fast as `jnp.cos`, which is not vectorized."""
+    # The sine of an angle in [-pi/2, pi/2], by its series up to the 11th power.
     angle = 2 * np.pi * (0.25 - jnp.abs(turns - jnp.round(turns)))
     square = angle * angle
     series = jnp.ones_like(angle)

@@ -1,7 +1,7 @@
 """The network of a NeRF, features first: activations are `[features, samples]`.
 
-Samples are the long axis of every product and, being last, contiguous: that is what a CPU wants in
-the backward pass. A layer may have several inputs: one matrix for each, nothing is concatenated.
+Samples are the long axis of every product and, being last, contiguous, which makes the backward
+pass fast on a CPU. A layer with several inputs has one matrix per input, so nothing is concatenated.
 """
 
 import functools
@@ -18,7 +18,7 @@ Params = Any
 
 
 class Raw(NamedTuple):
-    """What the network says of M samples, before activation: density `[M]` and rgb `[3, M]`."""
+    """The network's output for M samples, before activation: density `[M]` and rgb `[3, M]`."""
 
     density: jax.Array
     rgb: jax.Array
@@ -38,11 +38,11 @@ def init_network(
 
     Args:
       key: random key.
-      depth: layers of the trunk.
-      width: their width.
-      skip_after: positions enter again after the trunk's layer of this index.
-      position_features: features of an encoded position.
-      direction_features: features of an encoded direction.
+      depth: number of layers of the trunk.
+      width: width of the trunk's layers.
+      skip_after: index of the trunk's layer after which positions enter again.
+      position_features: number of features of an encoded position.
+      direction_features: number of features of an encoded direction.
       direction_width: width of the layer that sees directions.
     """
     fan_ins = [(position_features,)] + [(width,)] * (depth - 1)
@@ -62,17 +62,17 @@ def apply_network(network: Params, positions: jax.Array, directions: jax.Array) 
     """Evaluate the network on R rays of S samples each, all in one flat batch.
 
     Args:
-      network: from `init_network`.
-      positions: `[I, R * S]` encoded, the samples of a ray side by side.
-      directions: `[J, R]` encoded, of the same dtype, which products are computed in.
+      network: parameters from `init_network`.
+      positions: `[I, R * S]` encoded positions, with the samples of a ray side by side.
+      directions: `[J, R]` encoded directions of the same dtype, in which products are computed.
     """
     h = positions
     for layer in network["trunk"]:
         inputs = (h, positions)[: len(layer["weights"])]
         h = dense(layer["weights"], layer["bias"][:, None], inputs, True)
     density, feature, view, rgb = (network[k] for k in ("density", "feature", "view", "rgb"))
-    # The feature layer is linear and feeds a linear one: their product is one smaller layer.
-    # What the direction adds is the same for all samples of a ray: a bias.
+    # The feature layer is linear and feeds a linear layer: their product is one smaller layer.
+    # The direction adds the same to all samples of a ray, so it becomes a bias.
     from_feature, from_direction = view["weights"]
     from_h = from_feature @ feature["weights"][0]
     bias = (view["bias"] + from_feature @ feature["bias"])[:, None]
@@ -90,15 +90,15 @@ def dense(
 ) -> jax.Array:
     """`sum_i W_i x_i + b`, or its positive part.
 
-    Products are in the dtype of the inputs, sums in that of the weights. Plain differentiation
-    would multiply float32 cotangents with bfloat16 operands, keep values from before the activation
-    and contract leading axes, all of which cost time.
+    Products use the dtype of the inputs, sums that of the weights. Plain differentiation would
+    multiply float32 cotangents with bfloat16 operands, keep values from before the activation and
+    contract leading axes, all of which costs time.
 
     Args:
-      weights: `[O, I_i]` for each input.
-      bias: `[O, G]`, a column for each of G groups of consecutive samples, equal in size.
+      weights: `[O, I_i]` per input.
+      bias: `[O, G]`, a column per group; G groups of consecutive samples have equal sizes.
       inputs: `[I_i, M]`, all of one dtype.
-      relu: whether negative values become 0. Such a result has the dtype of the inputs.
+      relu: whether negative values become 0; the result then has the dtype of the inputs.
 
     Returns:
       `[O, M]`.
@@ -124,7 +124,7 @@ def _dense_backward(relu, residuals, cotangent):
     d_weights, d_inputs = [], []
     for w, x in zip(weights, inputs, strict=True):
         d_weights.append(_dot(cotangent, x, w.dtype, ((1,), (1,))))
-        # A real copy: a CPU's product is slow if it has to contract the leading axis of W.
+        # A real copy, because a CPU's product is slow when it contracts the leading axis of W.
         transposed = with_layout_constraint(w.astype(dtype).T, Layout((0, 1)))
         d_inputs.append(_dot(transposed, cotangent, w.dtype).astype(dtype))
     d_bias = jnp.sum(cotangent.reshape(*bias.shape, -1), axis=-1, dtype=bias.dtype)
@@ -135,7 +135,7 @@ dense.defvjp(_dense_forward, _dense_backward)
 
 
 def _dot(a, b, dtype, contracting=((1,), (0,))):
-    # Never of a transposed array: a CPU's bfloat16 product of one is three times slower.
+    # Do not pass a transposed array: its bfloat16 product is three times slower on a CPU.
     return jax.lax.dot_general(a, b, (contracting, ((), ())), preferred_element_type=dtype)
 
 

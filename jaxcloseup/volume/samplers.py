@@ -1,6 +1,6 @@
-"""Where along its ray a field is evaluated.
+"""Sample positions along rays.
 
-Samples are z-depths: ray directions have unit camera-z. No gradient flows through a sample.
+Samples are z-depths, because ray directions have unit camera-z. No gradient flows through them.
 """
 
 import chex
@@ -15,10 +15,10 @@ def stratified(
 
     Args:
       key: consumed; None takes the centers of the bins.
-      near: where the first bin begins.
-      far: where the last bin ends.
-      num_samples: bins for each ray.
-      shape: shape of the rays.
+      near: z-depth at which the first bin begins.
+      far: z-depth at which the last bin ends.
+      num_samples: number of bins per ray.
+      shape: batch shape of the rays.
 
     Returns:
       `[*shape, num_samples]` ascending samples.
@@ -34,13 +34,13 @@ def importance(
 ) -> jax.Array:
     """Samples distributed like a histogram, by inverting its piecewise linear CDF (NeRF, 5.2).
 
-    Every weight is raised by 1e-5 first, so that empty rays are sampled evenly.
+    Each weight is first raised by 1e-5, so that empty rays are sampled evenly.
 
     Args:
       key: consumed; None takes `num_samples` evenly spaced quantiles from 0 to 1 inclusive.
       edges: `[..., B + 1]` ascending edges of the bins.
-      weights: `[..., B]` non-negative, of any sum.
-      num_samples: samples for each ray.
+      weights: `[..., B]` non-negative; they need not sum to 1.
+      num_samples: number of samples per ray.
 
     Returns:
       `[..., num_samples]` samples, not sorted unless `key` is None.
@@ -56,7 +56,7 @@ def importance(
         quantiles = jnp.broadcast_to(jnp.linspace(0, 1, num_samples), shape)
     else:
         quantiles = jax.random.uniform(key, shape)
-    # The inverse is a sum of clipped ramps, one for each bin: no search and no gather.
+    # The inverse is a sum of clipped ramps, one per bin, without search or gather.
     inside = jnp.clip((quantiles[..., None] - cdf[..., None, :]) / pdf[..., None, :], 0, 1)
     widths = jnp.diff(edges, axis=-1)
     return edges[..., :1] + jnp.sum(inside * widths[..., None, :], axis=-1)

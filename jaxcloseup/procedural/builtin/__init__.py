@@ -1,4 +1,4 @@
-"""The five built-in scenes, in meters with z up, each photographed mainly from -y."""
+"""The five built-in scenes, in meters with z up, photographed mainly from -y."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""A park bench with things left on it, before a brick wall and hedges, in the sun."""
+"""A park bench with belongings on it, in front of a brick wall and hedges, in the sun."""
 
 import numpy as np
 
@@ -45,7 +45,7 @@ BALL = Finish("carpet", 0.4, "grit", 0.15, gloss=0.15)
 
 
 def bench() -> Model:
-    """The model and its photographer."""
+    """Build the model of the scene and its camera rig."""
     solids = [
         *_garden(),
         *_bench(),
@@ -119,7 +119,7 @@ def _bench() -> list[Solid]:
 
 
 def _left_behind() -> list[Solid]:
-    """A newspaper, a coffee, a bag, three apples and a ball."""
+    """A newspaper, a cup of coffee, a bag, three apples and a ball."""
     seat = 0.438
     bag = turn(x=-8, z=-10)
     red, green = (0.75, 0.12, 0.1), (0.55, 0.7, 0.2)
@@ -163,7 +163,7 @@ def _lamp_post(x: float, y: float) -> list[Solid]:
 
 
 def _pigeon(base: tuple, facing: float) -> list[Solid]:
-    """A pigeon that looks along -y turned by `facing` degrees."""
+    """A pigeon that faces -y, rotated by `facing` degrees about z."""
     rotation = turn(z=facing)
     gray, dark = peel(0.50, 0.53, 0.60), peel(0.26, 0.28, 0.34)
     neck, pink = peel(0.28, 0.46, 0.42), peel(0.80, 0.42, 0.36)

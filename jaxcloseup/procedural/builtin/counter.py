@@ -41,11 +41,11 @@ from jaxcloseup.procedural.modeling import (
 TILES = Finish("tiles", 0.6, gloss=0.2)
 GRANITE = Finish("granite", 0.35, "grit", 0.3, gloss=0.3)
 RED_ENAMEL = tinted(STEEL, 1.1, 0.35, 0.3)
-TOP = 0.9  # height of the worktop
+TOP = 0.9  # height of the worktop in meters
 
 
 def counter() -> Model:
-    """The model and its photographer."""
+    """Build the model of the scene and its camera rig."""
     solids = [
         *interior((-2.2, -3.6, 0), (2.2, 0.0, 2.6), FLOOR_TILES, PLASTER, back=TILES),
         *_cupboards(),

@@ -1,4 +1,4 @@
-"""Finishes and small things that several scenes share."""
+"""Finishes and small objects that several scenes share."""
 
 import numpy as np
 
@@ -29,7 +29,7 @@ PAGES = (0.95, 0.92, 0.84)
 
 
 def tinted(finish: Finish, *tint: float) -> Finish:
-    """The same finish in another color."""
+    """The same finish with another tint."""
     return finish._replace(tint=tint)
 
 
@@ -39,19 +39,19 @@ def peel(*tint: float) -> Finish:
 
 
 def print_of(name: str, part: tuple[int, int, int, int] = (0, 0, 1, 1), **options) -> Finish:
-    """A printed sheet: cell (column, row) of a sheet cut in (columns, rows)."""
+    """A printed sheet; `part` = (column, row, columns, rows) selects one cell of its grid."""
     column, row, columns, rows = part
     region = column / columns, row / rows, (column + 1) / columns, (row + 1) / rows
     return Finish(name, None, "paper", 0.1, region=region, **options)
 
 
 def label(index: int) -> Finish:
-    """A label: 0 tomatoes, 1 peas, 2 wine, 3 honey."""
+    """A label: 0 is tomatoes, 1 peas, 2 wine, 3 honey."""
     return print_of("labels", (index % 2, index // 2, 2, 2), gloss=0.08)
 
 
 def spine(index: int) -> Finish:
-    """The back of one of eight books."""
+    """The spine of one of eight books."""
     return print_of("spines", (index % 8, 0, 8, 1))
 
 
@@ -91,7 +91,7 @@ def framed(
 
 
 def book(center: tuple, size: tuple, index: int, angle: float) -> list[Solid]:
-    """A book lying flat, its titled back towards -y turned by `angle` degrees."""
+    """A book lying flat; its spine faces -y, rotated by `angle` degrees about z."""
     rotation, cover = turn(z=angle), tinted(PAPER, *COVERS[index % len(COVERS)])
     (width, depth, height), title = size, {2: spine(2 * index + 1)}
     back, lying = center + rotation @ [0, -depth / 2 - 0.002, 0], rotation @ turn(y=-90)
@@ -102,13 +102,13 @@ def book(center: tuple, size: tuple, index: int, angle: float) -> list[Solid]:
 
 
 def standing_book(corner: tuple, size: tuple, index: int) -> Solid:
-    """A book upright on a shelf, its back towards -y; `corner` is its low left front corner."""
+    """A book upright on a shelf, spine towards -y; `corner` is its lower left front corner."""
     sides = {k: tinted(PAPER, 0.4, 0.36, 0.34) for k in (0, 1)}
     return block(corner, np.add(corner, size), PAPER, faces={2: spine(index), **sides})
 
 
 def pot_plant(base: tuple, size: float, leaves: int) -> list[Solid]:
-    """Flat leaves rising in a spiral from a flower pot `size` meters wide."""
+    """Flat leaves that rise in a spiral from a flower pot `size` meters wide."""
     x, y, z = base
     solids = [cylinder(base, 0.88 * size, 0.7 * size, size, TERRACOTTA, texel=0.02)]
     for i in range(leaves):

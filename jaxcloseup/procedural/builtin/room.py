@@ -1,4 +1,4 @@
-"""A furnished room: sofa, rug, low table with a newspaper, bookcase, lamp, plant and pictures."""
+"""A living room: sofa, rug, low table with a newspaper, bookcase, lamp, plant and pictures."""
 
 import itertools
 
@@ -49,7 +49,7 @@ COFFEE = tinted(MUG, 0.16, 0.09, 0.05)
 
 
 def room() -> Model:
-    """The model and its photographer."""
+    """Build the model of the scene and its camera rig."""
     solids = [
         *interior((-2.4, -3.6, 0), (2.4, 1.0, 2.6), PLANKS, PLASTER),
         block((-2.4, 0.98, 0.0), (2.4, 1.0, 0.11), WHITE, texel=0.1),

@@ -40,7 +40,7 @@ RISE, RUN, STEPS = 0.185, 0.27, 10
 
 
 def stairs() -> Model:
-    """The model and its photographer."""
+    """Build the model of the scene and its camera rig."""
     solids = [
         *interior((-2.3, -3.2, 0), (0.62, 2.9, 3.4), FLOOR_TILES, PLASTER, right=WALLPAPER),
         block((0.602, -3.2, 0), (0.62, 0.0, 0.12), WHITE, texel=0.1),
@@ -102,7 +102,7 @@ def _handrail() -> list[Solid]:
 
 
 def _boot(base: tuple, facing: float) -> list[Solid]:
-    """A rubber boot that points along -y turned by `facing` degrees."""
+    """A rubber boot that points to -y, rotated by `facing` degrees about z."""
     rotation = turn(z=facing)
 
     def at(*p: float) -> np.ndarray:

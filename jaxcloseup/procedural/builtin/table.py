@@ -41,12 +41,12 @@ GLASS = Finish("white", 0.4, tint=(0.50, 0.66, 0.72), gloss=0.4)
 BOTTLE = Finish("white", 0.4, tint=(0.10, 0.22, 0.14), gloss=0.45)
 VASE = Finish("white", 0.4, "scratches", 0.2, tint=(0.30, 0.44, 0.62), gloss=0.35)
 WICKER = Finish("fabric", 0.2, "weave", 0.1, tint=(0.62, 0.46, 0.28))
-TOP = 0.76  # height of the table
+TOP = 0.76  # height of the table top in meters
 RUNNER = TOP + 0.003
 
 
 def table() -> Model:
-    """The model and its photographer."""
+    """Build the model of the scene and its camera rig."""
     solids = [
         *interior((-2.4, -2.8, 0), (2.4, 2.2, 2.6), PLANKS, WALLPAPER),
         *_table(),
@@ -94,7 +94,7 @@ def _table() -> list[Solid]:
 
 
 def _chair(x: float, y: float, facing: float) -> list[Solid]:
-    """A slatted chair at (x, y) for someone who looks along +y turned by `facing` degrees."""
+    """A slatted chair at (x, y) that faces +y, rotated by `facing` degrees about z."""
     rotation = turn(z=facing)
 
     def at(*p: float) -> np.ndarray:
@@ -111,7 +111,7 @@ def _chair(x: float, y: float, facing: float) -> list[Solid]:
 
 
 def _setting(x: float, y: float, facing: float) -> list[Solid]:
-    """Plate, knife, spoon, a fork on a napkin, and a glass, for a guest who looks along +y."""
+    """Plate, knife, spoon, fork on a napkin and glass, for a guest who faces +y before rotation."""
     rotation = turn(z=facing)
 
     def at(px: float, py: float, pz: float = 0.0) -> np.ndarray:
@@ -202,7 +202,7 @@ def _salt_and_pepper(x: float, y: float) -> list[Solid]:
 
 
 def _menu(x: float, y: float) -> list[Solid]:
-    """A card folded to a tent."""
+    """A card folded into a tent."""
     card = print_of("menu")
     return [
         sheet(

@@ -11,7 +11,7 @@ from jaxcloseup.procedural.textures.prints import PRINTS
 
 
 def draw_texture(name: str) -> np.ndarray:
-    """A periodic texture `[1024, 1024, 3]` in [0, 1], the same at every call.
+    """Draw the periodic texture `name`, `[1024, 1024, 3]` in [0, 1]; the name seeds the drawing.
 
     Materials and prints are colored; details are gray with mean 0.5, and multiply a color.
     """
@@ -21,6 +21,6 @@ def draw_texture(name: str) -> np.ndarray:
         return np.repeat(np.clip(0.5 + value - value.mean(), 0, 1)[..., None], 3, axis=-1)
     if name in COLORS:
         return np.clip(COLORS[name](rng), 0, 1)
-    # A printed sheet has its own proportions; the face that carries it gives them back.
+    # A printed sheet has its own proportions, which the face that carries it restores.
     sheet = cv2.resize(PRINTS[name](rng), (SIZE, SIZE), interpolation=cv2.INTER_AREA)
     return sheet.astype(np.float32) / 255

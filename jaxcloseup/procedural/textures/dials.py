@@ -1,4 +1,4 @@
-"""Round things with letters, a plate and a clock: square sheets, uint8 and 1024 wide."""
+"""Draw a plate and a clock face on square sheets, uint8 `[1024, 1024, 3]`."""
 
 import cv2
 import numpy as np
@@ -16,7 +16,7 @@ from jaxcloseup.procedural.textures.lettering import (
 
 
 def plate(rng: np.random.Generator) -> np.ndarray:
-    """Glazed china seen from above: rim bands, a ring of leaves, a flower."""
+    """Draw a china plate from above: rim bands, a ring of leaves, a flower."""
     sheet = blank((240, 239, 234))
     for radius, width, color in (
         (505, 10, BLUE),
@@ -66,7 +66,7 @@ def plate(rng: np.random.Generator) -> np.ndarray:
 
 
 def clock(rng: np.random.Generator) -> np.ndarray:
-    """The face of a clock with its numerals, hands and small print."""
+    """Draw a clock face with numerals, hands and small print."""
     sheet = blank(CREAM)
     cv2.circle(sheet, (512, 512), 500, (60, 44, 32), 22, cv2.LINE_AA)
     for i in range(60):

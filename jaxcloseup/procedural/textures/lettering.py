@@ -1,4 +1,4 @@
-"""Drawing on paper: letters, running text, bars and landscapes, on uint8 images with OpenCV."""
+"""Draw letters, running text, bars and landscapes on uint8 images with OpenCV."""
 
 import cv2
 import numpy as np
@@ -13,15 +13,16 @@ INK, RED, BLUE, GREEN, GOLD, CREAM, WHITE = (
     (35, 32, 30), (176, 40, 34), (34, 66, 130), (42, 98, 58), (204, 152, 50), (244, 236, 216),
     (250, 249, 246),
 )  # fmt: skip
+# Printed on textures: any change, even of spelling, changes the pixels of the built-in scenes.
 TEXT = """
 the lamp stood near a window and its light fell over brick and oak while rain went on in the yard a
 kettle began to sing so we cut bread and set plates along the table nobody had measured how far the
 stairs were worn but every step kept the print of a shoe and the rail was smooth look closer said
 the painter and you will find grain inside the grain small letters under large ones and threads that
-cross where you only saw a color
+cross where you only saw a colour
 """
 
-# Tones of a landscape, from the sky and its sun to the nearest hill.
+# Colors of a landscape: sky, sun, then hills from the farthest to the nearest.
 DUSK, DAY, GRAY = (
     [(238, 206, 160), (214, 92, 52), (170, 140, 140), (110, 112, 124), (70, 84, 92), (40, 54, 58)],
     [(176, 208, 226), (248, 226, 140), (140, 172, 150), (98, 140, 96), (64, 104, 66), (40, 70, 48)],
@@ -58,17 +59,17 @@ def paragraph(
 
 
 def blank(color: tuple, aspect: float = 1.0) -> np.ndarray:
-    """An empty sheet, `aspect` times as tall as wide."""
+    """An empty sheet 1024 pixels wide and `aspect` times as tall."""
     return np.full((round(1024 * aspect), 1024, 3), color, np.uint8)
 
 
 def bar(image: np.ndarray, box: tuple, color: tuple) -> None:
-    """Fill `box` = (left, top, right, bottom)."""
+    """Fill `box` = (left, top, right, bottom) with a color."""
     cv2.rectangle(image, tuple(map(int, box[:2])), tuple(map(int, box[2:])), color, -1)
 
 
 def landscape(image: np.ndarray, box: tuple, tones: tuple, rng: np.random.Generator) -> None:
-    """Hills under a sun, layer before layer."""
+    """Draw hills under a sun into `box`, from the farthest layer to the nearest."""
     left, top, right, bottom = map(int, box)
     view = image[top:bottom, left:right]
     height, width = view.shape[:2]

@@ -1,7 +1,7 @@
-"""What things are made of: wood, brick, glaze, cloth, leaves; and the fine structure of surfaces.
+"""Draw materials such as wood, brick, glaze, cloth and leaves, and the fine detail of surfaces.
 
-Each function draws a periodic texture: `COLORS` make `[1024, 1024, 3]` in about [0, 1], `DETAILS`
-make deviations `[1024, 1024]` from an even gray.
+Each function draws a periodic texture: those in `COLORS` return colors `[1024, 1024, 3]` in about
+[0, 1]; those in `DETAILS` return deviations `[1024, 1024]` from uniform gray.
 """
 
 import cv2
@@ -63,7 +63,7 @@ def _brick(rng: np.random.Generator) -> np.ndarray:
     face = face * (1 + 0.10 * rough + 0.07 * noise(rng, octave=8))[..., None]
     pits = step(noise(rng, octave=90, slope=2), 1.7, 2.4)
     face = face * (1 - 0.45 * pits)
-    # Relief painted in: bricks catch light above and shade below.
+    # Painted relief: the upper edges of bricks are lit and the lower ones shaded.
     height = step(distance, 0.003, 0.0075)[..., 0]
     relief = (np.roll(height, -2, 0) - np.roll(height, 2, 0))[..., None]
     mortar = (
@@ -74,7 +74,7 @@ def _brick(rng: np.random.Generator) -> np.ndarray:
 
 
 def _tiles(rng: np.random.Generator) -> np.ndarray:
-    """Glazed 4 x 4 wall tiles, every other one with a painted flower."""
+    """Glazed 4 x 4 wall tiles; every second one has a painted flower."""
     u, v, column, row = grid(4, 4)
     base = np.float32([0.88, 0.90, 0.88]) * rng.uniform(0.95, 1.03, (4, 4, 1))[row, column]
     base = base * (1 + 0.012 * noise(rng, octave=10))[..., None]
@@ -258,7 +258,7 @@ def _bread(rng: np.random.Generator) -> np.ndarray:
 
 
 def _peel(rng: np.random.Generator) -> np.ndarray:
-    """Orange peel, white enough to be tinted."""
+    """Fruit peel, nearly white so that finishes can tint it."""
     pores = step(noise(rng, octave=60, slope=3), 1.2, 1.9)
     base = np.full((SIZE, SIZE, 3), 0.92, np.float32) * (1 + 0.05 * noise(rng, octave=4))[..., None]
     return base * (1 - 0.22 * pores)
@@ -272,7 +272,7 @@ def _sky(rng: np.random.Generator) -> np.ndarray:
     return base + 0.8 * clouds * (np.float32([0.96, 0.96, 0.97]) - base)
 
 
-# Fine structure: gray, mean 0.5.
+# Details: gray deviations.
 
 
 def _plain(rng: np.random.Generator) -> np.ndarray:
@@ -291,7 +291,7 @@ def _grit(rng: np.random.Generator) -> np.ndarray:
 
 
 def _pile(rng: np.random.Generator) -> np.ndarray:
-    """Tufts of a carpet, in rows."""
+    """Carpet tufts in rows."""
     u, v, column, row = grid(56, 56, bond=0.5)
     tone = rng.uniform(-0.10, 0.10, (56, 56))[row, column]
     tuft = 0.9 * np.exp(-3.2 * ((u - 0.5) ** 2 + (v - 0.45) ** 2) * 2) - 0.6
@@ -299,7 +299,7 @@ def _pile(rng: np.random.Generator) -> np.ndarray:
 
 
 def _weave(rng: np.random.Generator) -> np.ndarray:
-    """Threads over and under."""
+    """Threads that cross over and under each other."""
     u, v, column, row = grid(64, 64)
     over = (column + row) % 2 == 0
     along, across = np.where(over, u, v), np.where(over, v, u)

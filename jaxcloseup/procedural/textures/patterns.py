@@ -1,4 +1,4 @@
-"""Periodic patterns on the unit square, which textures are made of: noise, cells, scattered things.
+"""Periodic patterns on the unit square for textures: noise, cells, scattered shapes.
 
 `SIZE` is the side of every texture in texels; x runs along the second axis, y along the first.
 """
@@ -15,10 +15,13 @@ SIZE = 1024
 def noise(
     rng: np.random.Generator, *, octave: float = 4, slope: float = 1.5, stretch: float = 1.0
 ) -> np.ndarray:
-    """Periodic fractal noise `[S, S]` of mean 0 and variance 1.
+    """Draw periodic fractal noise `[S, S]` with mean 0 and variance 1.
 
-    Power is flat up to `octave` waves a side and falls with exponent `slope` in amplitude beyond;
-    `stretch` > 1 makes streaks along x.
+    Args:
+      rng: random generator.
+      octave: number of waves per side up to which the power spectrum is flat.
+      slope: exponent of the fall-off of the amplitude beyond.
+      stretch: values above 1 make streaks along x.
     """
     waves = np.fft.fftfreq(SIZE, 1 / SIZE).astype(np.float32)
     squared = (stretch * waves[None, : SIZE // 2 + 1]) ** 2 + waves[:, None] ** 2
@@ -30,7 +33,7 @@ def noise(
 
 
 def ramp(value: np.ndarray, *colors: tuple[float, float, float]) -> np.ndarray:
-    """Colors `[..., 3]` along a polyline through `colors` as `value` goes from 0 to 1."""
+    """Interpolate colors `[..., 3]` along a polyline through `colors`, for `value` from 0 to 1."""
     stops, fine = np.linspace(0, 1, len(colors)), np.linspace(0, 1, 1024)
     table = np.stack([np.interp(fine, stops, c) for c in np.array(colors).T], -1)
     index = (np.clip(value, 0, 1) * 1023).astype(np.int32)
@@ -44,7 +47,7 @@ def axes() -> tuple[np.ndarray, np.ndarray]:
 
 
 def grid(columns: int, rows: int, *, bond: float = 0.0) -> tuple[np.ndarray, ...]:
-    """Cells of a periodic wall: position inside `[0, 1]^2`, and column and row numbers."""
+    """Cells of a periodic wall: position in the cell in [0, 1]^2, column and row, each `[S, S]`."""
     x, y = axes()
     row = np.floor(y * rows)
     shifted = (x + 0 * y) * columns + bond * row
@@ -53,12 +56,12 @@ def grid(columns: int, rows: int, *, bond: float = 0.0) -> tuple[np.ndarray, ...
 
 
 def edge_distance(u: np.ndarray, v: np.ndarray, columns: int, rows: int) -> np.ndarray:
-    """Distance to the cell's border, in texture sides."""
+    """Distance to the cell's border, in units of the texture's side."""
     return np.minimum(np.minimum(u, 1 - u) / columns, np.minimum(v, 1 - v) / rows)
 
 
 def step(value: np.ndarray, low: float, high: float) -> np.ndarray:
-    """A smooth step `[..., 1]` from 0 below `low` to 1 above `high`."""
+    """Smooth step `[..., 1]` from 0 below `low` to 1 above `high`."""
     t = np.clip((value - low) / (high - low), 0, 1)
     return (t * t * (3 - 2 * t))[..., None]
 
@@ -66,7 +69,7 @@ def step(value: np.ndarray, low: float, high: float) -> np.ndarray:
 def scatter(
     rng: np.random.Generator, base: np.ndarray, count: int, draw: Callable[..., None]
 ) -> np.ndarray:
-    """Draw `count` small things at random places, repeated across the borders."""
+    """Draw `count` small shapes at random positions, wrapped around the borders."""
     image = np.ascontiguousarray(base, np.float32)
     for at in rng.uniform(0, SIZE, (count, 2)):
         state = rng.integers(2**32)

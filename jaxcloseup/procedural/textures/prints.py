@@ -1,6 +1,6 @@
-"""Printed matter: textures with letters, from headlines down to small print of a few texels.
+"""Draw printed sheets with letters, from headlines to small print of a few texels.
 
-Each function draws a sheet, uint8 and 1024 wide, in its own proportions.
+Each function draws a uint8 sheet, 1024 pixels wide, with its own aspect ratio.
 """
 
 from collections.abc import Callable
@@ -160,7 +160,7 @@ def _labels(rng: np.random.Generator) -> np.ndarray:
 
 
 def _spines(rng: np.random.Generator) -> np.ndarray:
-    """Eight book spines side by side, each titled along its length."""
+    """Eight book spines side by side, with titles along their length."""
     titles = (
         "A HISTORY OF LENSES", "THE LONG STAIRCASE", "Bread and Salt", "ATLAS OF SMALL THINGS",
         "Letters from a Garden", "GEOMETRY, VOL. II", "The Brickmaker", "NIGHT TRAINS",
@@ -225,7 +225,7 @@ def _map(rng: np.random.Generator) -> np.ndarray:
 
 
 def _chart(rng: np.random.Generator) -> np.ndarray:
-    """An optician's chart: rows of letters, each smaller than the one above."""
+    """An eye chart: rows of letters, each row smaller than the one above."""
     sheet = blank(WHITE, 1.4)
     y, height = 0.0, 150.0
     while height > 5:

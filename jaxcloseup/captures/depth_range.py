@@ -1,32 +1,32 @@
-"""The depth range of a scene whose files do not give one."""
+"""Estimate the depth range of a scene whose files do not give one."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
 
-_MOST_POINTS = 20_000
+_MAX_POINTS = 20_000
 
 
 def near_far_from_points(
     points: np.ndarray, camtoworld: np.ndarray, intrinsics: np.ndarray, sizes: np.ndarray
 ) -> tuple[float, float] | None:
-    """A depth range that holds what the cameras see of the points, with a margin.
+    """Estimate a depth range that holds the points which the cameras see, with a margin.
 
-    In each camera the 1st and 99th percentiles of the depths of the points inside its image, so
-    that stray points do not count; then the extremes over cameras, so that one close-up does. Near
-    is 0.7 of the one, far 1.5 of the other.
+    Each camera contributes the 1st and 99th percentiles of the depths of points inside its image,
+    which ignores stray points. Near is 0.7 of the smallest of these over all cameras and far 1.5 of
+    the largest, so that a single close-up counts.
 
     Args:
       points: `[P, 3]` world points.
       camtoworld: `[V, 3, 4]` OpenCV poses.
-      intrinsics: `[V, 4]` fx, fy, cx, cy.
-      sizes: `[V, 2]` width and height of each image.
+      intrinsics: `[V, 4]` fx, fy, cx, cy in pixels.
+      sizes: `[V, 2]` image widths and heights in pixels.
 
     Returns:
-      near and far, or None where no camera sees any point.
+      near and far in world units, or None if no camera sees any point.
     """
-    points = points[:: max(1, len(points) // _MOST_POINTS)]
+    points = points[:: max(1, len(points) // _MAX_POINTS)]
     ranges = []
     for pose, lens, size in zip(camtoworld, intrinsics, sizes, strict=True):
         depths = depths_in_view(points, pose, lens, size)
@@ -44,13 +44,13 @@ def depths_in_view(
     intrinsics: np.ndarray,
     size: Sequence[int],
 ) -> np.ndarray:
-    """z-depths, in world units, of those of `points` `[P, 3]` that lie inside an image.
+    """Compute the z-depths `[Q]`, in world units, of the points that lie inside an image.
 
     Args:
-      points: of the world.
+      points: `[P, 3]` world points.
       camtoworld: `[3, 4]` OpenCV pose.
-      intrinsics: `[4]` fx, fy, cx, cy.
-      size: width and height in pixels.
+      intrinsics: `[4]` fx, fy, cx, cy in pixels.
+      size: image width and height in pixels.
     """
     fx, fy, cx, cy = intrinsics
     x, y, z = ((points.astype(np.float64) - camtoworld[:, 3]) @ camtoworld[:, :3]).T
@@ -60,16 +60,17 @@ def depths_in_view(
 
 
 def near_far_from_cameras(camtoworld: np.ndarray) -> tuple[float, float]:
-    """A guess from poses `[V, 3, 4]` alone.
+    """Guess near and far, in world units, from the poses `[V, 3, 4]` alone.
 
-    They are taken to look at one subject: the point nearest to all their optical axes. Near is a
-    tenth of the least distance to it and far four times the greatest. Where the axes are parallel,
-    or there is one camera, the unit is the cameras' own spread (or 1): 0.1 and 100 of it.
+    The guess assumes that all cameras look at one subject, the point nearest to all optical axes.
+    Near is a tenth of the smallest depth of the subject and far four times the largest. If the axes
+    are parallel or there is one camera, near and far are 0.1 and 100 times the spread of the
+    camera positions (or times 1 if that is 0).
     """
     axes, positions = camtoworld[:, :, 2], camtoworld[:, :, 3]
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # projects onto the plane of an image
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # projects onto the image plane
     total = across.mean(0)
-    # The least eigenvalue is about the mean squared sine of the angle between the axes.
+    # The smallest eigenvalue is about the mean squared sine of the angle between the axes.
     if np.linalg.eigvalsh(total)[0] > 1e-4:
         subject = np.linalg.solve(total, np.einsum("vij,vj->i", across, positions) / len(axes))
         depths = np.einsum("vi,vi->v", axes, subject - positions)

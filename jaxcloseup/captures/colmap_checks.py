@@ -1,7 +1,7 @@
-"""Checks of COLMAP's files before its own reader sees them.
+"""Check COLMAP's files before pycolmap reads them.
 
-That reader fills what a truncated file lacks with whatever is in memory, and its complaints about
-text name no file. Formats: https://colmap.github.io/format.html
+pycolmap fills the missing part of a truncated file with whatever is in memory, and its errors about
+text files do not name the file. Formats: https://colmap.github.io/format.html
 """
 
 import math
@@ -18,15 +18,16 @@ NAMES = ("cameras", "images", "points3D")
 def check_files(
     folder: pathlib.Path, suffix: str, count_parameters: Callable[[int | str], int]
 ) -> None:
-    """Walk through a model's cameras, images and points, and complain of what cannot be right.
+    """Check every record of a model's cameras, images and points.
 
     Args:
-      folder: holds the model.
+      folder: folder of the model.
       suffix: ".bin" or ".txt".
-      count_parameters: of a camera model, by its number or its name; a ValueError for others.
+      count_parameters: number of parameters of a camera model, given its id or name; raises
+        ValueError or KeyError for an unknown model.
 
     Raises:
-      SceneError: names the file, and the line or record in it.
+      SceneError: names the file and the line or record in it.
     """
     missing = [name + suffix for name in NAMES if not (folder / (name + suffix)).is_file()]
     if missing:
@@ -43,7 +44,7 @@ def check_files(
             _check_binary(path, data, count_parameters)
         else:
             _check_text(path, data, count_parameters)
-    for path in (folder / "rigs.bin", folder / "frames.bin"):  # of COLMAP 3.12, and optional
+    for path in (folder / "rigs.bin", folder / "frames.bin"):  # optional, since COLMAP 3.12
         if suffix == ".bin" and path.is_file():
             _check_binary(path, path.read_bytes(), count_parameters)
 
@@ -60,8 +61,7 @@ def _check_binary(path, data, count_parameters):
             end = len(data) + 1
         if end > len(data):
             raise SceneError(
-                f"{path} is truncated, it ends in record {record + 1} of {count}: copy or export "
-                "it again."
+                f"{path} is truncated in record {record + 1} of {count}: copy or export it again."
             )
     if end != len(data):
         raise SceneError(
@@ -99,7 +99,7 @@ def _walk_point(path, data, at, _):
 
 def _walk_rig(path, data, at, _):
     _, sensors = struct.unpack_from("<II", data, at)
-    at += 8 + 8 * min(sensors, 1)  # the first is the origin, the others have a pose or none
+    at += 8 + 8 * min(sensors, 1)  # the first sensor is the origin and has no pose
     for _ in range(sensors - 1):
         *_, has_pose = struct.unpack_from("<iIB", data, at)
         at += 9 + 56 * has_pose
@@ -127,20 +127,20 @@ def _check_text(path, data, count_parameters):
     if path.stem == "images":
         while numbered and not numbered[0][1]:
             numbered.pop(0)
-        # A line without points is empty, and the last one may be left out.
+        # An image without points has an empty line, which may be missing at the end.
         for number, words in numbered[1::2]:
             if len(words) % 3:
                 raise SceneError(
-                    f"{path}: line {number} holds {len(words)} numbers and not x, y and a point's "
-                    "number over and over: export it again."
+                    f"{path}: line {number} holds {len(words)} numbers instead of triples of x, y "
+                    "and point id: export it again."
                 )
         numbered = numbered[::2]
-    least = {"cameras": 4, "images": 10, "points3D": 8}[path.stem]
+    fewest = {"cameras": 4, "images": 10, "points3D": 8}[path.stem]
     for number, words in numbered:
         if not words:
             continue
         label = f"{path}: line {number}"
-        if len(words) < least:
+        if len(words) < fewest:
             raise SceneError(f"{label} ends after {len(words)} fields: export it again.")
         try:
             if path.stem == "images":
@@ -152,13 +152,15 @@ def _check_text(path, data, count_parameters):
         except ValueError as error:
             if isinstance(error, SceneError):
                 raise
-            raise SceneError(f"{label} holds a word for a number: export it again.") from error
+            raise SceneError(
+                f"{label} holds text where a number belongs: export it again."
+            ) from error
         if path.stem == "cameras":
             expected = _parameters(path, f"camera {words[0]}", words[1], count_parameters)
             if len(words) != 4 + expected:
                 raise SceneError(
-                    f"{label}: {words[1]} has {expected} parameters, got {len(words) - 4}: export "
-                    "it again."
+                    f"{label}: {words[1]} needs {expected} parameters, got {len(words) - 4}: "
+                    "export it again."
                 )
 
 

@@ -1,4 +1,4 @@
-"""Photographs that were read, against what their capture says of them."""
+"""Check decoded photographs and masks against what the capture's files say."""
 
 import pathlib
 import warnings
@@ -15,33 +15,33 @@ def check_weights(
     photos: Sequence[Photo],
     reading: Reading,
 ) -> None:
-    """Complain of masks that leave nothing of the training photographs, the first of `photos`.
+    """Check that masks leave some pixels of the training photographs, which come first in `photos`.
 
     Raises:
-      SceneError: that, or options on masks of a capture that has none.
+      SceneError: if masks leave no pixel, or an option asks for masks that the capture lacks.
     """
     if reading.invert_masks and not any(frame.mask for part in frames.values() for frame in part):
         raise SceneError(f"{folder}: no photograph has a mask to invert: leave out invert_masks.")
     masks = [photo.mask for photo in photos[: len(frames["train"])]]
     if reading.alpha_mode == "mask" and all((mask == 255).all() for mask in masks):
-        raise SceneError(f"{folder}: no photograph is transparent anywhere: leave out alpha_mode.")
+        raise SceneError(f"{folder}: no photograph has transparent pixels: leave out alpha_mode.")
     if not any(mask.any() for mask in masks):
-        advice = "white is what counts, so invert them with invert_masks if it is black in these"
+        advice = "white pixels are kept; set invert_masks if your masks keep black ones"
         if not any(frame.mask for frame in frames["train"]):
-            advice = "opaque pixels are what counts, so leave out alpha_mode"
+            advice = "only opaque pixels are kept, so leave out alpha_mode"
         elif reading.invert_masks:
-            advice = "black is what counts, so leave out invert_masks if it is white in these"
+            advice = "invert_masks keeps black pixels; leave it out if your masks keep white ones"
         raise SceneError(
             f"{folder}: the masks leave no pixel of the {len(masks)} training photographs: "
             f"{advice}."
         )
 
 
-def warn_sizes(folder: pathlib.Path, photos: Sequence[Photo]) -> None:
-    """Accept images that were resized as a whole, and refuse other sizes than the file's.
+def check_sizes(folder: pathlib.Path, photos: Sequence[Photo]) -> None:
+    """Warn about photographs that were resized as a whole, and refuse any other change of size.
 
     Raises:
-      SceneError: one that was cropped, padded or turned.
+      SceneError: a photograph was cropped, padded or rotated.
     """
     resized = []
     for photo in {(photo.frame.file, photo.frame.size): photo for photo in photos}.values():
@@ -51,19 +51,19 @@ def warn_sizes(folder: pathlib.Path, photos: Sequence[Photo]) -> None:
         (width, height), (w, h) = photo.stored_size, frame.size or photo.stored_size
         if (width, height) == (w, h):
             continue
-        # Resizing rounds each side to whole pixels: its aspect agrees to within one of them.
+        # Resizing rounds each side to whole pixels, so the aspect ratio agrees to within one pixel.
         if abs(width * h / w - height) > 1 and abs(height * w / h - width) > 1:
             swapped = (w, h) == (height, width)
-            turned = ", turned as by an EXIF orientation" if swapped else ""
+            rotated = ", as if rotated by an EXIF orientation" if swapped else ""
             raise SceneError(
                 f"{frame.label}: the image is {width} x {height} pixels, but w and h are {w} x {h}"
-                f"{turned}: restore the image that the camera was solved for, or correct w and h."
+                f"{rotated}: restore the image that the camera was solved for, or correct w and h."
             )
-        resized.append(f"{frame.listed} is {width} x {height} and not {w} x {h}")
+        resized.append(f"{frame.listed} is {width} x {height} pixels instead of {w} x {h}")
     if resized:
-        more = f" and {len(resized) - 1} more" if len(resized) > 1 else ""
+        more = f" (and {len(resized) - 1} more)" if len(resized) > 1 else ""
         warnings.warn(
-            f"{folder}: {resized[0]}{more}; intrinsics were scaled to the images.",
+            f"{folder}: {resized[0]}{more}; the intrinsics were scaled to the images.",
             ImageSizeWarning,
             stacklevel=2,
         )

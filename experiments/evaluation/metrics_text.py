@@ -1,0 +1,39 @@
+"""Metrics as people read them: titles, numbers, and a split in a line."""
+
+from collections.abc import Mapping
+from typing import Any
+
+
+SPLIT_TITLES = {"test": "Close-ups", "test_far": "Ordinary views"}
+COLUMNS = {
+    "psnr": "PSNR (dB)",
+    "ssim": "SSIM",
+    "lpips_vgg": "LPIPS (VGG)",
+    "lpips_alex": "LPIPS (AlexNet)",
+    "cc_psnr": "PSNR, color-corrected (dB)",
+    "psnr_seen1": "PSNR where seen by 1+ (dB)",
+    "psnr_seen3": "PSNR where seen by 3+ (dB)",
+    "coverage_seen1": "share seen by 1+",
+    "coverage_seen3": "share seen by 3+",
+    "depth_error_median": "median depth error (relative)",
+    "depth_error_p90": "90th percentile of it",
+    "normal_error_median": "median normal error (degrees)",
+    "point_depth_error_median": "median depth error at the capture's points (relative)",
+    "point_depth_error_p90": "90th percentile of it",
+}
+
+
+def in_short(split: Mapping[str, Any]) -> str:
+    """A split's PSNR, and how far its depth is off, in a line."""
+    text = f"PSNR {format_metric('psnr', split['psnr'])} dB"
+    for key in ("depth_error_median", "point_depth_error_median"):
+        if split.get(key) is not None:
+            text += f", depth off by {split[key]:.2%}"
+    return text
+
+
+def format_metric(key: str, value: float | None) -> str:
+    """A metric as text, "-" where it could not be computed."""
+    if value is None:
+        return "-"
+    return f"{value:.2f}" if "psnr" in key or "normal" in key else f"{value:.4f}"

@@ -1,0 +1,24 @@
+"""Renders of held-out views on disk, and what they should be."""
+
+import pathlib
+from collections.abc import Mapping, Sequence
+
+from experiments.evaluation.scores import Target
+from jaxcloseup.artifacts.images import colorize_depth, write_png
+from jaxcloseup.field import Rendering
+from jaxcloseup.scene import Scene
+
+
+def write_renders(folder: pathlib.Path, renderings: Mapping[str, Rendering], scene: Scene) -> None:
+    """Write `rgb/<name>.png` and `depth/<name>.png`, the depth in color over the scene's range."""
+    for name, rendering in renderings.items():
+        write_png(folder / "rgb" / f"{name}.png", rendering.rgb)
+        depth = colorize_depth(rendering.depth, near=scene.near, far=scene.far)
+        write_png(folder / "depth" / f"{name}.png", depth)
+
+
+def write_truth(folder: pathlib.Path, targets: Mapping[str, Sequence[Target]]) -> None:
+    """Write `<split>/rgb/<name>.png`, what renders are scored against, as anyone may again."""
+    for split, views in targets.items():
+        for target in views:
+            write_png(folder / split / "rgb" / f"{target.name}.png", target.rgb)

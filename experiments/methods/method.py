@@ -1,0 +1,130 @@
+"""What a method is, and what its presets hold: plain numbers that print and serialize."""
+
+import dataclasses
+import math
+import pathlib
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import optax
+
+from jaxcloseup.artifacts.gaussians import Gaussians
+from jaxcloseup.field import RadianceField
+from jaxcloseup.geometry.poses import PoseSettings
+from jaxcloseup.pseudo import PseudoSettings
+from jaxcloseup.scene import Scene
+from jaxcloseup.train import TrainConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class LabelConfig:
+    """How random close-ups are drawn and labeled; the defaults are the paper's text.
+
+    Attributes:
+      magnification: range of lambda, how many times nearer virtual cameras come.
+      max_angle: epsilon, the largest change of each Euler angle, radians.
+      anchor_tolerance: largest relative distance of an anchor from its view's mean depth.
+      look_at: turn virtual cameras about the anchor and not about themselves.
+      fixed_anchors: draw only the four anchors of the paper's ablation.
+      use_mask: keep labels only where both warps agree in color.
+      rgb_tolerance: epsilon of the mask, the largest difference of a channel.
+      depth_tolerance: relative agreement with the source view's depth.
+      max_ray_angle: largest angle between the rays of a virtual pixel and its source, radians.
+      num_sources: photographs whose colors are averaged.
+      forward_label: take colors from the forward warps.
+      leave_out_source: check a label against the other views alone.
+      source_tolerance: relative depth tolerance for choosing a target view's source; inf ignores
+        occlusion, as published.
+      label_loss_weight: weight of the labels' loss in a step; the photographs' loss has the rest.
+      lr_scale: factor on the learning rates in steps with labels.
+      expected_depth: label from the expected depth (true) or the median depth (false); none takes
+        the depth that the field renders.
+    """
+
+    magnification: tuple[float, float] = (2.0, 8.0)
+    max_angle: float = math.pi / 4
+    anchor_tolerance: float = math.inf
+    look_at: bool = False
+    fixed_anchors: bool = False
+    use_mask: bool = True
+    rgb_tolerance: float = 0.05
+    depth_tolerance: float = math.inf
+    max_ray_angle: float = math.inf
+    num_sources: int = 1
+    forward_label: bool = False
+    leave_out_source: bool = False
+    source_tolerance: float = math.inf
+    label_loss_weight: float = 0.5
+    lr_scale: float = 1.0
+    expected_depth: bool | None = None
+
+
+def pseudo_settings(labels: LabelConfig) -> PseudoSettings:
+    """The traced settings of labels."""
+    values = {name: jnp.asarray(value, jnp.float32) for name, value in _traced(labels).items()}
+    pose = {field.name: values.pop(field.name) for field in dataclasses.fields(PoseSettings)}
+    return PseudoSettings(pose=PoseSettings(**pose), **values)
+
+
+def _traced(labels):
+    """All values but `expected_depth`, which chooses what code runs before labels are made."""
+    return {name: value for name, value in vars(labels).items() if name != "expected_depth"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Preset:
+    """One experiment with one method.
+
+    Attributes:
+      method: a name in `METHODS`.
+      field: the method's own configuration: its field, optimizer and steps for target views.
+      train: what a step looks at.
+      labels: how close-ups are drawn and labeled.
+      baseline_steps: steps of stage 1, on photographs alone.
+      closeup_steps: steps of stage 2 with labels, and of its control without.
+      downscale: divisor of the photographs' size.
+      gated: let left-out photographs decide how much labels weigh, which may be nothing.
+    """
+
+    method: str
+    field: Any
+    train: TrainConfig
+    labels: LabelConfig
+    baseline_steps: int
+    closeup_steps: int
+    downscale: int = 1
+    gated: bool = False
+
+
+class Method(NamedTuple):
+    """A radiance field as experiments train it: plain values and functions.
+
+    `config` below is the `field` of a preset.
+
+    Attributes:
+      presets: by name; `quick`, the default, is the smallest run that shows the method honestly.
+      make_field: `(config, scene, growth) -> RadianceField`; `growth` multiplies the capacity of a
+        field whose renderings overflow.
+      make_optimizer: `(config, scene) -> optax.GradientTransformation`.
+      renders_pixels: whether the field renders single pixels, or whole images alone.
+      target_steps: `(config, count) -> int`, steps in all on `count` target views.
+      max_points: `(config) -> int | None`, how many initial points fit; None: any number.
+      with_expected_depth: `(buffers, expected) -> buffers` of a field that renders its expected
+        depth (true) or its median depth (false) as depth; None for fields without a choice.
+      export: `(folder, stage, params, buffers) -> None` writes a stage's state for other programs.
+      gaussians: `(params, buffers) -> Gaussians`, what viewers draw; None: they draw the scene's
+        points.
+      background: `(config) -> float`, gray level in [0, 1] behind the scene.
+    """
+
+    presets: Mapping[str, Preset]
+    make_field: Callable[[Any, Scene, int], RadianceField]
+    make_optimizer: Callable[[Any, Scene], optax.GradientTransformation]
+    renders_pixels: bool
+    target_steps: Callable[[Any, int], int]
+    max_points: Callable[[Any], int | None] = lambda config: None
+    with_expected_depth: Callable[[Any, bool], Any] | None = None
+    export: Callable[[pathlib.Path, str, Any, Any], None] = lambda *state: None
+    gaussians: Callable[[Any, Any], Gaussians] | None = None
+    background: Callable[[Any], float] = lambda config: 0.0

@@ -1,0 +1,56 @@
+"""What a run leaves for people: results.json, pictures and the report's page."""
+
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+
+from experiments.reporting.pictures import comparisons, label_pictures
+from experiments.reporting.report import write_report
+from experiments.training.setup import Training, timed
+from experiments.training.stages import Outcome
+from jaxcloseup.files import write_json
+from jaxcloseup.label_rules import label_depth
+
+
+def report_run(
+    output_dir: pathlib.Path, training: Training, outcome: Outcome, about: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Write `results.json`, `compare/`, `labels/` and `report.html`; returns the results.
+
+    Args:
+      output_dir: folder of the run.
+      training: what trained, with the seconds and metrics of its stages.
+      outcome: what the stages left.
+      about: "method", "preset", "seed", "config" and "versions".
+    """
+    programs, scene = training.programs, training.programs.scene
+    with timed(training.seconds, "report"):
+        targets = outcome.held_out.targets
+        pictures = comparisons(output_dir / "compare", targets, outcome.renderings)
+        _, _, key = jax.random.split(jax.random.key(about["seed"]), 3)
+        pictures += label_pictures(
+            key,
+            targets.get("test", []),
+            output_dir / "labels",
+            scene=scene,
+            sources=outcome.start.sources,
+            settings=outcome.settings,
+            render_depth=lambda camera: label_depth(programs.render(outcome.start.state, camera)),
+        )
+    size = scene.train.cameras
+    results = {
+        "scene": scene.name,
+        **about,
+        "resolution": [size.width, size.height],
+        "stages": outcome.scores,
+        "labels": outcome.audit,
+        "left_out": outcome.left_out,
+        "gate": outcome.gate,
+        "seconds": training.seconds,
+        "history": training.history,
+    }
+    write_json(output_dir / "results.json", results)
+    write_report(output_dir / "report.html", results, pictures)
+    return results

@@ -1,0 +1,200 @@
+"""Compiled programs of one preset on one scene: kinds of steps, and rendering."""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from orbax.checkpoint.multihost import sync_global_processes
+
+from experiments.methods import METHODS, Preset
+from jaxcloseup.field import Rendering
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.pseudo import LabelSources, PseudoSettings
+from jaxcloseup.scene import Scene
+from jaxcloseup.train import TrainState, closeup_step, labeled_step, run_steps, train_step
+
+
+HOSTS_WAIT = 24 * 3600  # seconds
+
+
+class Programs:
+    """What is compiled for one preset on one scene.
+
+    A field may have room for a fixed amount of work. Where an image needs more, `Programs` discards
+    it, doubles the room, compiles everything anew and does the work again: no step learns from a
+    truncated image, and nobody sees one.
+    """
+
+    def __init__(self, preset: Preset, scene: Scene) -> None:
+        """Compile for a preset on a scene."""
+        self.preset, self.scene, self.method = preset, scene, METHODS[preset.method]
+        self.optimizer = self.method.make_optimizer(preset.field, scene)
+        self.growth = 1
+        self._meetings = 0
+        self._compile()
+
+    def _compile(self) -> None:
+        self.field = self.method.make_field(self.preset.field, self.scene, self.growth)
+        bound = {"field": self.field, "optimizer": self.optimizer, "config": self.preset.train}
+        steps = {
+            "photographs": functools.partial(train_step, **bound),
+            "random_closeups": functools.partial(closeup_step, **bound),
+            "target_views": functools.partial(labeled_step, **bound),
+        }
+        # The number of steps is traced; the input state is left alone.
+        runners = {kind: functools.partial(run_steps, step) for kind, step in steps.items()}
+        runners["arms"] = self._run_arms(steps["random_closeups"])
+        self._runners = {kind: jax.jit(run) for kind, run in runners.items()}
+        self._render = jax.jit(
+            lambda state, camera, key: self.field.render(
+                state.params, state.buffers, camera, None, key
+            )
+        )
+
+    def _run_arms(self, step: Callable[..., Any]) -> Callable[..., Any]:
+        """Steps of all arms of a sweep together, spread over the devices.
+
+        Arms share the count of steps, so that what is due at a step is no question of arms, and the
+        photographs. Each device has arms of its own and exchanges nothing with the others.
+        """
+        arms_states = TrainState(step=None, params=0, buffers=0, opt_state=0, key=0)
+        arms_sources = LabelSources(views=None, depths=0, blocks=0)
+        arms_step = jax.vmap(
+            step, in_axes=(arms_states, arms_sources, 0), out_axes=(arms_states, 0)
+        )
+        shared, split = PartitionSpec(), PartitionSpec("arms")
+        states = TrainState(step=shared, params=split, buffers=split, opt_state=split, key=split)
+        sources = LabelSources(views=shared, depths=split, blocks=split)
+        mesh = Mesh(np.array(jax.devices()), ("arms",))
+        self._on_devices = jax.tree.map(
+            lambda spec: NamedSharding(mesh, spec),
+            (states, sources, split),
+            is_leaf=lambda leaf: isinstance(leaf, PartitionSpec),
+        )
+
+        def run_arms(
+            states_now: TrainState,
+            sources_now: LabelSources,
+            settings: PseudoSettings,
+            count: jax.Array | int,
+        ) -> Any:
+            return jax.shard_map(
+                lambda *data: run_steps(arms_step, *data[:-1], count=data[-1]),
+                mesh=mesh,
+                in_specs=(states, sources, split, shared),
+                out_specs=(states, split),
+                check_vma=False,
+            )(states_now, sources_now, settings, count)
+
+        return run_arms
+
+    def make_room(self, growth: int) -> None:
+        """Have room for `growth` times as much as the preset has, or more."""
+        if growth > self.growth:
+            self.growth = growth
+            self._compile()
+
+    def _grow(self) -> None:
+        self.make_room(2 * self.growth)
+        print(
+            f"an image needs more room than there is: growing to {self.growth} times the preset's"
+        )
+
+    def run(
+        self, kind: str, state: TrainState, *data: Any, count: int
+    ) -> tuple[TrainState, dict[str, Any]]:
+        """Take `count` steps of a kind.
+
+        Args:
+          kind: "photographs" (`train_step`), "random_closeups" (`closeup_step`), "target_views"
+            (`labeled_step`), or "arms": random close-ups of all arms of a sweep, one on each device
+            or several. Then the state, but for its step, and all data, but for the photographs,
+            have a leading axis of arms.
+          state: what is trained.
+          *data: what the step takes after its state.
+          count: how many steps.
+
+        Returns:
+          The next state and the means of the steps' metrics, over arms too; `skipped` counts the
+          steps that were skipped because loss or gradient was not finite (of "arms" a list of
+          counts). A mean that is not finite, such as the PSNR without any label, is left out.
+        """
+        if kind == "arms":
+            self._meet()
+            # What comes out of a checkpoint lies on one device.
+            state, *data = jax.tree.map(_place, self._on_devices, (state, *data))
+        while True:
+            after, metrics = self._runners[kind](state, *data, count=count)
+            if kind == "arms" and jax.process_count() > 1:
+                after, metrics = _gather((after, metrics))
+            metrics = jax.device_get(metrics)
+            # Means of counts: positive if any step had an overflow.
+            overflow = [metrics.pop(key, np.zeros(())) for key in ("overflow", "label_overflow")]
+            if not any(np.any(values) for values in overflow):
+                return after, _checked(metrics, kind, count)
+            self._grow()
+
+    def _meet(self) -> None:
+        if jax.process_count() > 1:
+            # One host may be minutes behind, but collectives wait for half a minute only.
+            self._meetings += 1
+            sync_global_processes(
+                f"arms {self._meetings}",
+                processes=set(range(jax.process_count())),
+                timeout=HOSTS_WAIT,
+            )
+
+    def render(self, state: TrainState, camera: Camera, key: jax.Array | None = None) -> Rendering:
+        """Render a whole image; without a key, as ever, deterministically."""
+        while True:
+            rendering = self._render(state, camera, key)
+            if rendering.overflow is None or not int(rendering.overflow):
+                return rendering
+            self._grow()
+
+
+def _checked(metrics, kind, count):
+    """Finite means as numbers, and counts of skipped steps, with a warning if there are any."""
+    skipped = np.round(metrics.pop("skipped") * count).astype(int)
+    if skipped.any():
+        by_arm = f", by arm: {skipped.tolist()}" if kind == "arms" else ""
+        print(f"warning: {skipped.max()} of {count} steps skipped, not finite{by_arm}")
+    values = {key: float(np.mean(value)) for key, value in metrics.items()}
+    values = {key: value for key, value in values.items() if math.isfinite(value)}
+    return values | {"skipped": skipped.tolist()}
+
+
+def _place(sharding: NamedSharding, tree: Any) -> Any:
+    """Arrays that every host has whole, each host's part on its devices."""
+    if jax.process_count() == 1:
+        return jax.device_put(tree, sharding)
+
+    def place(leaf):
+        leaf = np.asarray(leaf)
+        return jax.make_array_from_callback(leaf.shape, sharding, leaf.__getitem__)
+
+    return _map_keys_as_numbers(place, tree)
+
+
+def _gather(tree: Any) -> Any:
+    """Arrays that are spread over several hosts, whole on each."""
+
+    def gather(leaf):
+        return jnp.asarray(multihost_utils.process_allgather(leaf, tiled=True))
+
+    return _map_keys_as_numbers(gather, tree)
+
+
+def _map_keys_as_numbers(change, tree):
+    def one(leaf):
+        if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(change(jax.random.key_data(leaf)))
+        return change(leaf)
+
+    return jax.tree.map(one, tree)

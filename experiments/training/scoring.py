@@ -1,0 +1,94 @@
+"""What stages and arms are scored on, and the scores, renders and exports of a run's stages."""
+
+import functools
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+
+from experiments.evaluation.ladder import ladder_in_short, ladder_targets
+from experiments.evaluation.metrics_text import in_short
+from experiments.evaluation.renders import write_renders
+from experiments.evaluation.scores import (
+    Perceptual,
+    Target,
+    evaluate,
+    exact_depths,
+    targets_by_split,
+)
+from experiments.training.programs import Programs
+from experiments.training.setup import LabelStart, Training, timed
+from jaxcloseup.field import Rendering
+from jaxcloseup.train import TrainState
+
+
+class HeldOut(NamedTuple):
+    """What stages are scored on.
+
+    Attributes:
+      targets: held-out views by split.
+      ladder: views of the zoom ladder by rung; none where the exact scene is not known.
+      exact: `[V, H, W]` exact depths of the training views, or None.
+    """
+
+    targets: Mapping[str, Sequence[Target]]
+    ladder: Mapping[str, Sequence[Target]]
+    exact: jax.Array | None
+
+    @property
+    def all(self) -> dict[str, Sequence[Target]]:
+        """Targets and ladder together."""
+        return {**self.targets, **self.ladder}
+
+
+def hold_out(programs: Programs, start: LabelStart) -> HeldOut:
+    """The views to score on. Their coverage is that of `start`, so that all are scored alike."""
+    scene, render = programs.scene, functools.partial(programs.render, start.state)
+    exact = exact_depths(scene, scene.train.cameras) if scene.surface else None
+    targets = targets_by_split(scene, start.sources.depths, exact, render)
+    return HeldOut(targets, {} if exact is None else ladder_targets(scene, exact), exact)
+
+
+class Scorer:
+    """Scores stages on what is held out, and leaves their renders and exports.
+
+    Attributes:
+      scores: by stage and split.
+      renderings: by stage and split, then by the view's name; without the zoom ladder's.
+    """
+
+    def __init__(
+        self,
+        training: Training,
+        held_out: HeldOut,
+        output_dir: pathlib.Path,
+        perceptual: Perceptual,
+    ) -> None:
+        """Score nothing yet."""
+        self._training, self._held_out = training, held_out
+        self._folder, self._perceptual = output_dir, perceptual
+        self.scores: dict[str, dict[str, Any]] = {}
+        self.renderings: dict[tuple[str, str], Mapping[str, Rendering]] = {}
+
+    def score(self, stage: str, state: TrainState) -> None:
+        """Render, score and keep one stage."""
+        programs, log = self._training.programs, self._training.log
+        render = functools.partial(programs.render, state)
+        targets, ladder = self._held_out.targets, self._held_out.ladder
+        with timed(self._training.seconds, f"{stage}_evaluation"):
+            scores, shown = {}, {}
+            for split, views in self._held_out.all.items():
+                scores[split], seen = evaluate(render, views, self._perceptual)
+                write_renders(self._folder / "renders" / stage / split, seen, programs.scene)
+                if split in targets:
+                    self.renderings[stage, split] = seen
+                    name, first = next(iter(seen.items()))
+                    shown[f"{split}/{name}"] = first.rgb
+                    print(f"{stage:>9} {split}: {in_short(scores[split])}", flush=True)
+            self.scores[stage] = scores
+            if log is not None:
+                log.evaluated(stage, scores, shown)
+            if ladder:
+                print(f"{stage:>9} {ladder_in_short(scores)}", flush=True)
+            programs.method.export(self._folder, stage, state.params, state.buffers)

@@ -1,0 +1,196 @@
+"""What the stages of a run and the arms of a sweep begin with, and what both train with."""
+
+import contextlib
+import dataclasses
+import functools
+import time
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxcloseup
+from experiments.methods import Preset
+from experiments.training.logs import TrainLog
+from experiments.training.loop import run_stage
+from experiments.training.manifest import hash_data, hash_wanted
+from experiments.training.programs import Programs
+from experiments.training.settings import plain_config
+from jaxcloseup.artifacts.checkpoints import Checkpoints
+from jaxcloseup.field import Rendering
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.label_rules import LABEL_RULES, label_depth
+from jaxcloseup.photographs import Views, camera_at
+from jaxcloseup.pseudo import LabelSources, PseudoSettings, label_sources, label_views
+from jaxcloseup.scene import Scene
+from jaxcloseup.splats.surfels import random_points
+from jaxcloseup.train import TrainState, init_state
+
+
+FEWEST_POINTS = 100  # a capture with fewer gets random points too
+
+
+class LabelStart(NamedTuple):
+    """What fine-tuning on labels begins with.
+
+    Attributes:
+      state: that of the baseline, rendering the depth that labels are made from.
+      sources: the training photographs with this state's depths.
+    """
+
+    state: TrainState
+    sources: LabelSources
+
+
+@dataclasses.dataclass
+class Training:
+    """Training on one scene with one preset.
+
+    Attributes:
+      programs: what is compiled.
+      checkpoints: keep the states of every stage.
+      log: gets every report; None: none is kept.
+      save_every: steps between checkpoints.
+      seconds: filled with the wall time of each part.
+      history: filled with the metrics of each stage.
+    """
+
+    programs: Programs
+    checkpoints: Checkpoints
+    log: TrainLog | None = None
+    save_every: int = 1000
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+    history: dict[str, list[dict[str, Any]]] = dataclasses.field(default_factory=dict)
+
+    def train(self, stage: str, kind: str, state: TrainState, *data: Any, steps: int) -> TrainState:
+        """Run a stage, `steps` steps of a kind that `Programs.run` knows."""
+        with timed(self.seconds, stage):
+            state, self.history[stage] = run_stage(
+                stage,
+                self.programs,
+                kind,
+                state,
+                *data,
+                steps=steps,
+                checkpoints=self.checkpoints,
+                save_every=self.save_every,
+                log=self.log,
+            )
+        return state
+
+    def train_baseline(self, stage: str, seed: int) -> TrainState:
+        """Stage 1 of a seed: photographs alone."""
+        preset, views = self.programs.preset, self.programs.scene.train
+        start = initial_state(self.programs, seed)
+        return self.train(stage, "photographs", start, views, steps=preset.baseline_steps)
+
+
+def identity_of(scene: Scene, preset: Preset, names: Mapping[str, str]) -> dict[str, Any]:
+    """What makes a training this training, as JSON can hold it; runs and sweeps add their own."""
+    size = scene.train.cameras
+    return {
+        "scene": scene.name,
+        "config": plain_config(preset),
+        **names,
+        "resolution": [size.width, size.height],
+        "version": jaxcloseup.__version__,
+        "data_sha256": hash_data(scene),
+        "wanted_sha256": hash_wanted(scene),
+    }
+
+
+def initial_state(programs: Programs, seed: int) -> TrainState:
+    """The state before the first step of a seed's baseline."""
+    key_init, _, _ = jax.random.split(jax.random.key(seed), 3)
+    points, rgb = initial_points(jax.random.fold_in(key_init, 2), programs.scene)
+    return init_state(key_init, points, rgb, field=programs.field, optimizer=programs.optimizer)
+
+
+def initial_points(key: jax.Array, scene: Scene, count: int = 5000) -> tuple[Any, Any]:
+    """Points `[P, 3]` and colors to start from: the capture's; if few, random gray ones too."""
+    if len(scene.points) >= FEWEST_POINTS:
+        return scene.points, scene.rgb
+    points = random_points(key, scene.train.cameras, near=scene.near, far=scene.far, count=count)
+    gray = jnp.full_like(points, 0.5)
+    if not len(scene.points):
+        return points, gray
+    return np.concatenate([scene.points, points]), np.concatenate([scene.rgb, gray])
+
+
+def say_which_points_fit(programs: Programs) -> None:
+    """Print how many of the initial points a field begins with, if not with all."""
+    most, count = programs.method.max_points(programs.preset.field), len(programs.scene.points)
+    if most is not None and count > most:
+        print(
+            f"training begins with {most} of {count} points: --set capacity=N makes room for more"
+        )
+
+
+def start_labels(
+    programs: Programs, state: TrainState, seed: int, *, expected_depth: bool | None = None
+) -> LabelStart:
+    """The state whose depth labels are made from, and the photographs with its depths.
+
+    Args:
+      programs: what is compiled.
+      state: the baseline's.
+      seed: the run's.
+      expected_depth: see `LabelConfig`.
+    """
+    if expected_depth is not None:
+        buffers = programs.method.with_expected_depth(state.buffers, expected_depth)
+        state = state.replace(buffers=buffers)
+    depths = training_depths(programs, state, seed)
+    return LabelStart(state, jax.jit(label_sources)(programs.scene.train, depths))
+
+
+def training_depths(programs: Programs, state: TrainState, seed: int) -> jax.Array:
+    """Depths `[V, H, W]` of the training views as the preset's label rule makes them."""
+    scene, rule = programs.scene, LABEL_RULES[programs.preset.train.label_rule]
+    key_init, _, _ = jax.random.split(jax.random.key(seed), 3)
+    return rendered_depths(
+        functools.partial(programs.render, state),
+        scene.train.cameras,
+        scene,
+        near=scene.near,
+        key=rule.depth_key(jax.random.fold_in(key_init, 1)),
+        depth=rule.depth,
+    )
+
+
+def rendered_depths(
+    render: Callable[..., Rendering],
+    cameras: Camera,
+    scene: Scene,
+    *,
+    near: float = 0.0,
+    key: jax.Array | None = None,
+    depth: Callable[..., jax.Array] = label_depth,
+) -> jax.Array:
+    """`render_depths` of stacked cameras, by a `render` that makes room where images need it.
+
+    `near` is 0 by default: close-ups may be nearer to the surface than any photograph.
+    """
+    count = cameras.intrinsics.shape[0]
+    keys = [None] * count if key is None else jax.random.split(key, count)
+    seen = (render(camera_at(cameras, i), keys[i]) for i in range(count))
+    return jnp.stack([depth(rendering, near=near, far=scene.far) for rendering in seen])
+
+
+def label_targets(
+    programs: Programs, start: LabelStart, cameras: Camera, settings: PseudoSettings
+) -> Views:
+    """Labels of target views, given by stacked cameras `[Q]`."""
+    render = functools.partial(programs.render, start.state)
+    depths = rendered_depths(render, cameras, programs.scene)
+    return jax.jit(label_views)(cameras, depths, start.sources, settings)
+
+
+@contextlib.contextmanager
+def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
+    """Record under `name` how long the body takes."""
+    start = time.perf_counter()
+    yield
+    seconds[name] = time.perf_counter() - start

@@ -1,0 +1,144 @@
+"""Presets from the JSON of stored runs, including those that earlier versions stored."""
+
+import dataclasses
+import math
+import types
+import typing
+from collections.abc import Mapping
+from typing import Any
+
+from experiments.methods import METHODS, Preset
+from experiments.training.settings import plain_config
+
+
+def preset_from_config(
+    stored: Mapping[str, Any], method: str | None = None
+) -> tuple[Preset, dict[str, Any]]:
+    """The preset whose `plain_config` a run stored.
+
+    A setting that the run's version lacked has its default: every setting that is added later must
+    do by default what programs did before.
+
+    Args:
+      stored: the configuration in the run's JSON.
+      method: the run's method, which version 0.1.0 stored beside the configuration.
+
+    Returns:
+      The preset, and the absent settings by name with the values they have.
+
+    Raises:
+      ValueError: the configuration has another form; names the field.
+    """
+    if "method" not in stored:
+        stored = from_version_0_1(stored, method)
+    if stored["method"] not in METHODS:
+        raise ValueError(f"there is no method {stored['method']}")
+    field = next(iter(METHODS[stored["method"]].presets.values())).field
+    absent: dict[str, Any] = {}
+    preset = _rebuild(Preset, stored, "config", absent, {"field": type(field)})
+    again = plain_config(preset)
+    for name in absent:
+        _remove(again, name)
+    if again != stored:
+        raise ValueError("a value has another type")
+    return preset, {name.split(".")[-1]: value for name, value in absent.items()}
+
+
+def _remove(config, name):
+    *path, last = name.split(".")[1:]
+    for key in path:
+        config = config[key]
+    del config[last]
+
+
+def _rebuild(kind, value, name, absent, kinds=None):
+    if value == "inf":
+        return math.inf
+    if isinstance(value, list):
+        return tuple(_rebuild(Any, inner, name, absent) for inner in value)
+    if not isinstance(value, Mapping):
+        return value
+    choices = typing.get_args(kind) if isinstance(kind, types.UnionType) else (kind,)
+    choices = [choice for choice in choices if dataclasses.is_dataclass(choice)]
+    if not choices:
+        raise ValueError(f"{name} holds fields")
+    # The run holds one of these records: the one that shares most fields with it.
+    choice = max(choices, key=lambda one: len(_names(one) & set(value)))
+    if unknown := sorted(set(value) - _names(choice)):
+        raise ValueError(f"{name} has {', '.join(unknown)}, which this version does not know")
+    kinds = typing.get_type_hints(choice) | (kinds or {})
+    known = {k: _rebuild(kinds[k], v, f"{name}.{k}", absent) for k, v in value.items()}
+    for field in dataclasses.fields(choice):
+        if field.name not in value:
+            if field.default is dataclasses.MISSING:
+                raise ValueError(f"{name} lacks {field.name}")
+            absent[f"{name}.{field.name}"] = field.default
+    return choice(**known)
+
+
+def _names(record):
+    return {field.name for field in dataclasses.fields(record)}
+
+
+# Settings of version 0.1.0 under the names that they have now.
+_FIELD_NAMES = {
+    "colour_ridge": "color_ridge",
+    "regularise_from": "regularize_from",
+    "means_rate": "means_lr",
+    "decay_steps": "means_lr_steps",
+    "late_rate": "late_lr_scale",
+    "sh_rate": "sh_lr",
+    "opacity_rate": "opacity_lr",
+    "scale_rate": "scale_lr",
+    "rotation_rate": "rotation_lr",
+}
+_LABEL_NAMES = {"label_share": "label_loss_weight"} | {
+    name: name
+    for name in (
+        *("magnification", "max_angle", "anchor_tolerance", "rgb_tolerance", "depth_tolerance"),
+        *("forward_label", "leave_out_source", "source_tolerance"),
+    )
+}
+_NERF_NAMES = {
+    "learning_rate": "initial_lr",
+    "decay_rate": "lr_decay",
+    "decay_steps": "lr_decay_steps",
+    "normalise": "normalize",
+    "test_time_steps": "target_steps",
+}
+_LABEL_RULES = {
+    (False, False, False): "paper",
+    (False, False, True): "pooled",
+    (True, True, True): "released",
+}
+
+
+def from_version_0_1(stored: Mapping[str, Any], method: str | None) -> dict[str, Any]:
+    """The configuration of a run of version 0.1.0 in today's form.
+
+    Raises:
+      ValueError: it is not of that version.
+    """
+    try:
+        field, train = dict(stored["field"]), stored["train"]
+        if method == "surfels":
+            field = {_FIELD_NAMES.get(name, name): value for name, value in field.items()}
+            field["steps_per_target"] = stored["test_time_steps"]
+        else:
+            field |= {new: stored[old] for old, new in _NERF_NAMES.items()}
+        quirks = "perturbed_depth", "undivided_depth", "pooled_loss"
+        return {
+            "method": method,
+            "field": field,
+            "train": {
+                **{name: train[name] for name in ("num_rays", "num_label_rays")},
+                "label_rule": _LABEL_RULES[tuple(train[name] for name in quirks)],
+            },
+            "labels": {new: stored[old] for old, new in _LABEL_NAMES.items()},
+            **{
+                name: stored[name]
+                for name in ("baseline_steps", "closeup_steps", "downscale", "gated")
+            },
+        }
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"config lacks {error.args[0]}") from None

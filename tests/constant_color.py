@@ -1,0 +1,47 @@
+"""A trial method: everything has one trained color, at the depth of the scene's middle."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from experiments.methods import LabelConfig, Method, Preset
+from jaxcloseup.field import RadianceField, Rendering
+from jaxcloseup.train import TrainConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class ConstantConfig:
+    lr: float = 0.1
+
+
+def make_field(config, scene, growth):
+    def render(params, buffers, camera, pixels, key):
+        shape = (camera.height, camera.width) if pixels is None else pixels.shape[:-1]
+        depth = jnp.full(shape, (scene.near + scene.far) / 2)
+        return Rendering(jnp.broadcast_to(params, (*shape, 3)), depth, jnp.ones(shape))
+
+    def loss(rendering, target, weight):
+        squared = jnp.mean((rendering.rgb - target) ** 2, axis=-1)
+        error = jnp.sum(weight * squared) / jnp.maximum(jnp.sum(weight), 1)
+        return error, {"psnr": -10 * jnp.log10(error)}
+
+    return RadianceField(lambda key, points, rgb: (jax.random.uniform(key, (3,)), ()), render, loss)
+
+
+QUICK = Preset(
+    method="constant",
+    field=ConstantConfig(),
+    train=TrainConfig(num_rays=64, num_label_rays=64),
+    labels=LabelConfig(),
+    baseline_steps=9,
+    closeup_steps=2,
+)
+METHOD = Method(
+    presets={"quick": QUICK},
+    make_field=make_field,
+    make_optimizer=lambda config, scene: optax.adam(config.lr),
+    renders_pixels=True,
+    target_steps=lambda config, count: 2,
+)

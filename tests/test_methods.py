@@ -1,0 +1,108 @@
+"""Methods: what presets make of a scene, and that a new method needs its own module alone."""
+
+import dataclasses
+import json
+import os
+import pathlib
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tiny_runs import TINY_SURFELS
+
+from experiments.methods import surfels
+from experiments.methods.surfels import extent, make_field
+from experiments.training.setup import FEWEST_POINTS, initial_points
+from jaxcloseup.scenes import load_scene
+
+
+@pytest.fixture
+def scene(capture_folder):
+    return load_scene(str(capture_folder))
+
+
+def moved(scene, change):
+    """The scene with other positions `[V, 3]` of its cameras."""
+    cameras = scene.train.cameras
+    poses = cameras.camtoworld.at[..., 3].set(change(cameras.position))
+    return dataclasses.replace(
+        scene, train=scene.train.replace(cameras=cameras.replace(camtoworld=poses))
+    )
+
+
+def test_cameras_in_one_place_have_the_size_of_what_they_see(scene):
+    for place in np.random.default_rng(0).uniform(-3, 3, (8, 3)):
+        here = moved(scene, lambda old, place=place: jnp.broadcast_to(place, old.shape))
+        assert extent(here) == pytest.approx(0.5 * scene.far)
+    assert extent(scene) == pytest.approx(1.1 * np.hypot(1, 0.1), rel=1e-3)
+
+
+def test_the_near_plane_is_small_in_a_small_scene(scene, monkeypatch):
+    seen = []
+    monkeypatch.setattr(surfels, "surfel_field", lambda config, *, extent: seen.append(config))
+    small = moved(scene, lambda old: 0.01 * old)
+    for one in (scene, small, dataclasses.replace(small, far=0.01 * scene.far)):
+        make_field(TINY_SURFELS.field, one, 1)
+    near = [config.raster.near for config in seen]
+    assert near[0] == TINY_SURFELS.field.raster.near
+    assert near[1] == near[2] == pytest.approx(0.01 * 0.01 * extent(scene))
+
+
+def test_few_points_have_random_ones_beside_them(scene):
+    key = jax.random.key(0)
+    for count in (0, 3, FEWEST_POINTS):
+        some = np.random.default_rng(0).uniform(-1, 1, (count, 3)).astype(np.float32)
+        of_capture = dataclasses.replace(scene, points=some, rgb=some)
+        points, rgb = initial_points(key, of_capture, count=200)
+        assert len(points) == len(rgb) == count + (200 if count < FEWEST_POINTS else 0)
+        np.testing.assert_array_equal(points[:count], some)
+        np.testing.assert_array_equal(rgb[:count], some)
+        np.testing.assert_array_equal(rgb[count:], 0.5)
+
+
+# What a maintainer adds: a module, and a line of the table before flags read it.
+NEW_METHOD = """
+import sys, constant_color, experiments.methods
+experiments.methods.METHODS["constant"] = constant_color.METHOD
+from absl import app
+from experiments import run, sweep, render
+program = {"run": run, "sweep": sweep, "render": render}[sys.argv.pop(1)]
+app.run(program.main)
+"""
+
+
+def test_a_new_method_runs_through_every_program(capture_folder, tmp_path):
+    tests = pathlib.Path(__file__).parent
+    path = os.pathsep.join([str(tests.parent), str(tests)])
+    environment = os.environ | {"PYTHONPATH": path, "XLA_FLAGS": ""}
+
+    def call(program, folder, *given):
+        done = subprocess.run(
+            [sys.executable, "-c", NEW_METHOD, program, f"--output_dir={folder}", *given],
+            env=environment,
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, done.stderr[-2000:]
+        return done.stdout
+
+    trained, training = tmp_path / "run", ("--method=constant", "--set=lr=0.2")
+    call("run", trained, f"--scene={capture_folder}", *training)
+    results = json.loads((trained / "results.json").read_text())
+    assert results["method"] == "constant" and results["config"]["field"] == {"lr": 0.2}
+    assert set(results["stages"]) >= {"baseline", "control", "closeup", "test_time"}
+    assert "constant, preset quick" in (trained / "report.html").read_text()
+    swept = tmp_path / "sweep"
+    arms = "--arms=control,label_loss_weight=0.9"
+    call("sweep", swept, f"--scenes={capture_folder}", "--seeds=1", arms, *training)
+    assert set(json.loads((swept / "sweep.json").read_text())["scenes"]["plane0"]) == {
+        "control",
+        "label_loss_weight=0.9",
+    }
+    rendered = tmp_path / "render"
+    call("render", rendered, f"--run={trained}", "--views=test")
+    assert (rendered / "rgb" / "0.png").exists() and (rendered / "support" / "0.png").exists()
+    assert not (rendered / "normals").exists()
