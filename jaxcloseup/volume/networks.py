@@ -1,7 +1,7 @@
 """The network of a NeRF, features first: activations are `[features, samples]`.
 
 Samples are the long axis of every product and, being last, contiguous, which makes the backward
-pass fast on a CPU. A layer with several inputs has one matrix per input, so nothing is concatenated.
+pass fast on a CPU. A layer with several inputs has one matrix per input: nothing is concatenated.
 """
 
 import functools
