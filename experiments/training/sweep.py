@@ -236,8 +236,9 @@ def train_in_turn(
     if arm.kind == "test_time":
         steps = programs.method.target_steps(preset.field, len(scene.test))
     try:
-        data = scene.train, labels, arm.settings
-        state = training.train(name, "target_views", start.state, *data, steps=steps)
+        state = training.train(
+            name, "target_views", start.state, scene.train, labels, arm.settings, steps=steps
+        )
     except TrainingError as error:
         print(f"{name} is left out: {error}")
         return

@@ -334,8 +334,7 @@ def _image_loss(seen, target_rgb, weight, ssim_weight):
 
 def _match_colors(seen, target_rgb, weight, ridge):
     """Rendered colors after the affine map that takes them closest to the target."""
-    data = jax.lax.stop_gradient(seen), target_rgb, weight
-    matrix, offset = fit_colors(*data, ridge=ridge)
+    matrix, offset = fit_colors(jax.lax.stop_gradient(seen), target_rgb, weight, ridge=ridge)
     any_weight = jnp.sum(weight) > 0
     matrix = jnp.where(any_weight, matrix, jnp.eye(3, dtype=matrix.dtype))
     return matmul(seen, matrix[None]) + jnp.where(any_weight, offset, 0)[None, None]
