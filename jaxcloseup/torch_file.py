@@ -82,7 +82,7 @@ def _read_legacy(path):
             (count,) = struct.unpack("<q", file.read(8))
             kind = np.dtype(kinds[key])
             storages[key] = np.frombuffer(file.read(count * kind.itemsize), kind, count)
-    return {name: _view(storages[wait.storage], *wait.form) for name, wait in found.items()}
+    return {name: _view(storages[tensor.storage], *tensor.form) for name, tensor in found.items()}
 
 
 class _Pending(collections.namedtuple("_Pending", "storage form")):

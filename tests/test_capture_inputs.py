@@ -157,7 +157,7 @@ XYZ = (
             "ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n1\n",
             "plain properties x, y, z",
         ),
-        (XYZ.format(-1, ""), "-1 of them"),
+        (XYZ.format(-1, ""), "a count of -1"),
         (XYZ.format(1, "property float x\n") + "1 2 3 4\n", "a property name appears twice"),
         (XYZ.format(1, "") + "a b c\n", "has words instead of numbers"),
         (XYZ.format(2, "") + "1 2 3\n", "ends before its 2 vertices do"),

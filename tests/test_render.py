@@ -172,7 +172,11 @@ def copy_of(kept, folder, name, change):
         ("manifest.json", lambda a: a | {"scene": "/nowhere"}, "/nowhere is not a folder"),
         ("manifest.json", lambda a: a | {"load_options": {"lens": 3}}, "options that this version"),
         ("manifest.json", lambda a: a | {"load_options": {"downscale": 2}}, "was trained with"),
-        ("checkpoints/run.json", lambda a: a | {"config": {}}, "cannot read the configuration"),
+        (
+            "checkpoints/run.json",
+            lambda a: a | {"config": {}},
+            "whose configuration this version",
+        ),
         ("checkpoints/run.json", lambda a: a, "does not hold this run's state"),
     ],
 )

@@ -8,7 +8,7 @@ from jaxcloseup.geometry.rotations import euler_to_matrix, matrix_to_euler, quat
 
 
 def about(axis, angle):
-    """The rotation about one axis, by OpenCV."""
+    """Rotation matrix about one axis, from OpenCV."""
     return cv2.Rodrigues(np.eye(3)[axis] * angle)[0]
 
 

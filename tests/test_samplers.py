@@ -41,8 +41,10 @@ def test_importance_quantiles_match_the_oracle(key):
     edges = 1 + jnp.cumsum(jax.random.uniform(key_edges, (5, 13)) + 0.01, axis=-1)
     samples = importance(None, edges, weights, 33)
     for ours, e, w in zip(*map(np.asarray, (samples, edges, weights)), strict=True):
-        expected = reference.invert_cdf(e, w, np.linspace(0, 1, 33))
-        np.testing.assert_allclose(ours, expected, rtol=2e-5)
+        # In a nearly empty bin the inverse is steep: float32 rounds the CDF by up to 5e-7.
+        low, high = (reference.invert_cdf(e, w, np.linspace(0, 1, 33) + r) for r in (-5e-7, 5e-7))
+        np.testing.assert_array_less(ours, high * (1 + 2e-5))
+        np.testing.assert_array_less(low * (1 - 2e-5), ours)
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-20, 1e20])

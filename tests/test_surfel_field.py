@@ -9,14 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import plane
 import pytest
-from splat_scenes import COUNT, SCENES, random_scene, to_camera, to_surfels
+from splat_scenes import random_scene, to_camera, to_surfels
 
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.metrics import psnr
 from jaxcloseup.splats import RasterizeConfig
 from jaxcloseup.splats.field import (
-    SurfelBuffers,
     SurfelConfig,
     camera_extent,
     surfel_field,
@@ -287,25 +286,24 @@ def test_without_density_control_only_the_schedule_changes(trained):
     assert (after.buffers.degree, after.buffers.regularize) == (1, 1)
 
 
-def test_a_field_with_more_capacity_renders_what_overflowed():
+def test_a_field_with_more_capacity_renders_what_overflowed(trained, capture):
     """A caller doubles the capacity until everything fits, with the same parameters and buffers."""
-    params, camera = to_surfels(SCENES["in front"]), to_camera()
-    zero = jnp.float32(0)
-    buffers = SurfelBuffers(jnp.ones(COUNT, bool), jnp.int32(1), zero, zero)
+    state, camera = trained[0], jax.tree.map(lambda leaf: leaf[0], capture[0].cameras)
 
     def render_with(capacity):
         raster = dataclasses.replace(CONFIG.raster, capacity=capacity)
         field = surfel_field(dataclasses.replace(CONFIG, raster=raster), extent=EXTENT)
-        return jax.jit(field.render)(params, buffers, camera, None, None)
+        return jax.jit(field.render)(state.params, state.buffers, camera, None, None)
 
-    capacity = 40
+    capacity = 300
     image = render_with(capacity)
     assert image.overflow > 0
     while int(image.overflow) > 0:
         capacity *= 2
         image = render_with(capacity)
-    assert 40 < capacity < CONFIG.raster.capacity
-    jax.tree.map(np.testing.assert_array_equal, image, render_with(CONFIG.raster.capacity))
+    assert 300 < capacity < CONFIG.raster.capacity
+    ample = render(state.params, state.buffers, camera)
+    jax.tree.map(np.testing.assert_array_equal, image, ample)
     np.testing.assert_array_equal(image.normal, image.aux.surfels.normal)
 
 

@@ -187,7 +187,7 @@ def _count(surfels, camera, config):
 
 
 def _render_by_scan(surfels, camera, config, longest):
-    """Composite all tiles in step, one splat of each at a time."""
+    """Blend all tiles in step, one splat of each at a time."""
     splats = _footprints(surfels, camera, config)
     lists = _lists(splats, camera, config)
     starts, counts, origins = (a[:, 0] for a in (lists.starts, lists.counts, lists.origins))

@@ -74,12 +74,14 @@ def _leaves(record, before=()):
         value, path = getattr(record, field.name), (*before, field.name)
         if dataclasses.is_dataclass(value):
             yield from _leaves(value, path)
-        elif not _may_be_record(kinds[field.name]):
+        elif _is_plain(kinds[field.name]):
             yield path, kinds[field.name], value
 
 
-def _may_be_record(kind):
-    return any(dataclasses.is_dataclass(choice) for choice in _choices(kind))
+def _is_plain(kind):
+    """Whether texts can give its values; records come with a preset."""
+    kinds = {typing.get_origin(choice) or choice for choice in _choices(kind)}
+    return kinds <= {int, float, bool, str, tuple, type(None)}
 
 
 def _choices(kind):

@@ -2,8 +2,6 @@
 
 import dataclasses
 import math
-import types
-import typing
 from collections.abc import Mapping
 from typing import Any
 
@@ -33,15 +31,26 @@ def preset_from_config(
         stored = from_version_0_1(stored, method)
     if stored["method"] not in METHODS:
         raise ValueError(f"there is no method {stored['method']}")
-    field = next(iter(METHODS[stored["method"]].presets.values())).field
+    records: dict[str, set[type]] = {}
+    for preset in METHODS[stored["method"]].presets.values():
+        _collect(preset, "config", records)
     absent: dict[str, Any] = {}
-    preset = _rebuild(Preset, stored, "config", absent, {"field": type(field)})
+    preset = _rebuild(stored, "config", records, absent)
     again = plain_config(preset)
     for name in absent:
         _remove(again, name)
     if again != stored:
         raise ValueError("a value has another type")
     return preset, {name.split(".")[-1]: value for name, value in absent.items()}
+
+
+def _collect(record, name, records):
+    """The types of records in a preset, by the path where they are."""
+    records.setdefault(name, set()).add(type(record))
+    for field in dataclasses.fields(record):
+        value = getattr(record, field.name)
+        if dataclasses.is_dataclass(value):
+            _collect(value, f"{name}.{field.name}", records)
 
 
 def _remove(config, name):
@@ -51,23 +60,21 @@ def _remove(config, name):
     del config[last]
 
 
-def _rebuild(kind, value, name, absent, kinds=None):
+def _rebuild(value, name, records, absent):
     if value == "inf":
         return math.inf
     if isinstance(value, list):
-        return tuple(_rebuild(Any, inner, name, absent) for inner in value)
+        return tuple(_rebuild(inner, name, records, absent) for inner in value)
     if not isinstance(value, Mapping):
         return value
-    choices = typing.get_args(kind) if isinstance(kind, types.UnionType) else (kind,)
-    choices = [choice for choice in choices if dataclasses.is_dataclass(choice)]
-    if not choices:
+    if name not in records:
         raise ValueError(f"{name} holds fields")
-    # The run holds one of these records: the one that shares most fields with it.
-    choice = max(choices, key=lambda one: len(_names(one) & set(value)))
+    # The run stored one of these records: the one that shares most fields with it.
+    choices = sorted(records[name], key=lambda record: record.__name__)
+    choice = max(choices, key=lambda record: len(_names(record) & set(value)))
     if unknown := sorted(set(value) - _names(choice)):
         raise ValueError(f"{name} has {', '.join(unknown)}, which this version does not know")
-    kinds = typing.get_type_hints(choice) | (kinds or {})
-    known = {k: _rebuild(kinds[k], v, f"{name}.{k}", absent) for k, v in value.items()}
+    known = {k: _rebuild(v, f"{name}.{k}", records, absent) for k, v in value.items()}
     for field in dataclasses.fields(choice):
         if field.name not in value:
             if field.default is dataclasses.MISSING:
