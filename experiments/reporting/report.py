@@ -165,8 +165,8 @@ def _label_plots(labels, left_out):
     text = (
         "Each plot shows the mean error of the labels kept so far; lower is better. <i>By "
         "agreement</i> keeps the labels first whose two warps agree best, as the mask does. <i>By "
-        "true error</i> keeps the best labels first, which no mask can beat. AUSE, the area between "
-        "the two curves relative to the error of all labels, is 0 for a perfect mask."
+        "true error</i> keeps the best labels first, which no mask can beat. AUSE, the area "
+        "between the two curves relative to the error of all labels, is 0 for a perfect mask."
     )
     if left_out is not None:
         more = names | {"model": "model's own error"}
@@ -213,8 +213,8 @@ def _gate_table(gate):
         "photographs one by one and labels them from the others. Each row shows, for one pair of "
         "tolerances, the share of pixels with a label, and the PSNR of the labels and of the model "
         "on these pixels. The model was trained on these photographs, so labels may score below "
-        "it and still help elsewhere. The first row decides, because labels do harm on scenes where "
-        f"few of them agree so closely. Here {html.escape(verdict(gate))}.</p><table><tr>"
+        "it and still help elsewhere. The first row decides, because labels do harm on scenes "
+        f"where few of them agree so closely. Here {html.escape(verdict(gate))}.</p><table><tr>"
         "<th>color tolerance<th>depth tolerance<th>share with a label<th>PSNR of labels (dB)"
         f"<th>PSNR of the model (dB){lines}</table>"
     )

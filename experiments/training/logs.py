@@ -131,7 +131,7 @@ class _EventFile:
         self._add(step=0, session_log={"status": "START"})
 
     def write(self, step, numbers, images=None, *, ago=0.0):
-        """Write the numbers and images of a step that ended `ago` seconds ago; skip other values."""
+        """Write the numbers and images of a step that ended `ago` seconds ago; skip the rest."""
         values = [
             {"tag": tag, "simple_value": number}
             for tag, number in numbers.items()
