@@ -19,7 +19,7 @@ OFF = 1.1  # trained depth over exact depth
 
 
 def surface(camera):
-    """The plane z = 0 with smooth colors, for any camera."""
+    """Return the exact surface of the plane z = 0 with smooth colors."""
     origins, directions = pixels_to_rays(camera, pixel_grid(camera.height, camera.width))
     depth = -origins[..., 2] / directions[..., 2]
     points = origins + depth[..., None] * directions

@@ -35,7 +35,7 @@ def ladder():
     return scene, ladder_targets(scene, exact)
 
 
-def test_every_rung_is_nearer_to_one_point_by_its_magnification(ladder):
+def test_each_rung_is_magnification_times_nearer_to_one_point(ladder):
     scene, targets = ladder
     assert list(targets) == [f"zoom_{m}" for m in MAGNIFICATIONS]
     for i, name in enumerate(scene.names["test_far"]):

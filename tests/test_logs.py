@@ -40,12 +40,12 @@ def clock(monkeypatch):
     return clock
 
 
-def train(clock, folder, stage, *, history, begun=0, **options):
+def train(clock, folder, stage, *, history, resumed=0, **options):
     """Log chunks of 5 seconds each, after a pause of 100 seconds."""
     clock.now += 100
     log = TrainLog(folder, **options)
-    log.begin(stage, history[:begun])
-    for entry in history[begun:]:
+    log.begin(stage, history[:resumed])
+    for entry in history[resumed:]:
         clock.now += 5
         log.write(entry)
     return log
@@ -82,8 +82,8 @@ def test_steps_after_the_checkpoint_are_logged_once(tmp_path, clock, torn):
     first = read_lines(tmp_path)
     with (tmp_path / "stats" / "train.jsonl").open("ab") as file:
         file.write(torn)
-    train(clock, tmp_path, "baseline", history=HISTORY[:2], begun=2)
-    train(clock, tmp_path, "closeup", history=HISTORY, begun=1)
+    train(clock, tmp_path, "baseline", history=HISTORY[:2], resumed=2)
+    train(clock, tmp_path, "closeup", history=HISTORY, resumed=1)
     lines = read_lines(tmp_path)
     assert lines[:3] == first[:3]
     logged = [(line["stage"], line["step"]) for line in lines[3:]]
@@ -93,7 +93,7 @@ def test_steps_after_the_checkpoint_are_logged_once(tmp_path, clock, torn):
 
 
 def test_a_lost_line_is_restored_from_the_checkpoint(tmp_path, clock):
-    train(clock, tmp_path, "baseline", history=HISTORY, begun=3)
+    train(clock, tmp_path, "baseline", history=HISTORY, resumed=3)
     lines = read_lines(tmp_path)
     assert [line["loss"] for line in lines] == [entry["loss"] for entry in HISTORY]
     assert [line["seconds"] for line in lines] == [None] * 3 + [5]
@@ -155,7 +155,7 @@ def test_event_files_match_the_history_and_never_go_backwards(tmp_path, clock):
     pytest.importorskip("tensorboardX", reason='needs tensorboardX (the extra "tensorboard")')
     log = train(clock, tmp_path, "closeup", history=HISTORY[:3], tensorboard=True)
     train(
-        clock, tmp_path, "closeup", history=HISTORY, begun=1, tensorboard=True
+        clock, tmp_path, "closeup", history=HISTORY, resumed=1, tensorboard=True
     )  # the first log was killed
     del log
     log = TrainLog(tmp_path, tensorboard=True)

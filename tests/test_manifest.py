@@ -94,10 +94,10 @@ def test_the_hash_of_target_views_covers_their_cameras(capture_folder):
 
 def test_a_sweep_writes_a_manifest(capture_folder, tmp_path, monkeypatch):
     flags.FLAGS(["sweep"])
-    begun = {}
+    started = {}
 
     def stub(scene, preset, arms, seeds, folder, *, seconds, **options):
-        begun.update(json.loads((tmp_path / "out" / "manifest.json").read_text()))
+        started.update(json.loads((tmp_path / "out" / "manifest.json").read_text()))
         seconds["baseline_0"] = 1.5
         return SweepOutcome({}, {}, {})
 
@@ -107,7 +107,7 @@ def test_a_sweep_writes_a_manifest(capture_folder, tmp_path, monkeypatch):
     given = {"output_dir": str(tmp_path / "out"), "scenes": [str(capture_folder)], "downscale": 1}
     with flagsaver.flagsaver(compilation_cache="", arms=["control"], seeds=2, **given):
         sweep.main(["sweep"])
-    assert begun["finished"] is False and begun["seconds"] is None
+    assert started["finished"] is False and started["seconds"] is None
     after = json.loads((tmp_path / "out" / "manifest.json").read_text())
     name = capture_folder.name
     assert after["finished"] and after["seconds"] == {name: {"baseline_0": 1.5}}

@@ -78,7 +78,7 @@ def test_counts_and_footprints_match_the_definition(capture):
     assert np.isinf(np.asarray(found.footprint)[3:6, 4:9]).all()
 
 
-def test_a_footprint_is_the_ratio_of_distances_times_the_ratio_of_focal_lengths():
+def test_a_footprint_is_the_distance_ratio_times_the_focal_length_ratio():
     views, depths = plane.make_views([plane.camera_above(0.0, 0.0, 4.0)])
     near = plane.camera_above(0.0, 0.0, 1.0)
     near = near.replace(intrinsics=near.intrinsics * jnp.array([2.0, 2, 1, 1]))

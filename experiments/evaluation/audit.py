@@ -229,8 +229,8 @@ def audit_left_out(
 ) -> list[dict[str, float | None]]:
     """Compare labels of left-out training photographs, and the model, with these photographs.
 
-    The model was trained on them, so its error is as small as it can be. Labels that beat the model
-    here beat it anywhere.
+    The model was trained on them, so its error is as small as it can be. Labels that beat it even
+    here are better than the model.
 
     Args:
       sources: the training photographs with their depths.

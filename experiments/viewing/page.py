@@ -163,7 +163,7 @@ class Viewer:
         shown = gui.add_checkbox("training cameras", initial_value=True)
         shown.on_update(lambda _: setattr(self._cameras, "visible", shown.value))
         buttons = {
-            "Camera here": self._on_here,
+            "Place camera here": self._on_here,
             "Render": functools.partial(self._on_render, tuned=False),
             "Fine-tune and render": functools.partial(self._on_render, tuned=True),
             "Download PNG": self._on_download,
