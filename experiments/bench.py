@@ -1,7 +1,7 @@
 """Benchmarks: `python -m experiments.bench --suite=nerf,warp`.
 
-Each suite measures its alternatives and its ceiling in one process, interleaved, and prints medians
-and ratios. Absolute times belong to the machine and the hour; ratios carry over.
+Each suite times its alternatives and its upper bound in one process, in turns, and prints medians
+and ratios. Absolute times depend on the machine and its load; ratios carry over to other machines.
 """
 
 import importlib
@@ -11,7 +11,7 @@ from absl import app, flags
 
 SUITES = ("nerf", "warp", "labels", "splats", "sweep", "resume")
 
-_SUITE = flags.DEFINE_list("suite", ["nerf", "warp"], f"suites to run, of {', '.join(SUITES)}")
+_SUITE = flags.DEFINE_list("suite", ["nerf", "warp"], f"suites to run: {', '.join(SUITES)}")
 
 
 def main(_: list[str]) -> None:
@@ -20,7 +20,7 @@ def main(_: list[str]) -> None:
         importlib.import_module(f"experiments.benchmarks.{suite}").run()
 
 
-@flags.multi_flags_validator(["suite"], message=f"--suite takes names out of {', '.join(SUITES)}")
+@flags.multi_flags_validator(["suite"], message=f"--suite takes names from {', '.join(SUITES)}")
 def _known(values: dict[str, list[str]]) -> bool:
     return bool(values["suite"]) and set(values["suite"]) <= set(SUITES)
 

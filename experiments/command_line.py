@@ -1,4 +1,4 @@
-"""Flags and set-up that the programs of `experiments` share."""
+"""Flags and setup that the programs of `experiments` share."""
 
 import logging
 import pathlib
@@ -15,38 +15,40 @@ FLAGS = flags.FLAGS
 flags.DEFINE_string(
     "lpips_weights",
     None,
-    "folder of the weights of LPIPS, vgg16-*.pth with vgg.pth or alexnet-*.pth with alex.pth; "
+    "folder of LPIPS weights: vgg16-*.pth with vgg.pth, or alexnet-*.pth with alex.pth; "
     "default: $JAXCLOSEUP_LPIPS, or PyTorch's cache",
 )
 flags.DEFINE_string(
     "compilation_cache",
     None,
-    "folder of compiled programs, kept between runs; empty: none; default: under ~/.cache",
+    "folder that keeps compiled programs between runs; empty: no cache; default: under ~/.cache",
 )
-
-
 flags.DEFINE_string(
     "output_dir",
     None,
-    "where results go; default outputs/<scene>/<method>/<date_time>, and of renders "
-    "<run>/videos/<date_time>",
+    "folder for results; default: outputs/<scene>/<method>/<date_time>, and for "
+    "experiments.render <run>/videos/<date_time>",
 )
 
 
 def set_up() -> None:
-    """Compile into the cache of the flags, and say only what concerns the user."""
+    """Set up the compilation cache, and silence messages that do not concern the user."""
     set_up_compilation_cache(FLAGS.compilation_cache)
-    # Warnings are sentences for the user; notes on absent accelerators, on every file of a
-    # checkpoint, or that are printed anyway are not.
+    # The program's own warnings are sentences for the user. Notes about missing accelerators, about
+    # every file of a checkpoint, and repeats of what the program prints are not.
     warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
     logging.getLogger("jax._src.xla_bridge").setLevel(logging.WARNING)
     logging.getLogger("jaxcloseup").setLevel(logging.WARNING)
-    # Errors of Orbax come with a traceback, and are raised too.
+    # Orbax logs errors with a traceback, and raises them too.
     logging.getLogger("absl").setLevel(logging.CRITICAL)
 
 
 def set_up_compilation_cache(folder: str | None) -> None:
-    """Keep compiled programs on disk, so that the next run starts at once."""
+    """Keep compiled programs on disk, so that the next run starts faster.
+
+    Args:
+      folder: cache folder; None for the default one, empty for no cache.
+    """
     if folder is None:
         folder = str(cache_folder() / "jaxcloseup" / "xla")
     if folder:
@@ -55,29 +57,30 @@ def set_up_compilation_cache(folder: str | None) -> None:
 
 
 def check_unused(folder: str | pathlib.Path) -> pathlib.Path:
-    """The path of a folder that does not exist yet or is empty.
+    """Return the path of an output folder, which must be empty or not exist yet.
 
     Raises:
-      FileExistsError: it holds something.
+      FileExistsError: the folder holds files, or the path is a file.
     """
     path = pathlib.Path(folder)
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise FileExistsError(
-            f"--output_dir={folder} already holds something: name a new folder, or remove it first"
+            f"--output_dir={folder} already exists and is not empty: name a new folder, or remove "
+            "it first"
         )
     return path
 
 
-def make(folder: pathlib.Path) -> None:
-    """Make a folder for results, with those around it, if it is not there.
+def make_output_dir(folder: pathlib.Path) -> None:
+    """Create the output folder and its parents if they do not exist.
 
     Raises:
-      OSError: it cannot be made.
+      OSError: the folder cannot be created.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OSError(
-            f"--output_dir={folder} cannot be made ({error.strerror}): name a folder where you may "
-            "write"
+            f"--output_dir={folder} cannot be created ({error.strerror}): name a folder where you "
+            "may write"
         ) from error

@@ -1,9 +1,9 @@
-"""Score anyone's renders: a folder of images against a folder of the true ones.
+"""Score a folder of rendered images against a folder of true images, whatever made them.
 
     python -m experiments.evaluate --renders=renders/rgb --truth=capture/test --output=metrics.json
 
-Pairs are matched by name, whatever the ending. Metrics are those of experiments.run, on 8-bit
-colors: means over images, and each image's own.
+The program pairs images by file name, ignoring the ending. It computes the image metrics of
+experiments.run on 8-bit colors, and writes the means over images and the metrics of each image.
 """
 
 import pathlib
@@ -27,20 +27,26 @@ from jaxcloseup.scenes import SceneError
 FLAGS = flags.FLAGS
 for _name in ("lpips_weights", "compilation_cache"):
     flags.declare_key_flag(_name)
-flags.DEFINE_string("renders", None, "folder of images to score")
-flags.DEFINE_string("truth", None, "folder of what they should be")
-flags.DEFINE_string("masks", None, "folder of masks, white where pixels count; default: all count")
-flags.DEFINE_string("output", "metrics.json", "file to write; never one that exists")
+flags.DEFINE_string("renders", None, "folder of rendered images to score")
+flags.DEFINE_string("truth", None, "folder of true images with the same names")
+flags.DEFINE_string(
+    "masks", None, "folder of masks, white where pixels count; default: all pixels count"
+)
+flags.DEFINE_string("output", "metrics.json", "JSON file to write; it must not exist yet")
 
 ENDINGS = {".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"}
-SHOWN = 3
+_NAMES_IN_MESSAGE = 3
 
 
 def images_by_name(flag: str, folder: str | None) -> dict[str, pathlib.Path]:
-    """The images of a folder by their names without ending.
+    """Return the paths of a folder's images by file name without ending.
+
+    Args:
+      flag: name of the flag that gave the folder, for error messages.
+      folder: the folder, or None where the flag is missing.
 
     Raises:
-      ValueError: there is no such folder, no image in it, or two of one name.
+      ValueError: the folder does not exist, holds no image, or holds two images of one name.
     """
     if folder is None or not pathlib.Path(folder).is_dir():
         raise ValueError(f"--{flag}={folder or ''} is not a folder: name a folder of images")
@@ -50,7 +56,7 @@ def images_by_name(flag: str, folder: str | None) -> dict[str, pathlib.Path]:
             continue
         if path.stem in found:
             raise ValueError(
-                f"--{flag}={folder} has two images of one name, {found[path.stem].name} and "
+                f"--{flag}={folder} has two images with the same name, {found[path.stem].name} and "
                 f"{path.name}: remove one"
             )
         found[path.stem] = path
@@ -62,27 +68,27 @@ def images_by_name(flag: str, folder: str | None) -> dict[str, pathlib.Path]:
 def evaluate_folders(
     renders: str | None, truth: str | None, masks: str | None, perceptual: Perceptual
 ) -> dict:
-    """Score every render against the true image of its name.
+    """Score every render against the true image with its name.
 
     Args:
-      renders: folder of images to score.
-      truth: folder of what they should be.
-      masks: folder of masks, or None.
-      perceptual: networks of LPIPS.
+      renders: folder of rendered images to score.
+      truth: folder of true images.
+      masks: folder of masks, or None where all pixels count.
+      perceptual: LPIPS networks.
 
     Returns:
-      Means over images and, by name, each image's metrics in `views`.
+      The mean of each metric over images, and in `views` the metrics of each image by name.
 
     Raises:
-      ValueError: names or sizes do not match; one sentence that says which.
+      ValueError: names or sizes do not match; the message is one sentence that names them.
       SceneError: an image cannot be read.
     """
     pairs, true = images_by_name("renders", renders), images_by_name("truth", truth)
     weights = {} if masks is None else images_by_name("masks", masks)
-    _match(f"--renders={renders}", pairs, f"--truth={truth}", true)
-    _match(f"--truth={truth}", true, f"--renders={renders}", pairs)
+    _check_names(f"--renders={renders}", pairs, f"--truth={truth}", true)
+    _check_names(f"--truth={truth}", true, f"--renders={renders}", pairs)
     if masks is not None:
-        _match(f"--masks={masks}", weights, f"--renders={renders}", pairs)
+        _check_names(f"--masks={masks}", weights, f"--renders={renders}", pairs)
     views = {}
     for name, path in pairs.items():
         image, target = read_image(path), read_image(true[name])
@@ -92,21 +98,22 @@ def evaluate_folders(
         for other, what in ((target, true[name]), (weight, weights.get(name))):
             if other.shape[:2] != image.shape[:2]:
                 raise ValueError(
-                    f"{path} has {_size(image)} pixels and {what} {_size(other)}: render at the "
-                    "size of the truth, for resizing would change the metrics"
+                    f"{path} has {_size(image)} pixels but {what} has {_size(other)}: render at "
+                    "the size of the true image, because resizing changes the metrics"
                 )
         arrays = (to_float(jnp.asarray(array)) for array in (image, target, weight))
         views[name] = score_image(*arrays, perceptual)
     return summarize(views)
 
 
-def _match(some, these, other, those):
-    missing = [name for name in those if name not in these]
+def _check_names(folder, names, other, other_names):
+    missing = [name for name in other_names if name not in names]
     if missing:
-        more = f" and {len(missing) - SHOWN} more" if len(missing) > SHOWN else ""
+        shown = _NAMES_IN_MESSAGE
+        more = f" and {len(missing) - shown} more" if len(missing) > shown else ""
         raise ValueError(
-            f"{some} lacks {', '.join(missing[:SHOWN])}{more}, of which {other} has images: names "
-            "must match one to one"
+            f"{folder} has no image named {', '.join(missing[:shown])}{more}, but {other} has: "
+            "give both folders the same names"
         )
 
 
@@ -115,7 +122,7 @@ def _size(image):
 
 
 def main(argv: list[str]) -> None:
-    """Score the folders of the flags."""
+    """Score the folders that the flags name."""
     if len(argv) > 1:
         raise app.UsageError(f"unexpected argument: {argv[1]}")
     set_up()

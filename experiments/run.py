@@ -16,7 +16,7 @@ from typing import Any
 import jax
 from absl import app, flags
 
-from experiments.command_line import make, set_up
+from experiments.command_line import make_output_dir, set_up
 from experiments.evaluation.scores import NO_PERCEPTUAL, Perceptual, find_perceptual
 from experiments.methods import Preset
 from experiments.reporting.report import print_table
@@ -116,7 +116,7 @@ def main(argv: list[str]) -> None:
         load_options = training_flags.load_options_from_flags(preset)
         scene = training_flags.load(FLAGS.scene, load_options)
         perceptual = find_perceptual(FLAGS.lpips_weights)
-        make(output_dir)
+        make_output_dir(output_dir)
     except (SceneError, OSError, ValueError) as error:
         sys.exit(f"experiments.run: {error}")
     try:

@@ -17,7 +17,7 @@ from typing import Any
 import jax
 from absl import app, flags
 
-from experiments.command_line import make, set_up
+from experiments.command_line import make_output_dir, set_up
 from experiments.evaluation.scores import Perceptual, find_perceptual
 from experiments.methods import Preset
 from experiments.reporting.pictures import comparisons
@@ -132,7 +132,7 @@ def main(argv: list[str]) -> None:
         load_options = training_flags.load_options_from_flags(preset)
         scenes = [training_flags.load(name, load_options) for name in FLAGS.scenes]
         _check_scenes(scenes, output_dir)
-        make(output_dir)
+        make_output_dir(output_dir)
     except (SceneError, OSError, ValueError) as error:
         sys.exit(f"experiments.sweep: {error}")
     if hosts is not None:

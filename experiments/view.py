@@ -1,11 +1,11 @@
-"""Look at a finished or cut-off run in a browser, choose close-ups there and have them rendered.
+"""View a finished or interrupted run in a browser, and choose close-ups to render there.
 
     python -m experiments.view --run=outputs/table/surfels/...
 
-Surfels are shown as Gaussian splats, of a NeRF the points that it began with. A click on the scene
-puts a camera in front of what is there, a click on a training camera brings one there. What is
-shown below the buttons is rendered by the run's own renderer. All who look share one camera and one
-picture. Needs the extra "viewer".
+The page shows surfels as Gaussian splats, and a NeRF as the points that it started from. A click on
+the scene puts a close-up camera in front of that point; a click on a training camera moves you to
+it. The run's own renderer makes the pictures below the buttons. All visitors share one close-up
+camera and one picture. The program needs the extra "viewer".
 """
 
 import contextlib
@@ -15,7 +15,7 @@ from absl import app, flags
 
 from experiments.command_line import set_up
 from experiments.training.stored_run import RunError, load_run_scene, restore
-from experiments.viewing.flags import named_run
+from experiments.viewing.flags import run_from_flags
 from jaxcloseup.artifacts.checkpoints import CheckpointError
 from jaxcloseup.scene import SceneError
 
@@ -23,12 +23,14 @@ from jaxcloseup.scene import SceneError
 FLAGS = flags.FLAGS
 for _name in ("run", "stage", "data", "set"):
     flags.declare_key_flag(_name)
-flags.DEFINE_string("host", "127.0.0.1", "address to serve at; by default for this computer alone")
+flags.DEFINE_string(
+    "host", "127.0.0.1", "address to serve at; the default serves this computer only"
+)
 flags.DEFINE_integer("port", 7007, "port to serve at", lower_bound=1, upper_bound=65535)
 
 
 def main(argv: list[str]) -> None:
-    """Serve the run that the flags name until interrupted."""
+    """Serve the run that the flags name until Ctrl-C."""
     if len(argv) > 1:
         raise app.UsageError(f"unexpected argument: {argv[1]}")
     set_up()
@@ -37,21 +39,23 @@ def main(argv: list[str]) -> None:
     except ModuleNotFoundError as error:
         if error.name != "viser":
             raise
-        sys.exit('experiments.view: needs viser: install jaxcloseup with the extra "viewer"')
+        sys.exit('experiments.view: viser is missing: install jaxcloseup with the extra "viewer"')
     try:
-        record, stage = named_run()
+        record, stage = run_from_flags()
         server.check_address(FLAGS.host, FLAGS.port)
         scene = load_run_scene(record, FLAGS.data)
         programs, state = restore(record, scene, stage)
-        server = server.serve(FLAGS.host, FLAGS.port)
-        page = page.Viewer(server, programs, state, stage=stage, seed=record.identity["seed"])
+        viser_server = server.serve(FLAGS.host, FLAGS.port)
+        viewer = page.Viewer(
+            viser_server, programs, state, stage=stage, seed=record.identity["seed"]
+        )
     except (RunError, server.ServeError, SceneError, CheckpointError, OSError) as error:
         sys.exit(f"experiments.view: {error}")
-    print(f"open http://{FLAGS.host}:{FLAGS.port} in a browser; Ctrl-C ends this", flush=True)
+    print(f"open http://{FLAGS.host}:{FLAGS.port} in a browser; press Ctrl-C to stop", flush=True)
     with contextlib.suppress(KeyboardInterrupt):
         while True:
-            page.work()
-    server.stop()
+            viewer.work()
+    viser_server.stop()
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Headless Chromium by the W3C WebDriver protocol, as far as tests need it."""
+"""A minimal W3C WebDriver client for headless Chromium, with what the tests need."""
 
 import base64
 import contextlib
@@ -21,12 +21,13 @@ NO_PROXY = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 
 
 def free_port():
+    """Return a port of this computer that is free."""
     with socket.create_server(("127.0.0.1", 0)) as one:
         return one.getsockname()[1]
 
 
 class Browser:
-    """One window."""
+    """One browser window."""
 
     def __init__(self, address):
         self.session = address + "/session"
@@ -48,7 +49,7 @@ class Browser:
         self.call("POST", "/url", {"url": url})
 
     def wait(self, script, *arguments, seconds=30):
-        """What a script returns, as soon as that is something."""
+        """Run a script until it returns something true, and return that."""
         end = time.monotonic() + seconds
         while not (found := self.run(script, *arguments)):
             assert time.monotonic() < end, f"still nothing: {script}"
@@ -56,14 +57,14 @@ class Browser:
         return found
 
     def press(self, text):
-        """Click on the button with this text."""
+        """Click the button with this text."""
         script = "return [...document.querySelectorAll('button')].find("
         script += "one => one.innerText.trim() == arguments[0])"
         element = self.wait(script, text)
         self.call("POST", f"/element/{next(iter(element.values()))}/click", {})
 
     def click_in_the_middle(self):
-        """Click on whatever is in the middle of the window."""
+        """Click in the middle of the window."""
         x, y = self.run("return [innerWidth, innerHeight].map(side => Math.floor(side / 2))")
         moves = [{"type": "pointerMove", "x": x, "y": y}, {"type": "pause", "duration": 200}]
         presses = [{"type": "pointerDown", "button": 0}, {"type": "pointerUp", "button": 0}]
@@ -71,13 +72,13 @@ class Browser:
         self.call("POST", "/actions", {"actions": [mouse]})
 
     def screenshot(self):
-        """Bytes of a PNG."""
+        """Return a PNG of the window, as bytes."""
         return base64.b64decode(self.call("GET", "/screenshot"))
 
 
 @contextlib.contextmanager
 def open_browser():
-    """A browser, while it lasts; skips where there is none."""
+    """Open a browser for the duration of the context; skip the test if none is installed."""
     if not (shutil.which("chromium") or shutil.which("google-chrome")):
         pytest.skip("needs Chromium (Debian's package chromium)")
     if not shutil.which("chromedriver"):

@@ -1,4 +1,4 @@
-"""A world simple enough to know by heart: a textured plane z = 0, photographed from above."""
+"""A simple world with known answers: a textured plane z = 0, photographed from above."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +11,7 @@ HEIGHT, WIDTH, FOCAL = 24, 32, 30.0
 
 
 def camera_above(x, y, height, *, tilt=0.0):
-    """A camera that looks down on the plane, its right along +x; `tilt` turns it about its x."""
+    """Return a camera that looks down on the plane, its right along +x, turned `tilt` about x."""
     c, s = np.cos(tilt), np.sin(tilt)
     down = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
     rotation = down @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
@@ -21,13 +21,13 @@ def camera_above(x, y, height, *, tilt=0.0):
 
 
 def texture(points):
-    """Smooth colors `[..., 3]` of points `[..., 3]` of the plane."""
+    """Return smooth colors `[..., 3]` for points `[..., 3]` on the plane."""
     x, y = points[..., 0], points[..., 1]
     return 0.5 + 0.4 * np.stack([np.sin(2 * x), np.cos(3 * y), np.sin(x + 2 * y)], axis=-1)
 
 
 def photograph(camera):
-    """Colors, depths and points, `[H, W, ...]` in float64, ray by ray from the definition."""
+    """Return colors, depths and points, `[H, W, ...]` in float64, by intersecting each ray."""
     fx, fy, cx, cy = np.asarray(camera.intrinsics, np.float64)
     pose = np.asarray(camera.camtoworld, np.float64)
     x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
@@ -38,7 +38,7 @@ def photograph(camera):
 
 
 def make_views(cameras):
-    """`Views` of the plane, and their exact depths `[V, H, W]`."""
+    """Return `Views` of the plane, and their exact depths `[V, H, W]`."""
     shots = [photograph(camera) for camera in cameras]
     stacked = Camera(
         jnp.stack([camera.camtoworld for camera in cameras]),

@@ -1,4 +1,4 @@
-"""What photographs resolve of a close-up, and how well a mask sorts, against known cases."""
+"""Detail of close-ups that photographs resolve, and error curves of labels, on known cases."""
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ WAVELENGTH = 0.3
 
 
 def striped(camera):
-    """The plane z = 0 with stripes along y, from above."""
+    """Return the exact surface of the plane z = 0 with stripes along y."""
     origins, directions = pixels_to_rays(camera, pixel_grid(camera.height, camera.width))
     depth = -origins[..., 2] / directions[..., 2]
     x = origins[..., 0] + depth * directions[..., 0]
@@ -40,12 +40,12 @@ def scene_of(cameras):
 
 
 @pytest.mark.parametrize("heights", [(4.0,), (4.0, 2.0), (2.0, 4.0)])
-def test_waves_are_as_high_as_in_the_nearest_photograph(heights):
+def test_stripes_have_the_contrast_of_the_nearest_photograph(heights):
     scene, depths = scene_of([plane.camera_above(0.0, 0.0, height) for height in heights])
     close = plane.camera_above(0.1, 0.0, 1.0)
     resolved, seen = resolved_by_photographs(scene, close, depths)
     assert seen.all()
-    # Half a pixel of the photograph is the standard deviation; the close-up's own pixel is less.
+    # The blur's standard deviation is half a source pixel, less the close-up's own pixel.
     pixel = min(heights) / plane.FOCAL
     variance = pixel**2 / 4 - (1 / plane.FOCAL) ** 2 / 12
     expected = np.exp(-2 * np.pi**2 * variance / WAVELENGTH**2)
@@ -53,7 +53,7 @@ def test_waves_are_as_high_as_in_the_nearest_photograph(heights):
     assert np.abs(inner).max() / 0.4 == pytest.approx(expected, rel=0.1)
 
 
-def test_nothing_is_resolved_where_no_photograph_looks():
+def test_unseen_pixels_are_not_resolved():
     views, depths = plane.make_views([plane.camera_above(1.0, 0.0, 1.0)])
     none = np.zeros((0, 3))
     scene = Scene(
@@ -61,25 +61,25 @@ def test_nothing_is_resolved_where_no_photograph_looks():
     )
     close = plane.camera_above(0.0, 0.0, 1.0)
     _, seen = resolved_by_photographs(scene, close, depths)
-    # The photograph is 30 pixels, 1 unit, to the right.
+    # The photograph is 1 unit, or 30 pixels, to the right.
     x = np.asarray(pixel_grid(plane.HEIGHT, plane.WIDTH))[..., 0]
     np.testing.assert_array_equal(seen, x > 30)
 
 
-def test_curves_of_a_mask_that_knows_and_of_one_that_does_not():
+def test_error_curves_of_a_perfect_and_of_a_random_score():
     error = np.linspace(0, 1, 20_001)
     mixed = np.random.default_rng(0).permutation(error)
     knows = error_curve(error, error, 40_002)
     assert knows["ause"] == pytest.approx(0, abs=1e-9)
     assert knows["error"] == knows["oracle"]
-    # Errors spread evenly from 0 to 1: of the best part f the mean is f / 2.
+    # Errors are uniform on [0, 1]: the mean of the best share f is f / 2.
     np.testing.assert_allclose(knows["error"], np.arange(1, 21) / 40, atol=1e-4)
     assert knows["coverage"][-1] == 0.5
     blind = error_curve(mixed, error, 40_002)
     np.testing.assert_allclose(blind["error"], 0.5, atol=0.02)
-    # The area between 1 / 2 and f / 2 from f = 1 / 20 on, over the mean error.
+    # The area between 1 / 2 and f / 2 from f = 1 / 20 on, divided by the mean error.
     assert blind["ause"] == pytest.approx(0.5 * (1 - 1 / 20) ** 2, abs=0.02)
-    # Scores that know, one tenth of labels that leak, all of them last.
+    # A perfect score, with a tenth of leaked labels, which come last.
     leaks = error_curve(error, error, 20_001, {"leaked": error > 0.9})
     np.testing.assert_allclose(leaks["leaked"][:18], 0, atol=1e-9)
     assert leaks["leaked"][-1] == pytest.approx(0.1, abs=1e-3)
@@ -90,12 +90,12 @@ def test_labels_from_exact_depth_are_sorted_and_never_leak():
     cameras = [plane.camera_above(x, 0.1 * x, 4.0, tilt=0.1 * x) for x in (-1.0, 0.0, 1.0)]
     scene, depths = scene_of(cameras)
     sources = label_sources(scene.train, depths)
-    of_labels = {"render_depth": lambda camera: striped(camera).depth, "count": 3}
+    options = {"render_depth": lambda camera: striped(camera).depth, "count": 3}
     strict = settings().replace(rgb_tolerance=jnp.float32(0.02))
-    masked = audit_labels(jax.random.key(0), depths, scene, sources, strict, **of_labels)
+    masked = audit_labels(jax.random.key(0), depths, scene, sources, strict, **options)
     no_mask = strict.replace(use_mask=jnp.float32(0))
-    whole = audit_labels(jax.random.key(0), depths, scene, sources, no_mask, **of_labels)
-    # Without a mask everything is kept that the source sees; the curve is of any mask.
+    whole = audit_labels(jax.random.key(0), depths, scene, sources, no_mask, **options)
+    # Without a mask, every pixel that the source sees is kept; the curve does not use the mask.
     assert masked["kept"] < 0.5 < whole["kept"] == 1
     curve = masked["curve"]
     assert curve == whole["curve"]
@@ -104,11 +104,11 @@ def test_labels_from_exact_depth_are_sorted_and_never_leak():
     assert all(np.less_equal(curve["oracle"], np.add(curve["error"], 1e-9)))
 
 
-def test_left_out_photographs_judge_labels_and_model():
+def test_left_out_photographs_measure_labels_and_model():
     cameras = [plane.camera_above(x, 0.1 * x, 4.0, tilt=0.1 * x) for x in (-1.0, 0.0, 1.0)]
     views, depths = plane.make_views(cameras)
 
-    def render(camera):  # a model that is right in depth and off by 0.1 in color
+    def render(camera):  # a model with exact depth and colors off by 0.1
         rgb, depth, _ = plane.photograph(camera)
         rgb, depth = (jnp.asarray(a, jnp.float32) for a in (rgb - 0.1, depth))
         return Rendering(rgb, depth, jnp.ones_like(depth))

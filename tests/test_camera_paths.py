@@ -1,3 +1,5 @@
+"""Camera paths, orbits and dollies against poses that are known."""
+
 import dataclasses
 import json
 import math
@@ -14,7 +16,7 @@ from experiments.viewing.camera_paths import (
     CameraError,
     check_pixel,
     dolly,
-    looked_at,
+    focus_point,
     read_camera_path,
 )
 from jaxcloseup.geometry.cameras import Camera, pixels_to_points, points_to_pixels
@@ -23,7 +25,7 @@ from jaxcloseup.scenes import SceneError, load_scene
 
 
 def path_file(folder, **changes):
-    """A camera path of two cameras; a change to None leaves the field out."""
+    """Write a camera path of two cameras; a change to None leaves the field out."""
     pose = np.eye(4)
     pose[:3] = plane.camera_above(0.3, 0.1, 2.0, tilt=0.2).camtoworld
     pose[:3, 1:3] *= -1  # OpenCV to OpenGL
@@ -44,7 +46,7 @@ def path_file(folder, **changes):
     return file
 
 
-def test_a_camera_path_is_read_as_nerfstudio_means_it(tmp_path):
+def test_a_camera_path_has_the_cameras_that_nerfstudio_shows(tmp_path):
     shots = read_camera_path(path_file(tmp_path))
     expected = plane.camera_above(0.3, 0.1, 2.0, tilt=0.2)
     assert shots.names == ["0000", "0001"] and shots.fps == 24
@@ -58,12 +60,12 @@ def test_a_camera_path_is_read_as_nerfstudio_means_it(tmp_path):
 
 
 @pytest.mark.parametrize(("changes", "fps"), [({"fps": None}, 1.0), ({"seconds": None}, 24)])
-def test_frames_a_second_follow_from_seconds(tmp_path, changes, fps):
+def test_fps_or_seconds_give_frames_per_second(tmp_path, changes, fps):
     assert read_camera_path(path_file(tmp_path, **changes)).fps == fps
 
 
 def random_similarity(rng):
-    """A rotation with a translation, `[3, 4]`, and a scale."""
+    """Return a rotation with a translation, `[3, 4]`, and a scale."""
     q, r = np.linalg.qr(rng.normal(size=(3, 3)))
     q *= np.sign(np.diag(r))
     q[:, 0] *= np.linalg.det(q)
@@ -76,10 +78,10 @@ APPLIED = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
 
 @pytest.mark.parametrize(("applied", "applied_scale"), [(None, 1.0), (APPLIED, 1.0), (None, 2.5)])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_a_path_of_nerfstudio_comes_back_to_the_capture(
+def test_a_nerfstudio_path_maps_back_to_the_capture(
     tmp_path, capture_folder, applied, applied_scale, seed
 ):
-    """What a camera shows of points is what the camera that comes back shows of the capture's."""
+    """The mapped camera shows the capture's points as nerfstudio's camera shows its own."""
     scene = load_scene(str(capture_folder))
     scene.metadata.update(applied_transform=applied, applied_scale=applied_scale)
     rng = np.random.default_rng(seed)
@@ -88,7 +90,7 @@ def test_a_path_of_nerfstudio_comes_back_to_the_capture(
     theirs = scale * (original @ transform[:, :3].T + transform[:, 3])
     ours = original if applied is None else original @ applied[:, :3].T + applied[:, 3]
     file = tmp_path / "dataparser_transforms.json"
-    # What is recorded leads from before the capture was scaled; the cameras were moved after.
+    # The recorded scale includes the applied scale; the cameras do not.
     recorded = {"transform": transform.tolist(), "scale": scale * applied_scale}
     file.write_text(json.dumps(recorded))
     shots = read_camera_path(path_file(tmp_path))
@@ -102,20 +104,24 @@ def test_a_path_of_nerfstudio_comes_back_to_the_capture(
 
 
 @pytest.mark.parametrize("applied", [None, APPLIED])
-def test_what_a_run_says_of_its_coordinates_leads_back_to_them(tmp_path, capture_folder, applied):
+def test_the_transform_that_a_run_writes_keeps_its_own_coordinates(
+    tmp_path, capture_folder, applied
+):
     scene = load_scene(str(capture_folder))
     scene.metadata.update(applied_transform=applied, applied_scale=2.0)
     write_dataparser_transforms(tmp_path, scene)
     file = tmp_path / "dataparser_transforms.json"
-    said = json.loads(file.read_text())
-    assert said["scale"] == 2
-    np.testing.assert_array_equal(said["transform"], np.eye(3, 4) if applied is None else applied)
+    written = json.loads(file.read_text())
+    assert written["scale"] == 2
+    np.testing.assert_array_equal(
+        written["transform"], np.eye(3, 4) if applied is None else applied
+    )
     shots = read_camera_path(path_file(tmp_path))
     back = camera_paths.to_capture(shots, *camera_paths.read_camera_transform(file), scene)
     np.testing.assert_allclose(back.cameras.camtoworld, shots.cameras.camtoworld, atol=1e-6)
 
 
-def test_a_transform_of_another_capture_is_one_sentence(tmp_path, capture_folder):
+def test_a_transform_of_another_capture_raises_one_sentence(tmp_path, capture_folder):
     scene = load_scene(str(capture_folder))
     scene.metadata["applied_transform"] = 2 * APPLIED
     shots = read_camera_path(path_file(tmp_path))
@@ -139,7 +145,7 @@ RIGID = np.eye(3, 4).tolist()
         ([], "not an object with a transform and a scale"),
     ],
 )
-def test_a_broken_camera_transform_is_one_sentence(tmp_path, fields, message):
+def test_a_broken_camera_transform_raises_one_sentence(tmp_path, fields, message):
     file = tmp_path / "t.json"
     file.write_text(json.dumps(fields))
     with pytest.raises(SceneError, match=message) as error:
@@ -153,26 +159,26 @@ FLAT = np.eye(4).ravel().tolist()
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"render_height": None}, "no render_height"),
+        ({"render_height": None}, "render_height is missing"),
         ({"render_width": 31.5}, "render_width must be a whole number"),
         ({"render_height": "tall"}, "render_height must be a finite number"),
         ({"camera_path": None}, "camera_path must be a list"),
-        ({"camera_path": []}, "camera_path must be a list of one camera or more"),
+        ({"camera_path": []}, "camera_path must be a list of at least one camera"),
         ({"camera_path": [3]}, r"camera_path\[0\] must be an object"),
         ({"camera_type": "fisheye"}, "camera_type is 'fisheye'"),
         ({"fps": 0}, "fps and seconds must be positive"),
-        ({"camera_to_world": None}, r"camera_path\[1\]: no camera_to_world"),
+        ({"camera_to_world": None}, r"camera_path\[1\]: camera_to_world is missing"),
         ({"camera_to_world": FLAT[:15]}, r"camera_path\[1\]: camera_to_world must be 16 finite"),
         ({"camera_to_world": ["a"] * 16}, "must be 16 finite numbers"),
         ({"camera_to_world": [math.nan, *FLAT[1:]]}, "must be 16 finite numbers"),
         ({"camera_to_world": [*FLAT[:12], 1, 2, 3, 1]}, "may be transposed"),
         ({"camera_to_world": [2, *FLAT[1:]]}, "not a rotation and a position"),
         ({"camera_to_world": [-1, *FLAT[1:]]}, "not a rotation and a position"),
-        ({"fov": None}, r"camera_path\[1\]: no fov"),
+        ({"fov": None}, r"camera_path\[1\]: fov is missing"),
         ({"fov": 180}, "fov must be between 0 and 180"),
     ],
 )
-def test_a_broken_camera_path_is_one_sentence(tmp_path, changes, message):
+def test_a_broken_camera_path_raises_one_sentence(tmp_path, changes, message):
     with pytest.raises(CameraError, match=message) as error:
         read_camera_path(path_file(tmp_path, **changes))
     assert "path.json" in str(error.value) and "\n" not in str(error.value)
@@ -187,14 +193,14 @@ def test_a_broken_camera_path_is_one_sentence(tmp_path, changes, message):
         (None, "read"),
     ],
 )
-def test_what_is_no_camera_path_is_one_sentence(tmp_path, text, message):
+def test_a_file_without_a_camera_path_raises_one_sentence(tmp_path, text, message):
     if text is not None:
         (tmp_path / "a.json").write_bytes(text)
     with pytest.raises(CameraError, match=message):
         read_camera_path(tmp_path / "a.json")
 
 
-def test_a_dolly_ends_so_many_times_nearer_and_grows_evenly():
+def test_a_dolly_ends_magnification_times_nearer_and_grows_evenly():
     camera, pixel = plane.camera_above(0.3, 0.0, 4.0, tilt=0.3), (20.5, 7.5)
     depth = float(plane.photograph(camera)[1][7, 20])
     shots = dolly(camera, pixel, depth, magnification=4.0, frames=5)
@@ -215,7 +221,7 @@ def test_a_dolly_ends_so_many_times_nearer_and_grows_evenly():
 
 
 @pytest.mark.parametrize("pixel", [(-0.1, 3), (32, 3), (3, 24), (math.nan, 3)])
-def test_a_pixel_outside_is_one_sentence(pixel):
+def test_a_pixel_outside_raises_one_sentence(pixel):
     camera = plane.camera_above(0, 0, 1)
     assert check_pixel(camera, (31.9, 0)) == (0, 31)
     with pytest.raises(CameraError, match=r"--pixel=.* is outside .* 32 x 24 pixels"):
@@ -223,41 +229,40 @@ def test_a_pixel_outside_is_one_sentence(pixel):
 
 
 def ring(center, radius, height, count=12):
-    """Stacked cameras on a circle in the plane z = `height`, looking at its center below."""
+    """Return stacked cameras on a circle `height` above a center, looking at the center."""
     poses = []
     for angle in np.linspace(0, 2 * np.pi, count, endpoint=False):
         position = center + np.array([radius * np.cos(angle), radius * np.sin(angle), height])
-        poses.append(camera_paths.look(position, center, np.array([0.0, 0, 1])))
+        poses.append(camera_paths.look_at(position, center, np.array([0.0, 0, 1])))
     intrinsics = jnp.tile(jnp.array([40.0, 40, 16, 12]), (count, 1))
     return Camera(jnp.asarray(np.array(poses), jnp.float32), intrinsics, 24, 32)
 
 
-def test_an_orbit_is_the_circle_of_cameras_that_stand_on_one(capture_folder):
+def test_an_orbit_recovers_cameras_that_stand_on_a_circle(capture_folder):
     scene = load_scene(str(capture_folder))
     center = np.array([1.0, -2.0, 0.5])
     cameras = ring(center, 3.0, 2.0)
     scene = dataclasses.replace(scene, train=scene.train.replace(cameras=cameras))
     shots = camera_paths.orbit(scene, 12)
-    # From the first camera round, one way or the other.
     np.testing.assert_allclose(shots.cameras.camtoworld, cameras.camtoworld, atol=1e-4)
     pixel, depth = jax.vmap(points_to_pixels, (0, None))(shots.cameras, jnp.asarray(center, "f"))
     np.testing.assert_allclose(pixel, np.tile([16, 12], (12, 1)), atol=1e-2)
     np.testing.assert_allclose(depth, math.hypot(3, 2), rtol=1e-5)
 
 
-def test_an_orbit_stands_upright_in_the_direction_that_is_given(capture_folder):
+def test_an_orbit_turns_around_the_given_up_direction(capture_folder):
     scene = load_scene(str(capture_folder))
     center, radius, height = np.array([1.0, -2.0, 0.5]), 3.0, 2.0
     cameras = ring(center, radius, height)
     scene = dataclasses.replace(scene, train=scene.train.replace(cameras=cameras))
-    # About -z the circle is the same, and every camera upside down.
+    # Around -z the circle is the same, and every camera is upside down.
     shots = camera_paths.orbit(scene, 12, up=(0, 0, -3))
     offset = np.asarray(shots.cameras.position) - center
     np.testing.assert_allclose(offset[:, 2], height, atol=1e-4)
     np.testing.assert_allclose(np.linalg.norm(offset[:, :2], axis=1), radius, atol=1e-4)
     down = np.asarray(shots.cameras.rotation)[..., 1]
     np.testing.assert_allclose(down[:, 2], radius / math.hypot(radius, height), atol=1e-4)
-    # About x: as far from that axis as the cameras of the ring, who are evenly on both its sides.
+    # Around x: as far from that axis as the median camera of the ring.
     shots = camera_paths.orbit(scene, 8, up=(0.1, 0, 0))
     offset = np.asarray(shots.cameras.position) - center
     np.testing.assert_allclose(offset[:, 0], 0, atol=1e-4)
@@ -271,17 +276,17 @@ def test_an_orbit_stands_upright_in_the_direction_that_is_given(capture_folder):
     np.testing.assert_allclose(rotation[..., 2], -offset / expected, atol=1e-4)
 
 
-def test_cameras_that_look_nowhere_in_common_look_ahead():
+def test_cameras_without_a_common_focus_look_ahead():
     positions, forward = np.eye(3), np.tile([0.0, 0, 1], (3, 1))
-    point = looked_at(positions, forward, near=1.0, far=3.0)
+    point = focus_point(positions, forward, near=1.0, far=3.0)
     np.testing.assert_allclose(point, positions.mean(0) + 1.5 * forward[0])
-    # Back to back in a room: where their axes meet is behind them.
+    # Back to back in a room: their axes meet behind them.
     outward = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0]])
-    point = looked_at(outward * 0.1, outward, near=1.0, far=3.0)
+    point = focus_point(outward * 0.1, outward, near=1.0, far=3.0)
     np.testing.assert_allclose(point, (outward * 1.6).mean(0))
 
 
-def test_the_size_changes_and_the_view_does_not():
+def test_resizing_keeps_the_view():
     camera = plane.camera_above(0.3, 0.0, 4.0, tilt=0.3)
     points = jnp.asarray(plane.photograph(camera)[2], jnp.float32)
     before, _ = points_to_pixels(camera, points)

@@ -1,4 +1,4 @@
-"""Labels whose depth has less error, on the plane, whose depth is known."""
+"""Labels from depth with less error, on the plane z = 0, whose exact depth is known."""
 
 import jax
 import jax.numpy as jnp
@@ -8,18 +8,18 @@ import pytest
 from tiny_runs import TINY
 
 from experiments.methods import pseudo_settings
-from experiments.training.ceilings import CEILING_VIEWS, labels_of_less_error
+from experiments.training.ceilings import CEILING_VIEWS, labels_with_better_depth
 from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_rays
 from jaxcloseup.photographs import camera_at
 from jaxcloseup.pseudo import label_sources
 from jaxcloseup.scene import Scene, Surface
 
 
-OFF = 1.1  # trained depth over the exact one
+OFF = 1.1  # trained depth over exact depth
 
 
 def surface(camera):
-    """The plane z = 0 with smooth colors, for any camera."""
+    """Return the exact surface of the plane z = 0 with smooth colors."""
     origins, directions = pixels_to_rays(camera, pixel_grid(camera.height, camera.width))
     depth = -origins[..., 2] / directions[..., 2]
     points = origins + depth[..., None] * directions
@@ -28,7 +28,7 @@ def surface(camera):
     return Surface(0.5 + 0.4 * waves, depth, jnp.zeros_like(points))
 
 
-def test_labels_come_nearer_to_the_truth_as_depth_does():
+def test_better_depth_makes_better_labels():
     cameras = [plane.camera_above(x, 0.1 * x, 4.0, tilt=0.1 * x) for x in (-1.0, 0.0, 1.0)]
     views, exact = plane.make_views(cameras)
     names, none = {"train": list("abc")}, np.zeros((0, 3))
@@ -45,7 +45,9 @@ def test_labels_come_nearer_to_the_truth_as_depth_does():
     for share in (0.0, 0.5, 1.0):
         sources = label_sources(views, OFF * exact)
         key = jax.random.key(0)
-        labels = labels_of_less_error(key, scene, sources, exact, trained, settings, share=share)
+        labels = labels_with_better_depth(
+            key, scene, sources, exact, trained, settings, share=share
+        )
         assert len(labels) == CEILING_VIEWS
         truth = jnp.stack([surface(camera_at(labels.cameras, i)).rgb for i in range(CEILING_VIEWS)])
         difference = np.abs(labels.rgb - truth).mean(axis=-1)
@@ -62,7 +64,7 @@ def test_undefined_depth_stays_undefined(share):
         "plane", views, None, None, none, none, 0.5, 9.0, {"train": ["a"]}, surface=surface
     )
     nothing = jnp.zeros((CEILING_VIEWS, plane.HEIGHT, plane.WIDTH))
-    labels = labels_of_less_error(
+    labels = labels_with_better_depth(
         jax.random.key(0),
         scene,
         label_sources(views, exact),

@@ -83,7 +83,7 @@ def test_a_folder_that_holds_something_is_refused_before_any_work(parsed_flags, 
     (tmp_path / "results.json").write_text("{}")
     with (
         flagsaver.flagsaver(scene="table", output_dir=str(tmp_path)),
-        pytest.raises(SystemExit, match="already holds something"),
+        pytest.raises(SystemExit, match="already exists and is not empty"),
     ):
         program.main(["run"])
     assert (tmp_path / "results.json").read_text() == "{}"
@@ -94,7 +94,9 @@ def test_a_folder_that_cannot_be_made_is_one_sentence(parsed_flags, capture_fold
     folder = tmp_path / "file" / "out"
     with (
         flagsaver.flagsaver(scene=str(capture_folder), downscale=1, output_dir=str(folder)),
-        pytest.raises(SystemExit, match=f"--output_dir={folder} cannot be made .*: name a folder"),
+        pytest.raises(
+            SystemExit, match=f"--output_dir={folder} cannot be created .*: name a folder"
+        ),
     ):
         program.main(["run"])
 

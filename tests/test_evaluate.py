@@ -1,4 +1,4 @@
-"""Scoring folders of images: pairs by name, and one sentence for what does not match."""
+"""Scoring folders of images: pairs by name, and one sentence for each mismatch."""
 
 import json
 import math
@@ -29,7 +29,7 @@ def write_images(folder, images):
 
 @pytest.fixture
 def pair(tmp_path):
-    """Two renders, one off by 51 in its upper half, and their truth."""
+    """Write two renders, of which one is off by 51 in its upper half, and the true images."""
     truth = np.random.default_rng(0).integers(0, 200, (16, 24, 3), np.uint8)
     off = truth.copy()
     off[:8] += 51
@@ -52,7 +52,7 @@ def test_metrics_of_known_images(pair, tmp_path):
     assert found["lpips_vgg_reason"]
 
 
-def test_masks_choose_what_counts(pair, tmp_path):
+def test_masks_choose_the_pixels_that_count(pair, tmp_path):
     lower = np.zeros((16, 24), np.uint8)
     lower[8:] = 255
     upper = 255 - lower
@@ -66,15 +66,15 @@ def test_masks_choose_what_counts(pair, tmp_path):
     [
         ({"renders": None}, "--renders= is not a folder"),
         ({"truth": "nowhere"}, "--truth=nowhere is not a folder"),
-        ({"only": "b"}, r"lacks a, of which --truth=.* has images"),
-        ({"more": "c.png"}, r"--truth=.* lacks c, of which --renders="),
-        ({"more": "a.jpg"}, "two images of one name, a.jpg and a.png"),
-        ({"size": (8, 8)}, r"a\.png has 8 x 8 pixels and .*a\.bmp 24 x 16"),
+        ({"only": "b"}, r"has no image named a, but --truth=.* has"),
+        ({"more": "c.png"}, r"--truth=.* has no image named c, but --renders="),
+        ({"more": "a.jpg"}, "two images with the same name, a.jpg and a.png"),
+        ({"size": (8, 8)}, r"a\.png has 8 x 8 pixels but .*a\.bmp has 24 x 16"),
         ({"broken": True}, r"a\.png is not a readable image"),
         ({"output": True}, "already exists"),
     ],
 )
-def test_what_does_not_match_is_said_in_one_sentence(pair, tmp_path, change, sentence):
+def test_a_mismatch_exits_with_one_sentence(pair, tmp_path, change, sentence):
     folder, output = tmp_path / "renders", tmp_path / "metrics.json"
     if "only" in change:
         (folder / "a.png").unlink()

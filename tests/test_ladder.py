@@ -1,4 +1,4 @@
-"""The zoom ladder: cameras that come nearer to one point, on the plane, whose look is known."""
+"""The zoom ladder on the plane z = 0: cameras that move nearer to one point."""
 
 import dataclasses
 import xml.etree.ElementTree as ET
@@ -8,7 +8,7 @@ import numpy as np
 import plane
 import pytest
 
-from experiments.evaluation.ladder import MAGNIFICATIONS, ladder_in_short, ladder_targets
+from experiments.evaluation.ladder import MAGNIFICATIONS, describe_ladder, ladder_targets
 from experiments.reporting.plots import Curve, gains_over, line_plot, zoom_curves
 from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_rays
 from jaxcloseup.scene import Surface
@@ -16,7 +16,7 @@ from jaxcloseup.scenes import Scene
 
 
 def surface(camera):
-    """The plane z = 0, gray, for any camera."""
+    """Return the exact surface of a gray plane z = 0."""
     origins, directions = pixels_to_rays(camera, pixel_grid(camera.height, camera.width))
     depth = -origins[..., 2] / directions[..., 2]
     rgb = jnp.full((*depth.shape, 3), 0.5)
@@ -35,14 +35,14 @@ def ladder():
     return scene, ladder_targets(scene, exact)
 
 
-def test_every_rung_is_nearer_to_one_point_by_its_magnification(ladder):
+def test_each_rung_is_magnification_times_nearer_to_one_point(ladder):
     scene, targets = ladder
     assert list(targets) == [f"zoom_{m}" for m in MAGNIFICATIONS]
     for i, name in enumerate(scene.names["test_far"]):
         centers = np.stack([targets[f"zoom_{m}"][i].camera.position for m in MAGNIFICATIONS])
         assert targets["zoom_1"][i].name == name
         np.testing.assert_allclose(centers[0], scene.test_far.cameras.position[i], atol=1e-6)
-        # All stand on one line, which meets the plane where the distance to it would be 0.
+        # All cameras stand on one line, which meets the plane at the anchor.
         anchor = centers[0] + (centers[1] - centers[0]) * 2
         np.testing.assert_allclose(anchor[2], 0, atol=1e-5)
         for m, center in zip(MAGNIFICATIONS, centers, strict=True):
@@ -52,10 +52,10 @@ def test_every_rung_is_nearer_to_one_point_by_its_magnification(ladder):
             )
 
 
-def test_targets_are_what_the_cameras_truly_see(ladder):
+def test_targets_hold_the_exact_surface(ladder):
     _, targets = ladder
-    for of_rung in targets.values():
-        for target in of_rung:
+    for rung in targets.values():
+        for target in rung:
             np.testing.assert_allclose(
                 target.surface.depth, surface(target.camera).depth, rtol=1e-5
             )
@@ -81,10 +81,10 @@ def test_curves_and_gains():
     ]
     assert gains_over(curves, "control")[1] == Curve("closeup", [1, 4], [-0.5, 1.0])
     assert gains_over(curves[1:], "control") == []
-    assert ladder_in_short(stages["control"]).endswith("4x nearer 25.00, 16x nearer -")
+    assert describe_ladder(stages["control"]).endswith("4x nearer 25.00, 16x nearer -")
 
 
-def test_a_plot_is_one_element_with_its_words():
+def test_a_plot_is_one_svg_element_with_its_labels():
     curves = [Curve("arm & leg", [1, 2], [0.0, 1.0], [-1.0, 0.5], [1.0, 1.5])]
     plot = line_plot(curves, x="times nearer", y="dB", title="Gain", doubling=True, level=0)
     root = ET.fromstring(plot)

@@ -1,4 +1,4 @@
-"""Logs of training: each step once, whatever was cut off; event files read back byte by byte."""
+"""Logs of training: each step once, also after interruptions; event files read byte by byte."""
 
 import json
 import math
@@ -32,7 +32,7 @@ def read_lines(folder):
 
 @pytest.fixture
 def clock(monkeypatch):
-    """A clock that stands still, and counts on from 0 where it is asked for seconds."""
+    """Replace the clock by one that the test moves; `perf_counter` starts at 0."""
     clock = types.SimpleNamespace(now=1000.0, time_ns=time.time_ns)
     clock.perf_counter = lambda: clock.now - 1000
     clock.time = lambda: clock.now
@@ -40,12 +40,12 @@ def clock(monkeypatch):
     return clock
 
 
-def train(clock, folder, stage, *, history, begun=0, **options):
-    """Log chunks of 5 seconds, after a cut of 100."""
+def train(clock, folder, stage, *, history, resumed=0, **options):
+    """Log chunks of 5 seconds each, after a pause of 100 seconds."""
     clock.now += 100
     log = TrainLog(folder, **options)
-    log.begin(stage, history[:begun])
-    for entry in history[begun:]:
+    log.begin(stage, history[:resumed])
+    for entry in history[resumed:]:
         clock.now += 5
         log.write(entry)
     return log
@@ -76,31 +76,31 @@ def test_lines_follow_the_training_in_one_file(tmp_path, clock):
 
 
 @pytest.mark.parametrize("torn", [b"", b'{"stage": "closeup", "st', b"\xff\x00", b"{}\n7\n"])
-def test_what_was_said_after_the_checkpoint_is_said_once(tmp_path, clock, torn):
+def test_steps_after_the_checkpoint_are_logged_once(tmp_path, clock, torn):
     train(clock, tmp_path, "baseline", history=HISTORY[:2])
     train(clock, tmp_path, "closeup", history=HISTORY[:3])
     first = read_lines(tmp_path)
     with (tmp_path / "stats" / "train.jsonl").open("ab") as file:
         file.write(torn)
-    train(clock, tmp_path, "baseline", history=HISTORY[:2], begun=2)
-    train(clock, tmp_path, "closeup", history=HISTORY, begun=1)
+    train(clock, tmp_path, "baseline", history=HISTORY[:2], resumed=2)
+    train(clock, tmp_path, "closeup", history=HISTORY, resumed=1)
     lines = read_lines(tmp_path)
     assert lines[:3] == first[:3]
-    said = [(line["stage"], line["step"]) for line in lines[3:]]
-    assert said == [("closeup", 20), ("closeup", 30), ("closeup", 40)]
+    logged = [(line["stage"], line["step"]) for line in lines[3:]]
+    assert logged == [("closeup", 20), ("closeup", 30), ("closeup", 40)]
     assert [line["seconds"] for line in lines] == [5, 10, 5, 10, 15, 20]
     assert {line["steps_per_second"] for line in lines} == {2.0}
 
 
-def test_a_line_that_was_lost_comes_back_from_the_checkpoint(tmp_path, clock):
-    train(clock, tmp_path, "baseline", history=HISTORY, begun=3)
+def test_a_lost_line_is_restored_from_the_checkpoint(tmp_path, clock):
+    train(clock, tmp_path, "baseline", history=HISTORY, resumed=3)
     lines = read_lines(tmp_path)
     assert [line["loss"] for line in lines] == [entry["loss"] for entry in HISTORY]
     assert [line["seconds"] for line in lines] == [None] * 3 + [5]
 
 
-@pytest.mark.skipif("not os.path.exists('/dev/full')", reason="needs /dev/full, of Linux")
-def test_a_full_disk_is_one_sentence(tmp_path, clock):
+@pytest.mark.skipif("not os.path.exists('/dev/full')", reason="needs /dev/full, which Linux has")
+def test_a_full_disk_raises_one_sentence(tmp_path, clock):
     log = TrainLog(tmp_path)
     log.begin("baseline", [])
     (tmp_path / "stats").mkdir()
@@ -110,7 +110,7 @@ def test_a_full_disk_is_one_sentence(tmp_path, clock):
         log.write(HISTORY[0])
 
 
-def test_lines_are_strict(tmp_path, clock):
+def test_lines_are_strict_json(tmp_path, clock):
     train(clock, tmp_path, "baseline", history=[{"step": 1, "loss": math.nan, "psnr": math.inf}])
     (line,) = read_lines(tmp_path)
     assert line["loss"] is None and line["psnr"] is None
@@ -127,7 +127,7 @@ def crc32c(data):
 
 
 def read_events(folder):
-    """Events of a folder's files: where one starts, those before it from its step on are void."""
+    """Read a folder's events; a start event voids earlier events from its step on."""
     from tensorboardX.proto.event_pb2 import Event
 
     events = []
@@ -151,12 +151,12 @@ def read_records(data, parse):
         data = body[size + 4 :]
 
 
-def test_event_files_hold_the_same_and_never_go_backwards(tmp_path, clock):
-    pytest.importorskip("tensorboardX", reason="needs tensorboardX, of the extra tensorboard")
+def test_event_files_match_the_history_and_never_go_backwards(tmp_path, clock):
+    pytest.importorskip("tensorboardX", reason='needs tensorboardX (the extra "tensorboard")')
     log = train(clock, tmp_path, "closeup", history=HISTORY[:3], tensorboard=True)
     train(
-        clock, tmp_path, "closeup", history=HISTORY, begun=1, tensorboard=True
-    )  # the first was killed
+        clock, tmp_path, "closeup", history=HISTORY, resumed=1, tensorboard=True
+    )  # the first log was killed
     del log
     log = TrainLog(tmp_path, tensorboard=True)
     log.begin("closeup", HISTORY)
@@ -175,14 +175,14 @@ def test_event_files_hold_the_same_and_never_go_backwards(tmp_path, clock):
     pixels = cv2.imdecode(np.frombuffer(png.encoded_image_string, np.uint8), 1)[..., ::-1]
     np.testing.assert_array_equal(pixels, np.rint(image * 255))
     assert [event.wall_time - clock.now for event in events] == [-15, -10, -5, 0, 0]
-    # A stage that takes no steps is evaluated after as many as the one before.
+    # A stage without steps has the step of the stage before it.
     log.evaluated("test_time", {"test": summary}, {})
     assert [event.step for event in read_events(tmp_path / "tb" / "test_time")] == [40]
     assert len(read_events(tmp_path / "tb" / "closeup")) == 5
 
 
 @pytest.mark.parametrize("program", [run, sweep])
-def test_tensorboard_that_is_absent_is_one_sentence(program, tmp_path, monkeypatch):
+def test_missing_tensorboard_exits_with_one_sentence(program, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
     flags.FLAGS(["run"])
     out = str(tmp_path / "out")

@@ -1,3 +1,5 @@
+"""The manifest of a run: hashes of the data, the commit, and how to load the scene again."""
+
 import dataclasses
 import json
 import shutil
@@ -14,7 +16,7 @@ from experiments.training.sweep import SweepOutcome
 from jaxcloseup.scenes import load_scene
 
 
-def test_the_hash_is_of_all_that_training_reads(capture_folder):
+def test_the_hash_covers_all_data_that_training_reads(capture_folder):
     scene = load_scene(str(capture_folder))
     digest = hash_data(scene)
     assert len(digest) == 64
@@ -27,11 +29,11 @@ def test_the_hash_is_of_all_that_training_reads(capture_folder):
         views.replace(cameras=views.cameras.replace(camtoworld=pose)),
     ):
         assert hash_data(dataclasses.replace(scene, train=changed)) != digest
-    # Held-out photographs are not read in training.
+    # Training does not read held-out photographs.
     assert hash_data(dataclasses.replace(scene, test=None)) == digest
 
 
-def test_a_manifest_knows_how_to_load_the_scene_again(capture_folder, monkeypatch):
+def test_a_manifest_can_load_the_scene_again(capture_folder, monkeypatch):
     monkeypatch.chdir(capture_folder.parent)
     about = about_scene(load_scene(capture_folder.name), {"downscale": 1})
     again = load_scene(about["scene"], **about["load_options"])
@@ -40,7 +42,7 @@ def test_a_manifest_knows_how_to_load_the_scene_again(capture_folder, monkeypatc
 
 
 @pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
-def test_the_commit_is_that_of_the_package_alone(tmp_path):
+def test_the_commit_is_that_of_the_package(tmp_path):
     def git(*args):
         identity = ["-c", "user.name=a", "-c", "user.email=a@b.c"]
         subprocess.run(["git", "-C", tmp_path, *identity, *args], check=True, capture_output=True)
@@ -58,42 +60,44 @@ def test_the_commit_is_that_of_the_package_alone(tmp_path):
     assert len(commit) == 40 and not changed
     (package / "a.py").write_text("b")
     assert git_commit(package) == (commit, True)
-    # Somebody else's checkout that happens to hold the environment.
+    # The checkout of another project that contains the environment.
     assert git_commit(installed) == (None, None)
 
 
-def test_git_that_is_missing_is_no_error(tmp_path, monkeypatch):
+def test_missing_git_is_no_error(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     assert git_commit(tmp_path) == (None, None)
 
 
-def test_a_run_that_goes_on_with_other_code_says_so(tmp_path, monkeypatch):
+def test_a_run_that_another_commit_continues_warns(tmp_path, monkeypatch):
     commits = iter(["a" * 40, "a" * 40, "b" * 40, None])
     monkeypatch.setattr(manifest, "git_commit", lambda _: (next(commits), False))
     for _ in range(2):
         manifest.write_manifest(tmp_path, {})
-    with pytest.warns(UserWarning, match="begun with commit aaaaaaaaa and goes on with bbbbbbbbb"):
+    with pytest.warns(
+        UserWarning, match="started by commit aaaaaaaaa and continues with bbbbbbbbb"
+    ):
         manifest.write_manifest(tmp_path, {})
     manifest.write_manifest(tmp_path, {})
 
 
-def test_wanted_views_are_told_apart_by_their_cameras(capture_folder):
+def test_the_hash_of_target_views_covers_their_cameras(capture_folder):
     scene = load_scene(str(capture_folder))
-    known = manifest.hash_wanted(scene)
+    known = manifest.hash_targets(scene)
     turned = scene.test.replace(
         cameras=scene.test.cameras.replace(camtoworld=-scene.test.cameras.camtoworld)
     )
-    assert known == manifest.hash_wanted(load_scene(str(capture_folder)))
-    assert manifest.hash_wanted(dataclasses.replace(scene, test=turned)) != known
-    assert manifest.hash_wanted(dataclasses.replace(scene, test=None)) is None
+    assert known == manifest.hash_targets(load_scene(str(capture_folder)))
+    assert manifest.hash_targets(dataclasses.replace(scene, test=turned)) != known
+    assert manifest.hash_targets(dataclasses.replace(scene, test=None)) is None
 
 
-def test_a_sweep_leaves_a_manifest(capture_folder, tmp_path, monkeypatch):
+def test_a_sweep_writes_a_manifest(capture_folder, tmp_path, monkeypatch):
     flags.FLAGS(["sweep"])
-    begun = {}
+    started = {}
 
     def stub(scene, preset, arms, seeds, folder, *, seconds, **options):
-        begun.update(json.loads((tmp_path / "out" / "manifest.json").read_text()))
+        started.update(json.loads((tmp_path / "out" / "manifest.json").read_text()))
         seconds["baseline_0"] = 1.5
         return SweepOutcome({}, {}, {})
 
@@ -103,7 +107,7 @@ def test_a_sweep_leaves_a_manifest(capture_folder, tmp_path, monkeypatch):
     given = {"output_dir": str(tmp_path / "out"), "scenes": [str(capture_folder)], "downscale": 1}
     with flagsaver.flagsaver(compilation_cache="", arms=["control"], seeds=2, **given):
         sweep.main(["sweep"])
-    assert begun["finished"] is False and begun["seconds"] is None
+    assert started["finished"] is False and started["seconds"] is None
     after = json.loads((tmp_path / "out" / "manifest.json").read_text())
     name = capture_folder.name
     assert after["finished"] and after["seconds"] == {name: {"baseline_0": 1.5}}

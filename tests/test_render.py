@@ -99,17 +99,17 @@ def test_nothing_is_fine_tuned_where_the_gate_lets_no_labels_in(capture_folder, 
 MISTAKES = {
     "no such run": ({"run": "nowhere"}, "--run=nowhere is not a folder"),
     "no run": ({"run": None}, "--run is missing"),
-    "nothing to render": ({"views": None}, "exactly one of --views, .*, and none is"),
-    "two things": ({"orbit": True}, "all of these are: views, orbit"),
+    "nothing to render": ({"views": None}, "give exactly one of --views, .*, not none"),
+    "two things": ({"orbit": True}, "exactly one of .*, not --views and --orbit"),
     "no such stage": ({"stage": "test_time"}, "choose baseline or closeup"),
     "no such views": ({"views": "val"}, "--views=val: .* choose train, test, test_far"),
-    "a size of its own": ({"width": 64}, "--width says nothing of --views"),
-    "frames of views": ({"frames": 9}, "--frames says nothing of --views"),
-    "pixel of views": ({"pixel": ["3", "4"]}, "--pixel says nothing of --views"),
-    "up of views": ({"up": ["0", "0", "1"]}, "--up says nothing of --views"),
+    "a size of its own": ({"width": 64}, "--width does not apply to --views"),
+    "frames of views": ({"frames": 9}, "--frames does not apply to --views"),
+    "pixel of views": ({"pixel": ["3", "4"]}, "--pixel does not apply to --views"),
+    "up of views": ({"up": ["0", "0", "1"]}, "--up does not apply to --views"),
     "transform of views": (
         {"camera_transform": "t.json"},
-        "--camera_transform says nothing of --views",
+        "--camera_transform does not apply to --views",
     ),
     "no direction": ({"views": None, "orbit": True, "up": ["0"] * 3}, "--up=0,0,0 must be three"),
     "up and nan": ({"views": None, "orbit": True, "up": ["0", "nan", "1"]}, "--up=0,nan,1 must be"),
@@ -121,7 +121,7 @@ MISTAKES = {
     "no pixel": ({"views": None, "from": "0"}, "--from needs --pixel=x,y"),
     "not numbers": ({"views": None, "from": "0", "pixel": ["a", "b"]}, "--from needs --pixel=x,y"),
     "outside": ({"views": None, "from": "0", "pixel": ["32", "4"]}, "--pixel=32,4 is outside"),
-    "no depth": ({"views": None, "from": "0", "pixel": ["0", "0"]}, "--pixel=0,0 .* no depth"),
+    "no depth": ({"views": None, "from": "0", "pixel": ["0", "0"]}, "--pixel=0,0: .* no surface"),
     "farther": (
         {"views": None, "from": "0", "pixel": ["3", "4"], "magnification": 0.9},
         "--magnification=0.9 must be 1 or more",
@@ -149,7 +149,7 @@ def test_a_mistake_is_one_sentence_and_nothing_is_written(render, kept, tmp_path
 def test_a_folder_that_holds_something_is_refused(render, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "a").write_text("")
-    with pytest.raises(SystemExit, match="already holds something"):
+    with pytest.raises(SystemExit, match="already exists and is not empty"):
         render(views="test")
 
 

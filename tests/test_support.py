@@ -1,3 +1,5 @@
+"""Support on the plane z = 0: counts and footprints against a slow float64 oracle."""
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +16,7 @@ support = jax.jit(find_support)
 
 @pytest.fixture(scope="module")
 def capture():
-    """Photographs from several heights; one has other focal lengths, one a masked strip."""
+    """Photographs from several heights: one has other focal lengths, one a masked strip."""
     heights = ((-1.0, 4.0), (0.0, 3.0), (1.0, 6.0), (0.4, 2.0))
     cameras = [plane.camera_above(x, 0.1 * x, z, tilt=0.1 * x) for x, z in heights]
     views, depths = plane.make_views(cameras)
@@ -26,7 +28,7 @@ def capture():
 
 
 def flat_depth(cameras, i):
-    """Exact depth of photograph `i`, whatever its focal lengths."""
+    """Return the exact depth of photograph `i` for its focal lengths."""
     fx, fy, cx, cy = np.asarray(cameras.intrinsics[i], np.float64)
     pose = np.asarray(cameras.camtoworld[i], np.float64)
     x, y = np.moveaxis(np.asarray(GRID, np.float64), -1, 0)
@@ -35,7 +37,7 @@ def flat_depth(cameras, i):
 
 
 def oracle(camera, depth, views):
-    """Counts, footprints, and the distance of the nearest border in pixels, in float64."""
+    """Return counts, footprints, and each point's distance from the nearest border in pixels."""
     fx, fy, cx, cy = np.asarray(camera.intrinsics, np.float64)
     pose = np.asarray(camera.camtoworld, np.float64)
     count = np.zeros(depth.shape, int)
@@ -48,8 +50,8 @@ def oracle(camera, depth, views):
         point = pose[:, :3] @ (z * ray) + pose[:, 3]
         for i in range(len(views)):
             f, g, px, py = np.asarray(views.cameras.intrinsics[i], np.float64)
-            of_source = np.asarray(views.cameras.camtoworld[i], np.float64)
-            x, y, s = of_source[:, :3].T @ (point - of_source[:, 3])
+            source_pose = np.asarray(views.cameras.camtoworld[i], np.float64)
+            x, y, s = source_pose[:, :3].T @ (point - source_pose[:, 3])
             u, v = f * x / s + px, g * y / s + py
             borders = (u, v, u - plane.WIDTH, v - plane.HEIGHT, u - 8)
             clearance[row, column] = min(clearance[row, column], *map(abs, borders))
@@ -76,7 +78,7 @@ def test_counts_and_footprints_match_the_definition(capture):
     assert np.isinf(np.asarray(found.footprint)[3:6, 4:9]).all()
 
 
-def test_a_footprint_is_the_ratio_of_distances_times_the_ratio_of_focal_lengths():
+def test_a_footprint_is_the_distance_ratio_times_the_focal_length_ratio():
     views, depths = plane.make_views([plane.camera_above(0.0, 0.0, 4.0)])
     near = plane.camera_above(0.0, 0.0, 1.0)
     near = near.replace(intrinsics=near.intrinsics * jnp.array([2.0, 2, 1, 1]))
@@ -90,7 +92,7 @@ def test_unseen_surfaces_have_no_support(capture):
     wide = plane.camera_above(0.0, 0.0, 6.0)
     depth = jnp.asarray(plane.photograph(wide)[1], jnp.float32)
     assert support(wide, GRID, depth, views, depths).count.max() == 4
-    # Points in front of the plane, which no depth map confirms, and undefined depth.
+    # Points in front of the plane, where no depth map confirms them; and undefined depth.
     for wrong in (0.7 * depth, 0 * depth):
         found = support(wide, GRID, wrong, views, depths)
         assert found.count.max() == 0

@@ -1,4 +1,4 @@
-"""Errors of depth and normals against planes and points whose answers are known."""
+"""Errors of depth and normals, on planes and points whose exact errors are known."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +16,7 @@ CAMERA = Camera(jnp.eye(4)[:3], jnp.array([24.0, 24.0, 24.0, 12.0]), height=24, 
 
 
 def tilted_plane(slope):
-    """Depth of z = 2 + slope x, and its normal towards the camera."""
+    """Return the depth of the plane z = 2 + slope x, and its normal towards the camera."""
     x = (pixel_grid(24, 48)[..., 0] - 24) / 24
     normal = jnp.array([slope, 0, -1]) / np.hypot(slope, 1)
     return 2 / (1 - slope * x), jnp.broadcast_to(normal, (24, 48, 3))
@@ -33,25 +33,25 @@ def test_a_tilt_is_measured_in_degrees():
     assert float(found["depth_error_p90"]) == pytest.approx(0.1, rel=1e-4)
 
 
-def test_normals_of_surfels_are_their_own_and_what_is_empty_does_not_count():
+def test_rendered_normals_are_used_and_empty_pixels_do_not_count():
     depth, normal = tilted_plane(0.4)
     hit = jnp.arange(48)[None] < 24
     surface = Surface(jnp.zeros((24, 48, 3)), jnp.where(hit, depth, 0), normal)
     zeros = jnp.zeros((24, 48))
-    of_surfels = jnp.where(hit[..., None], 0.3 * normal, -normal)  # composited, not normalized
-    aux = SurfelFieldAux(SurfelAux(of_surfels, depth, zeros, jnp.int32(0)), zeros, jnp.float32(0))
+    rendered = jnp.where(hit[..., None], 0.3 * normal, -normal)  # composited, not normalized
+    aux = SurfelFieldAux(SurfelAux(rendered, depth, zeros, jnp.int32(0)), zeros, jnp.float32(0))
     found = surface_error(CAMERA, Rendering(normal, jnp.where(hit, depth, 9), zeros, aux), surface)
     assert float(found["normal_error_p90"]) == pytest.approx(0, abs=0.05)
     assert float(found["depth_error_p90"]) == 0
 
 
-def test_landmarks_are_the_points_in_front():
+def test_landmarks_are_the_visible_points():
     points = np.array(
         [
             [0.0, 0.0, 2.0],  # at pixel (24, 12)
-            [0.01, 0.0, 3.0],  # hidden by it
+            [0.01, 0.0, 3.0],  # hidden by the first
             [0.01, 0.0, 2.05],  # on the same surface
-            [0.5, 0.2, 4.0],  # at pixel (27, 13.2): in another cell
+            [0.5, 0.2, 4.0],  # at pixel (27, 13.2), in another cell
             [0.0, 0.0, -1.0],  # behind the camera
             [9.0, 0.0, 2.0],  # outside the image
         ]

@@ -1,4 +1,4 @@
-"""The viewer: its page in a browser, where one is here, and what is said where it cannot be."""
+"""The viewer: its page in a browser, if one is installed, and one sentence for each mistake."""
 
 import queue
 import socket
@@ -19,7 +19,7 @@ from experiments.training.stored_run import load_run_scene, read_run, restore
 
 
 HAS = "return document.body.innerText.includes(arguments[0])"
-# The pixels of the picture and of its support, once the picture is not the one given.
+# Returns the pixels of the picture and of its support once the picture differs from the argument.
 PICTURES = """
 const shown = [...document.images].filter(image => image.complete && image.naturalWidth > 300);
 const pixels = shown.map(image => {
@@ -39,7 +39,7 @@ def viser():
 
 @pytest.fixture
 def serve(viser):
-    """Serve a state at a free port; returns the page and its address."""
+    """Return a function that serves a state at a free port; it returns the page and its address."""
     from experiments.viewing.page import Viewer
     from experiments.viewing.server import serve
 
@@ -75,27 +75,27 @@ def test_a_closeup_is_chosen_and_rendered_in_a_browser(serve, kept, monkeypatch)
         browser.wait(HAS, "There is no picture yet")
         browser.click_in_the_middle()
         page.work(timeout=30)
-        browser.wait(HAS, "photographs show that")
+        browser.wait(HAS, "photographs show that point")
         pictures = [[None]]
-        for button in ("Render", "Fine-tune for it, and render", "Render"):
+        for button in ("Render", "Fine-tune and render", "Render"):
             browser.press(button)
             page.work(timeout=30)
             said = "Fine-tuned and rendered (" if "tune" in button else "Rendered ("
             browser.wait(HAS, said)
             pictures.append(browser.wait(PICTURES, pictures[-1][0]))
     _, rendered, tuned, again = pictures
-    assert tuned[1] == rendered[1]  # darker, but of the same support
-    assert again == rendered  # every fine-tuning starts from the same state, which is left alone
+    assert tuned[1] == rendered[1]  # darker, but with the same support
+    assert again == rendered  # every fine-tuning starts from the same state, which does not change
 
 
-def test_a_nerf_is_shown_by_its_points(serve, kept):
+def test_the_page_shows_the_points_of_a_nerf(serve, kept):
     programs = Programs(TINY, load_run_scene(read_run(kept)))
     page, _ = serve(programs, types.SimpleNamespace(params={}))
     with pytest.raises(queue.Empty):
         page.work(timeout=0)
 
 
-def test_failures_are_said_on_the_page_which_goes_on(serve, kept, capsys):
+def test_the_page_shows_failures_and_stays_up(serve, kept, capsys):
     page, _ = serve(
         Programs(TINY, load_run_scene(read_run(kept))), types.SimpleNamespace(params={})
     )
@@ -105,16 +105,16 @@ def test_failures_are_said_on_the_page_which_goes_on(serve, kept, capsys):
 
     page._later("trying", lambda: fail(TrainingError("the loss was not finite")))
     page._later("trying more", lambda: "done")
-    assert "still work to do" in page._status.content
+    assert "still busy" in page._status.content
     page.work()
     assert page._status.content == "the loss was not finite"
     page._later("trying", lambda: fail(ValueError("a bug")))
     page.work()
-    assert page._status.content == "trying failed (ValueError): the terminal says more."
+    assert page._status.content == "trying failed (ValueError): see the terminal for details."
     assert "ValueError: a bug" in capsys.readouterr().err
 
 
-def test_nothing_is_ever_shared(viser):
+def test_the_page_never_becomes_public(viser):
     from experiments.viewing.server import serve
 
     server = serve("127.0.0.1", free_port())
@@ -134,10 +134,10 @@ def run(kept):
     return call
 
 
-def test_mistakes_are_one_sentence(run, viser):
+def test_a_mistake_exits_with_one_sentence(run, viser):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        with pytest.raises(SystemExit, match=rf"--port={port} cannot be served at \(Address al"):
+        with pytest.raises(SystemExit, match=rf"--port={port} \(Address already in use\)"):
             run(port=port)
     with pytest.raises(SystemExit, match=r"--host=10\.255\.255\.1 .*an address of this computer"):
         run(host="10.255.255.1", port=free_port())
@@ -145,7 +145,7 @@ def test_mistakes_are_one_sentence(run, viser):
         run(run="nowhere")
 
 
-def test_without_viser_the_extra_is_named(run, monkeypatch):
+def test_an_error_without_viser_names_the_extra(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     for name in ("experiments.viewing.server", "experiments.viewing.page"):
         monkeypatch.delitem(sys.modules, name, raising=False)

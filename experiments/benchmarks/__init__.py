@@ -1,1 +1,1 @@
-"""One module for each suite of `experiments.bench`; each has `run() -> None` and prints a table."""
+"""One module for each suite of `experiments.bench`, with `run() -> None`, which prints a table."""

@@ -1,10 +1,10 @@
-"""How right pseudo-labels are when depth is exact, on the built-in scenes, and their ceiling.
+"""Errors of pseudo-labels from exact depth on the built-in scenes, and their upper bound.
 
-Random virtual close-ups, magnified 2 to 8 times; error is the mean absolute difference of kept
-labels from the true close-up blurred to the source photograph's pixels, kept is the share of the
-pixels that the source sees. The ceiling is the PSNR, on the close-ups that runs are scored on, of
-the truth as sharp as the nearest photograph shows it. What training leaves of these figures is in
-each run's results.json.
+The suite labels random virtual close-ups, magnified 2 to 8 times. `error` is the mean absolute
+difference between kept labels and the true close-up, blurred to the source photograph's pixels.
+`kept` is the share of the pixels seen by the source that keep a label. The bound is the PSNR of the
+true test close-ups, blurred to the detail of the nearest photograph. The results.json of each run
+holds the same figures for trained depth.
 """
 
 import dataclasses
@@ -36,7 +36,7 @@ MASKS = {
 
 
 def run() -> None:
-    """Print error, kept and leaked shares for each scene and mask; write pictures of labels."""
+    """Print error and shares kept and leaked by scene and mask, and write pictures of labels."""
     print(f"labels from exact depth at 1/{DOWNSCALE} of the full size")
     print(f"{'scene':>8}  {'mask':<22}  {'error':>6}  {'kept':>6}  {'leaked':>6}")
     for name in PROCEDURAL_SCENES:
@@ -54,10 +54,8 @@ def run() -> None:
                 f"  {found['leaked']:>6.1%}",
                 flush=True,
             )
-        ceilings = (
-            f"{_ceiling(scene, exact):.2f} dB, at 1/{2 * DOWNSCALE} {_ceiling_at(name):.2f} dB"
-        )
-        print(f"{name:>8}  ceiling on close-ups: {ceilings}", flush=True)
+        bounds = f"{_bound(scene, exact):.2f} dB, at 1/{2 * DOWNSCALE} {_quick_bound(name):.2f} dB"
+        print(f"{name:>8}  upper bound on close-ups: {bounds}", flush=True)
         label_pictures(
             jax.random.key(1),
             [],
@@ -70,14 +68,14 @@ def run() -> None:
     print(f"pictures: {PICTURES}")
 
 
-def _ceiling_at(name: str) -> float:
-    """The ceiling at the size of the quick presets."""
+def _quick_bound(name: str) -> float:
+    """Return the upper bound at the size of the quick presets."""
     scene = load_scene(name, downscale=2 * DOWNSCALE)
-    return _ceiling(scene, exact_depths(scene, scene.train.cameras))
+    return _bound(scene, exact_depths(scene, scene.train.cameras))
 
 
-def _ceiling(scene: Scene, exact: jax.Array) -> float:
-    """Mean PSNR of the test close-ups as photographs resolve them, where any sees the surface."""
+def _bound(scene: Scene, exact: jax.Array) -> float:
+    """Return the mean PSNR of the test close-ups at the photographs' detail, where seen."""
     views = scene.test
     found = []
     for i in range(len(views)):

@@ -1,7 +1,7 @@
-"""Training steps and images of a NeRF, against the matrix products that they consist of.
+"""Training steps and images of a NeRF, timed against the matrix products that they consist of.
 
-The ceiling is the product that a NeRF of 1024 rays would do, 65536 x 256 x 256. A second one is the
-same arithmetic in pieces that stay in the cache, which is how the NeRF does it.
+The ceiling is one product of 65536 x 256 x 256, the size for 1024 rays. The pieces are the same
+arithmetic in parts that stay in the cache, as in the NeRF.
 """
 
 import dataclasses
@@ -22,17 +22,15 @@ from jaxcloseup.volume.nerf import NerfConfig, nerf
 FULL = NerfConfig()
 SMALL = NerfConfig(depth=4, direction_width=64, num_coarse=32, num_fine=32)
 SMALL_WIDTHS = (64, 96, 128)
-NUM_RAYS = 256  # they go through 16 at a time: 1024 take four times as long
+NUM_RAYS = 256  # the NeRF takes 16 rays at a time, so 1024 rays take four times as long
 IMAGE = 32
 CAMERA = Camera(jnp.eye(4)[:3], jnp.array([32.0, 32.0, 16.0, 16.0]), IMAGE, IMAGE)
 ROWS, WIDTH = 65536, 256
-
-
 DTYPES = ("float32", "bfloat16")
 
 
 def run() -> None:
-    """Measure and print; about two minutes on two idle cores."""
+    """Print a table of times, rates and memory; takes about two minutes on two idle cores."""
     calls, megabytes = {}, {}
     for dtype in DTYPES:
         config = dataclasses.replace(FULL, compute_dtype=dtype)
@@ -48,7 +46,7 @@ def run() -> None:
     flops = {"ceiling": 2 * ROWS * WIDTH**2, "step": NUM_RAYS * training_flops(FULL)}
     flops |= {"pieces": flops["ceiling"], "again": flops["step"]}
     rate = {call: flops[call[0]] / s / 1e9 for call, s in seconds.items() if call[0] in flops}
-    print(f"\nNeRF 8 x 256, 64 + 64 samples; a training step is of {NUM_RAYS} rays, with Adam")
+    print(f"\nNeRF 8 x 256, 64 + 64 samples; a training step has {NUM_RAYS} rays, with Adam")
     print(f"{'':44}{'float32':>10}{'bfloat16':>10}")
     row("ceiling 65536 x 256 x 256, GFLOP/s", [rate["ceiling", d] for d in DTYPES])
     row("the same in pieces that stay in the cache", [rate["pieces", d] for d in DTYPES])
@@ -61,9 +59,9 @@ def run() -> None:
         [seconds["step", DTYPES[0]] / seconds["step", d] for d in DTYPES],
     )
     row("  temporaries, MB", [megabytes["step", d] for d in DTYPES])
-    row("plain gradient, which renders twice, ms", [1e3 * seconds["again", d] for d in DTYPES])
+    row("plain gradient (renders twice), ms", [1e3 * seconds["again", d] for d in DTYPES])
     row("  temporaries, MB", [megabytes["again", d] for d in DTYPES])
-    row("image of depth alone, rays/s", [IMAGE**2 / seconds["image", d] for d in DTYPES])
+    row("depth image, rays/s", [IMAGE**2 / seconds["image", d] for d in DTYPES])
     row("  temporaries, MB", [megabytes["image", d] for d in DTYPES])
     print(f"\nNeRF of depth 4, 32 + 32 samples; a training step of {NUM_RAYS} rays, float32")
     for width in SMALL_WIDTHS:
@@ -76,11 +74,11 @@ def row(title: str, cells: list[float]) -> None:
 
 
 def training_flops(config: NerfConfig) -> int:
-    """Matrix FLOPs of one ray, forward and backward: 2 m n k for each product needed.
+    """Return the matrix FLOPs of one ray, forward and backward: 2 m n k for each product needed.
 
-    A layer needs one product forward and two backward, for its weights and for its input, but none
-    for the gradient of an encoded input. The linear feature layer counts as folded into the next,
-    which is what is computed (the original's figure is 13 % higher). Recomputation does not count.
+    A layer needs one product forward and two backward, for its weights and for its input. The
+    gradient of an encoded input is not needed. The linear feature layer counts as folded into the
+    next layer, as computed here; the original's count is 13 % higher. Recomputation does not count.
     """
     inputs = 3 + 6 * config.position_octaves
     skip = config.skip_after + 1 < config.depth
@@ -92,7 +90,7 @@ def training_flops(config: NerfConfig) -> int:
 
 
 def product(dtype: str, rows: int) -> Callable[[], jax.Array]:
-    """As many products of `rows` rows as make up ROWS, rows last, summed in float32."""
+    """Return a call that does products of `rows` rows, in all ROWS rows, summed in float32."""
     weights = jnp.ones((WIDTH, WIDTH), dtype)
     x = jnp.ones((WIDTH, rows), dtype)
     dot = jax.jit(functools.partial(jax.lax.dot, preferred_element_type=jnp.float32))
@@ -106,7 +104,7 @@ def product(dtype: str, rows: int) -> Callable[[], jax.Array]:
 
 
 def training_step(config: NerfConfig, *, recompute: bool = False):
-    """A step on random pixels, and its temporary memory in MB."""
+    """Return a training step on random pixels, and its temporary memory in MB."""
     field = nerf(config, near=0.5, far=4.0)
     params, buffers = jax.jit(field.init)(jax.random.key(0), jnp.zeros((1, 3)), jnp.zeros((1, 3)))
     optimizer = optax.adam(5e-4)
@@ -126,14 +124,14 @@ def training_step(config: NerfConfig, *, recompute: bool = False):
 
 
 def depth_image(config: NerfConfig):
-    """The depth of an image of IMAGE x IMAGE pixels, and its temporary memory in MB."""
+    """Return a call that renders the depth of IMAGE x IMAGE pixels, and its temporary MB."""
     field = nerf(config, near=0.5, far=4.0)
     params, buffers = jax.jit(field.init)(jax.random.key(0), jnp.zeros((1, 3)), jnp.zeros((1, 3)))
     return compiled(lambda p: field.render(p, buffers, CAMERA, None, None).depth, params)
 
 
 def compiled(function: Callable, *args):
-    """A call without arguments, and the temporary memory that it takes in MB."""
+    """Compile a function; return a call without arguments, and its temporary memory in MB."""
     executable = jax.jit(function).lower(*args).compile()
     memory = executable.memory_analysis().temp_size_in_bytes / 1e6
     return functools.partial(executable, *args), memory

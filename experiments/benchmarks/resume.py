@@ -1,4 +1,4 @@
-"""A short run, killed at ten random moments and resumed each time, against one left in peace.
+"""A short run, killed at ten random moments and resumed each time, against an uninterrupted run.
 
 All metrics and the history of every stage must be the same to the last bit.
 """
@@ -14,39 +14,39 @@ import time
 
 
 KILLS = 10
-KILLS_OF_A_RUN = 2  # more would meet it where it begins again, and no longer in stage 1
+KILLS_PER_RUN = 2  # later kills would hit the restart, and no longer stage 1
 COMMAND = (
     "-m",
     "experiments.run",
     "--scene=table",
-    "--set=baseline_steps=700",  # relocations, harmonics and regularizers begin before
+    "--set=baseline_steps=700",  # relocation, harmonics and regularizers start earlier
     "--set=closeup_steps=20",
     "--save_every=50",
 )
 
 
 def run() -> None:
-    """Print when runs were killed, and whether what they ended with is the same."""
+    """Print the checkpoint kept at each kill, and check that all runs end the same."""
     with tempfile.TemporaryDirectory() as folder:
         root = pathlib.Path(folder)
         start = time.perf_counter()
-        _start(root / "peace", resume=False).wait()
-        expected = _outcome(root / "peace")
+        _start(root / "uninterrupted", resume=False).wait()
+        expected = _outcome(root / "uninterrupted")
         whole = time.perf_counter() - start
-        print(f"left in peace: {whole:.0f} s")
+        print(f"uninterrupted: {whole:.0f} s")
         rng, killed, attempt = random.Random(0), 0, 0
         while killed < KILLS:
             target, before = root / f"killed_{attempt}", killed
             while not (target / "report.html").exists():
                 process = _start(target, resume=(target / "checkpoints").is_dir())
-                if killed < min(KILLS, before + KILLS_OF_A_RUN):
+                if killed < min(KILLS, before + KILLS_PER_RUN):
                     time.sleep(rng.uniform(0.1, 0.6) * whole)
                     if process.poll() is None:
                         process.send_signal(signal.SIGKILL)
                         killed += 1
                         steps = sorted(target.glob("checkpoints/*/[0-9]*"))
-                        last = "/".join(steps[-1].parts[-2:]) if steps else "nothing"
-                        print(f"kill {killed}: {last} was kept", flush=True)
+                        last = "/".join(steps[-1].parts[-2:]) if steps else "none"
+                        print(f"kill {killed}: the newest checkpoint is {last}", flush=True)
                 if process.wait() not in (0, -signal.SIGKILL):
                     raise AssertionError((root / "log.txt").read_text()[-2000:])
             attempt += 1

@@ -1,9 +1,9 @@
-"""Surfels rendered and differentiated, against a plain scan and against arithmetic.
+"""Surfels rendered and differentiated, timed against a plain scan and against their arithmetic.
 
-The discs lie at points that the photographs of `table` saw, as they do when training starts.
-The plain scan is what one would write first, given the same projection and the same tile lists: all
-tiles step through their lists together and `jax.grad` does the rest. The bound is the arithmetic of
-all (pixel, splat) evaluations at the rate at which this machine multiplies matrices.
+The discs lie at points that the photographs of `table` see, as at the start of training. The plain
+scan uses the same projection and the same tile lists: all tiles step through their lists together,
+and `jax.grad` differentiates the scan. The bound is the time for the arithmetic of all
+(pixel, splat) evaluations at this machine's rate of matrix products.
 """
 
 import contextlib
@@ -31,17 +31,17 @@ from jaxcloseup.splats.tiling import tile_lists
 
 COUNTS = (5_000, 20_000, 100_000)
 SIZES = ((135, 240), (270, 480), (540, 960))
-# Additions, multiplications, comparisons and selections of one evaluation; exp and 1/x count once.
+# Additions, products, comparisons and selections of one evaluation; exp and 1/x count as one.
 FORWARD_OPERATIONS, BACKWARD_OPERATIONS = 76, 136
-SCAN_BYTES = 6e9  # the scan is skipped where its stored steps would need more
+SCAN_BYTES = 6e9  # the scan is skipped if its stored steps need more memory
 
 
 def run() -> None:
     """Print a table of milliseconds, ratios, memory and compile time."""
     rate = _matmul_rate()
     print(
-        f"matrix product {rate / 1e9:.0f} GFLOP/s; milliseconds of forward and of both passes, and "
-        "how many times slower the scan is in forward/both"
+        f"matrix product: {rate / 1e9:.0f} GFLOP/s; the table shows milliseconds of the forward "
+        "pass and of both passes, and how many times slower the scan is in forward/both"
     )
     print(
         "splats     image   pairs/px  forward    both  one core  cores       scan    ratios"
@@ -51,13 +51,13 @@ def run() -> None:
     for count in COUNTS:
         for size in SIZES:
             _report(*_workload(scene, count, size), rate)
-    print("a wavy wall, which gives all tiles lists of nearly one length:")
+    print("a wavy wall, which gives all tiles lists of nearly the same length:")
     _report(*_wall(20_000, (270, 480)), rate)
 
 
 def _report(surfels, camera, rate):
     count, size = surfels.means.shape[0], (camera.height, camera.width)
-    # What a first guess counts as overflow says how much is needed.
+    # The overflow of a first guess shows how much capacity is needed.
     pairs, _ = _count(surfels, camera, RasterizeConfig(capacity=2**16))
     config = RasterizeConfig(capacity=-(-pairs // 2**14) * 2**14)
     _, longest = _count(surfels, camera, config)
@@ -111,7 +111,7 @@ def _report(surfels, camera, rate):
 
 
 def _workload(scene, count, size):
-    """Discs at random points that the photographs saw, and the camera of the first of them."""
+    """Return discs at random points that the photographs see, and the first photograph's camera."""
     key_pixel, key_opacity, key_surfels = jax.random.split(jax.random.key(0), 3)
     cameras, depths = scene.train.cameras, exact_depths(scene, scene.train.cameras)
     grid = pixel_grid(cameras.height, cameras.width)
@@ -147,7 +147,7 @@ def _wall(count, size):
 
 
 def _loss(render, surfels, camera):
-    """Every output counts, as when training with all regularizers."""
+    """Return a loss of every output, as in training with all regularizers."""
     rgb, depth, normal, distortion = render(surfels, camera)
     loss = jnp.mean((rgb - 0.4) ** 2) + 0.05 * jnp.mean((depth - 3) ** 2)
     return loss + 0.05 * jnp.mean(normal[..., 2]) + 0.1 * jnp.mean(distortion)
@@ -181,13 +181,13 @@ def _lists(footprints, camera, config):
 
 
 def _count(surfels, camera, config):
-    """How many (tile, surfel) pairs there are, and how many of those that fit one tile has."""
+    """Return the number of (tile, surfel) pairs, and the most that fit in one tile's list."""
     lists = jax.jit(lambda s, c: _lists(_footprints(s, c, config), c, config))(surfels, camera)
     return int(lists.counts.sum() + lists.overflow), int(lists.counts.max())
 
 
 def _render_by_scan(surfels, camera, config, longest):
-    """Blend all tiles in step, one splat of each at a time."""
+    """Blend all tiles together, one splat of each list at a time."""
     splats = _footprints(surfels, camera, config)
     lists = _lists(splats, camera, config)
     starts, counts, origins = (a[:, 0] for a in (lists.starts, lists.counts, lists.origins))
@@ -230,14 +230,14 @@ def _render_by_scan(surfels, camera, config, longest):
 
 
 def _check(gradient, expected):
-    """Both must have the same derivative, up to rounding."""
+    """Check that both have the same derivative up to rounding."""
     for a, b in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected), strict=True):
         if float(jnp.max(jnp.abs(a - b))) > 1e-2 * float(jnp.max(jnp.abs(b))):
             raise AssertionError("the splatter and the scan disagree on a derivative")
 
 
 def _matmul_rate():
-    """Operations per second of a large product of matrices."""
+    """Return the operations per second of a large matrix product."""
     side = 2048
     matrix = jax.random.normal(jax.random.key(0), (side, side))
     product = jax.jit(lambda a: a @ a)
@@ -246,7 +246,7 @@ def _matmul_rate():
 
 @contextlib.contextmanager
 def _one_core():
-    """Keep all threads of this process on one core, where the system allows it."""
+    """Keep all threads of this process on one core, if the system allows it."""
     if not hasattr(os, "sched_setaffinity"):
         yield
         return

@@ -1,4 +1,4 @@
-"""One step of a sweep of eight arms against eight steps of a run alone, for both fields."""
+"""One step of a sweep with eight arms against eight steps of a single run, for each method."""
 
 import jax
 
@@ -13,24 +13,24 @@ from jaxcloseup.scenes import load_scene
 
 ARMS = ("control", "labels", "mask", "diverse")
 GRID = ("rgb_tolerance=0.02", "depth_tolerance=0.005", "label_loss_weight=0.5", "magnification=2:4")
-BEGUN, STEPS = 100, 5  # steps before measuring, and in one measurement
+WARMUP, STEPS = 100, 5  # steps before measuring, and in one measurement
 
 
 def run() -> None:
-    """Print milliseconds and the ratio."""
+    """Print milliseconds and the ratio for each method."""
     print("method   one step alone  one step of 8 arms  over 8 alone")
     for name, method in METHODS.items():
         preset = method.presets["quick"]
         scene = load_scene("table", downscale=preset.downscale)
         programs = Programs(preset, scene)
         state = initial_state(programs, seed=0)
-        state, _ = programs.run("photographs", state, jax.device_put(scene.train), count=BEGUN)
+        state, _ = programs.run("photographs", state, jax.device_put(scene.train), count=WARMUP)
         start = start_labels(programs, state, seed=0)
         arms = [make_arm(arm, preset) for arm in ARMS + GRID]
         arms = [arm.settings for arm in sorted(arms, key=lambda arm: arm.outlook)]
         stacked = stack_arms(arms, [start] * len(arms), len(jax.devices()))
         alone = start.state, start.sources, pseudo_settings(preset.labels)
-        programs.make_room(4)  # virtual views need more than photographs; both have the same
+        programs.make_room(4)  # virtual cameras need more than photographs; both calls get the same
         calls = {
             "alone": lambda p=programs, a=alone: p.run("random_closeups", *a, count=STEPS)[0],
             "arms": lambda p=programs, a=stacked: p.run("arms", *a, count=STEPS)[0],

@@ -1,4 +1,4 @@
-"""Fair timing on shared, noisy machines: one process, interleaved calls, medians."""
+"""Fair timing on shared, noisy machines: one process, calls in turns, medians."""
 
 import statistics
 import time
@@ -10,7 +10,14 @@ import jax
 def interleaved_medians(
     calls: Mapping[str, Callable[[], object]], repeats: int = 5
 ) -> dict[str, float]:
-    """Median wall seconds of calls taken in turn (A B, A B, ...), after one warm-up each."""
+    """Return the median wall seconds of each call.
+
+    The calls take turns (A B, A B, ...), after one warm-up each.
+
+    Args:
+      calls: functions to time, by name; their results are waited for.
+      repeats: number of timed calls of each function.
+    """
     seconds: dict[str, list[float]] = {name: [] for name in calls}
     for call in calls.values():
         jax.block_until_ready(call())

@@ -1,7 +1,8 @@
 """Forward warp of 50 views of 960 x 540 into one virtual close-up.
 
-Against the loop that one would write first: for each view in NumPy, project all points, keep the
-nearest of each pixel, merge. And against the time to copy the bytes that any method must read.
+The suite compares it with a plain NumPy loop, which for each view projects all points, keeps the
+nearest at each pixel, and merges the views. It also prints the time to copy the depth maps, which
+any method without culling must read.
 """
 
 import functools
@@ -22,7 +23,7 @@ TARGETS = 3
 
 
 def run() -> None:
-    """Print milliseconds, ratios and the bound."""
+    """Print milliseconds, ratios and the copy time."""
     cameras = _cameras()
     depths = jax.lax.map(_depth, cameras)
     rgb = jax.random.randint(jax.random.key(0), (*depths.shape, 3), 0, 256).astype(jnp.uint8)
@@ -58,12 +59,12 @@ def run() -> None:
     copy = interleaved_medians({"copy": functools.partial(jax.jit(lambda x: x + 1), depths)})
     print(
         f"reading and writing all {depths.nbytes / 1e6:.0f} MB of depth once takes "
-        f"{copy['copy'] * 1e3:.0f} ms: what any method without culling would need at least"
+        f"{copy['copy'] * 1e3:.0f} ms, the least that a method without culling needs"
     )
 
 
 def _cameras():
-    """An arc of cameras around a sphere on the ground, in a large dome."""
+    """Return cameras on an arc around a sphere on the ground, inside a large dome."""
     poses = []
     for turn in np.linspace(0, np.pi, VIEWS, endpoint=False):
         position = np.array([3 * np.cos(turn), 3 * np.sin(turn), 1.5 + 0.3 * np.sin(5 * turn)])
@@ -79,7 +80,7 @@ def _cameras():
 
 
 def _depth(camera):
-    """Exact depth of that world: the nearest of ground, sphere and dome."""
+    """Return the exact depth of ground, sphere and dome, whichever is nearest."""
     origins, directions = pixels_to_rays(camera, _grid())
     down = directions[..., 2]
     ground = jnp.where(down < 0, -origins[..., 2] / jnp.where(down < 0, down, -1), jnp.inf)
@@ -101,7 +102,7 @@ def _grid():
 
 
 def _numpy_loop(points, rgb, camera):
-    """The union of forward warps, a view at a time."""
+    """Warp the views forward one at a time; keep the nearest point at each pixel."""
     fx, fy, cx, cy = camera.intrinsics
     image = np.zeros((HEIGHT * WIDTH, 3), np.uint8)
     depth = np.full(HEIGHT * WIDTH, np.inf, np.float32)
@@ -120,8 +121,8 @@ def _numpy_loop(points, rgb, camera):
 
 
 def _check(union, by_loop):
-    """Both must agree but for pixels where rounding moves a point across a pixel's edge."""
+    """Check that both agree except where rounding moves a point across a pixel's edge."""
     image, _ = by_loop
     agree = np.mean(np.all(np.asarray(union.values) == image, axis=-1))
     if agree < 0.99:
-        raise AssertionError(f"union_warp and the NumPy loop agree on {agree:.1%} of pixels only")
+        raise AssertionError(f"union_warp and the NumPy loop agree on only {agree:.1%} of pixels")

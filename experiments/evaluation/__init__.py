@@ -1,1 +1,1 @@
-"""How good renders, depths and labels are."""
+"""Metrics of renders, depths and pseudo-labels; the program is `experiments.evaluate`."""

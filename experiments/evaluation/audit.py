@@ -1,8 +1,8 @@
-"""How good pseudo-labels are: against the truth on procedural scenes, against photographs on all.
+"""Errors of pseudo-labels: against true close-ups on procedural scenes, against photographs on all.
 
-A label can at best be what its source photograph resolves, so it is compared with the true close-up
-blurred to the footprint that the source's pixels have there. On captures, training photographs are
-left out one by one, labeled from the others and compared with what they are.
+A label cannot be sharper than its source photograph. On procedural scenes it is therefore compared
+with the true close-up, blurred to the footprint of the source's pixels. On all scenes, training
+photographs are left out one by one, labeled from the others, and compared with their labels.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -38,13 +38,16 @@ _SIGMAS = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 def blur_to_footprint(image: np.ndarray, footprint: np.ndarray) -> np.ndarray:
     """Blur an image as if it were photographed with pixels `footprint` times as large.
 
-    A photograph averages over its pixel (variance 1/12) and bilinear reading over its neighbors
-    (1/6), so the standard deviation is half a source pixel; what the image's own pixels average
-    already is taken off.
+    A photograph averages over its pixel (variance 1/12), and bilinear sampling over the neighbors
+    (1/6), so the standard deviation is half a source pixel. The variance that the image's own
+    pixels already have is subtracted.
 
     Args:
-      image: `[H, W, 3]`.
-      footprint: `[H, W]` side of a source pixel in pixels of the image.
+      image: `[H, W, 3]` image to blur.
+      footprint: `[H, W]` side of a source pixel, in pixels of the image.
+
+    Returns:
+      `[H, W, 3]` blurred image.
     """
     sigma = np.sqrt(np.maximum(footprint**2 / 4 - 1 / 12, 0))
     levels = [image] + [cv2.GaussianBlur(image, (0, 0), s) for s in _SIGMAS[1:]]
@@ -58,17 +61,18 @@ def blur_to_footprint(image: np.ndarray, footprint: np.ndarray) -> np.ndarray:
 def resolved_by_photographs(
     scene: Scene, camera: Camera, exact_depths: jax.Array
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The true image of a camera as the training photograph nearest to each point resolves it.
+    """Blur a camera's true image to the detail of the training photographs.
 
-    What labels could be at best, with exact depth and every photograph at hand.
+    At each pixel the photograph with the smallest footprint sets the blur. Labels from exact depth
+    and all photographs cannot be better than this image.
 
     Args:
-      scene: with `surface`.
-      camera: of the image.
-      exact_depths: `[V, H, W]` of the training views.
+      scene: a scene with `surface`.
+      camera: camera of the image.
+      exact_depths: `[V, H, W]` exact depths of the training views.
 
     Returns:
-      `[H, W, 3]` the blurred truth, and `[H, W]` whether any photograph sees the point.
+      `[H, W, 3]` the blurred true image, and `[H, W]` whether any photograph sees the surface.
     """
     truth = jax.jit(scene.surface)(camera)
     pixels = pixel_grid(camera.height, camera.width)
@@ -91,22 +95,23 @@ def audit_labels(
     render_depth: Callable[[Camera], jax.Array],
     count: int = 16,
 ) -> dict[str, Any]:
-    """Label error and yield over random virtual close-ups of a procedural scene.
+    """Measure errors and shares of labels over random virtual close-ups of a procedural scene.
 
     Args:
       key: random key.
-      exact_depths: `[V, H, W]` exact depths of the training views, which decide what is visible.
+      exact_depths: `[V, H, W]` exact depths of the training views; they decide what a view sees.
       scene: a scene with `surface`.
       sources: the photographs with the depths that labels are made from.
-      settings: how labels are made.
-      render_depth: `camera -> [H, W]`, the virtual depth that labels are made from.
-      count: how many virtual cameras.
+      settings: settings of poses and labels.
+      render_depth: `camera -> [H, W]`, the depth of a virtual camera that labels are made from.
+      count: number of virtual cameras.
 
     Returns:
-      `error`, mean absolute difference of kept labels from the blurred truth; `kept`, share of the
-      pixels that the source view truly sees; `leaked`, share of kept pixels that it does not.
-      None beside a reason where there is nothing to divide by. `curve`: see `error_curve`, with
-      coverage as a share of all pixels.
+      `error`: mean absolute difference between kept labels and the blurred true image. `kept`:
+      share of the pixels seen by the source view that keep their label. `leaked`: share of kept
+      labels whose surface the source view does not see. A share of nothing is None, and
+      `<name>_reason` says why. `curve`: `error_curve` with the mean of `leaked`, and coverage as a
+      share of all pixels.
     """
     sample = jax.jit(sample_virtual_camera)
     label_image = jax.jit(_label_twice)
@@ -117,7 +122,7 @@ def audit_labels(
         camera, index = sample(one, sources, settings)
         pixels = pixel_grid(camera.height, camera.width)
         label = label_image(camera, pixels, render_depth(camera), index, sources, settings)
-        weight, of_any_color = np.asarray(label.weight)
+        weight, any_color_weight = np.asarray(label.weight)
         truth = scene.surface(camera)
         visible, footprint = _seen_by(
             camera, pixels, truth.depth, camera_at(scene.train.cameras, index), exact_depths[index]
@@ -129,7 +134,7 @@ def audit_labels(
         kept += float(weight.sum())
         kept_visible += float((weight * visible).sum())
         visible_total += float(visible.sum())
-        inside = of_any_color > 0
+        inside = any_color_weight > 0
         score = np.abs(label.backward - label.forward).max(axis=-1)
         columns = score, difference, 1 - visible
         of_curve.append(tuple(column[inside] for column in columns))
@@ -143,7 +148,9 @@ def audit_labels(
     for name, (part, whole) in shares.items():
         result[name] = part / whole if whole else None
         if not whole:
-            result[f"{name}_reason"] = "no label was kept" if name != "kept" else "nothing is seen"
+            result[f"{name}_reason"] = (
+                "no label was kept" if name != "kept" else "the source sees nothing"
+            )
     score, scored_error, leaked = map(np.concatenate, zip(*of_curve, strict=True))
     result["curve"] = error_curve(score, scored_error, pixels_total, {"leaked": leaked})
     return result
@@ -155,22 +162,22 @@ def error_curve(
     total: int,
     more: Mapping[str, np.ndarray] | None = None,
 ) -> dict[str, list[float] | float] | None:
-    """Error of labels against how many are kept, those first that the mask trusts most.
+    """Return the mean error of the best labels by score, for a growing number of labels.
 
-    The area under sparsification error (AUSE; Ilg et al., "Uncertainty Estimates and
-    Multi-Hypotheses Networks for Optical Flow", ECCV 2018) is 0 where the score sorts labels by
-    their true error, and one half where it says nothing and errors are uniform.
+    The area under the sparsification error (AUSE; Ilg et al., "Uncertainty Estimates and
+    Multi-Hypotheses Networks for Optical Flow", ECCV 2018) is 0 for a score that sorts labels by
+    their true error. It is one half for an uninformative score and uniform errors.
 
     Args:
-      score: `[N]` of the labels, smaller is better.
-      error: `[N]` their true error.
-      total: pixels of all images, of which the labels cover a part.
-      more: `[N]` other quantities whose means are wanted for the same parts.
+      score: `[N]` scores of the labels; smaller is better.
+      error: `[N]` true errors of the labels.
+      total: number of pixels in all images, labeled or not.
+      more: other quantities `[N]` by name, averaged over the same labels as `error`.
 
     Returns:
-      Lists over parts of the labels, from few to all: `coverage`, their share of `total`; `error`,
-      their mean error; `oracle`, that of as many labels with the least error; those of `more`; and
-      the number `ause`. None without labels.
+      Lists over `CURVE_POINTS` numbers of labels, from few to all. `coverage`: their share of
+      `total`. `error`: their mean error. `oracle`: mean error of the same number of labels with the
+      smallest errors. Each name of `more`: its mean. The number `ause`. None without labels.
     """
     if not len(score):
         return None
@@ -194,21 +201,22 @@ def error_curve(
 
 
 def _label_twice(camera, pixels, depth, index, sources, settings):
-    """The label with two weights `[2, H, W]`: as settings say, and regardless of color."""
-    ways = settings, _of_any_color(settings)
+    """Return the label with two weights `[2, H, W]`: by the settings' mask, and with any color."""
+    variants = settings, _any_color(settings)
 
     def label(use_mask, rgb_tolerance):
         changed = settings.replace(use_mask=use_mask, rgb_tolerance=rgb_tolerance)
         return label_pixels(camera, pixels, depth, index, sources, changed)
 
-    # What is not batched, the warps above all, is made once.
+    # vmap computes the unbatched parts once, above all the warps.
     return jax.vmap(label, out_axes=PseudoLabel(None, 0, None, None))(
-        jnp.stack([way.use_mask for way in ways]), jnp.stack([way.rgb_tolerance for way in ways])
+        jnp.stack([one.use_mask for one in variants]),
+        jnp.stack([one.rgb_tolerance for one in variants]),
     )
 
 
-def _of_any_color(settings: PseudoSettings) -> PseudoSettings:
-    """Settings that keep whatever both warps reach, so that their difference can be sorted by."""
+def _any_color(settings: PseudoSettings) -> PseudoSettings:
+    """Return settings that keep every label that both warps reach, whatever its colors."""
     return settings.replace(use_mask=jnp.float32(1), rgb_tolerance=jnp.float32(jnp.inf))
 
 
@@ -219,19 +227,20 @@ def audit_left_out(
     *,
     count: int = 8,
 ) -> list[dict[str, float | None]]:
-    """Labels of left-out training photographs, and the model, against these photographs.
+    """Compare labels of left-out training photographs, and the model, with these photographs.
 
-    The model has seen them, so its error is the least that it can be: labels that win here win.
+    The model was trained on them, so its error is as small as it can be. Labels that beat it even
+    here are better than the model.
 
     Args:
-      sources: the training photographs.
+      sources: the training photographs with their depths.
       render: `camera -> Rendering` of the model.
-      candidates: settings to compare.
-      count: photographs to leave out, spread evenly.
+      candidates: settings of labels to compare.
+      count: number of photographs to leave out, spread evenly.
 
     Returns:
-      For each candidate `label_psnr` and `model_psnr` over the pixels that are labeled, None where
-      none is, and `coverage`, their share.
+      For each candidate `label_psnr` and `model_psnr` in dB over the labeled pixels, None without
+      any, and `coverage`, the share of labeled pixels.
     """
     audit = jax.jit(_left_out)
     sums = np.zeros((len(candidates), 4))
@@ -256,17 +265,18 @@ def left_out_curve(
     *,
     count: int = 8,
 ) -> dict[str, list[float] | float] | None:
-    """`error_curve` of labels of left-out training photographs, with the error of the `model`.
+    """Return `error_curve` for labels of left-out training photographs, with the model's error.
 
-    Needs no truth but the photographs. Where the labels' curve lies above the model's, a tolerance
-    that keeps so many of them teaches the model its own faults. Arguments as in `audit_left_out`.
+    The curve needs no exact depth. Where the labels' error is above the `model` error, a tolerance
+    that keeps that many labels trains on worse colors than the model has. Arguments are those of
+    `audit_left_out`.
     """
     label_of = jax.jit(_label_left_out)
     found: list[tuple[np.ndarray, ...]] = []
     total = 0
     for index in _spread(sources.views, count):
         seen = render(camera_at(sources.views.cameras, index))
-        label, truth, weight = label_of(index, label_depth(seen), sources, _of_any_color(settings))
+        label, truth, weight = label_of(index, label_depth(seen), sources, _any_color(settings))
         inside = np.asarray(label.weight * weight) > 0
         columns = (
             np.abs(label.backward - label.forward).max(axis=-1),
@@ -284,7 +294,7 @@ def _spread(views, count):
 
 
 def _label_left_out(index, depth, sources, settings):
-    """The label of a training photograph from the others, its colors and its weight."""
+    """Return a training photograph's label from the others, its true colors and its weight."""
     views, depths = sources.views, sources.depths
     camera, weight = camera_at(views.cameras, index), views.weight[index]
     others = views.replace(weight=views.weight.at[index].set(0))
@@ -295,7 +305,7 @@ def _label_left_out(index, depth, sources, settings):
 
 
 def _left_out(index, rgb, depth, sources, settings):
-    """Sums over kept pixels: squared errors of label and model, kept pixels, all pixels."""
+    """Return `[4]` sums: squared errors of labels and of the model, kept weight, all weight."""
     label, truth, weight = _label_left_out(index, depth, sources, settings)
     kept = label.weight * weight
 
@@ -307,7 +317,7 @@ def _left_out(index, rgb, depth, sources, settings):
 
 @jax.jit
 def _seen_by(camera, pixels, depth, source, source_depth):
-    """Whether the source sees each pixel's surface, and its pixel's size in pixels of `camera`."""
+    """Return whether the source sees each surface, and its pixel's side in pixels of `camera`."""
     landed, landed_depth = points_to_pixels(source, pixels_to_points(camera, pixels, depth))
     observed = backward_warp(source_depth[..., None], landed, order=0)[..., 0]
     inside = in_bounds(landed, source.height, source.width)

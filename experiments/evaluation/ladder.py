@@ -1,7 +1,7 @@
-"""The zoom ladder: the same places seen from ever nearer, on scenes whose true look is known.
+"""The zoom ladder: the same points seen from nearer and nearer, on procedural scenes.
 
-From each held-out ordinary view one camera comes 1, 2, 4, 8 and 16 times nearer to one point that
-it sees, without turning, so that all that changes along the ladder is the magnification.
+Each held-out ordinary view gives a camera for each rung. The camera moves 1, 2, 4, 8 and 16 times
+nearer to one point of the view without turning, so only the magnification changes along the ladder.
 """
 
 from collections.abc import Iterable, Mapping
@@ -20,18 +20,19 @@ from jaxcloseup.support import count_seen
 
 MAGNIFICATIONS = (1, 2, 4, 8, 16)
 PREFIX = "zoom_"
-LEAST_SEEN = 3  # photographs that show a point which a ladder leads to
+MIN_PHOTOGRAPHS = 3  # photographs that must see the point of a ladder, if any point has so many
 
 
 def ladder_targets(scene: Scene, exact_depths: jax.Array) -> dict[str, list[Target]]:
-    """Held-out views for each magnification, by `zoom_<magnification>`.
+    """Return the held-out views of the ladder, by `zoom_<magnification>`.
 
     Args:
-      scene: a scene with `surface` and ordinary held-out views.
-      exact_depths: `[V, H, W]` of the training views.
+      scene: the scene.
+      exact_depths: `[V, H, W]` exact depths of the training views.
 
     Returns:
-      For each magnification a target of each ordinary view; none at all of scenes without.
+      For each magnification, one target for each ordinary view. Empty for scenes without `surface`
+      or without ordinary held-out views.
     """
     if scene.surface is None or scene.test_far is None:
         return {}
@@ -55,11 +56,11 @@ def ladder_targets(scene: Scene, exact_depths: jax.Array) -> dict[str, list[Targ
 
 
 def _anchor(key: jax.Array, camera: Camera, depth: jax.Array, seen: jax.Array) -> jax.Array:
-    """A point in the middle half of the view that several photographs show."""
+    """Draw a point in the middle half of the view, from those that several photographs see."""
     height, width = depth.shape
     middle = jnp.zeros((height, width), jnp.float32)
     middle = middle.at[height // 4 : -(height // 4), width // 4 : -(width // 4)].set(1)
-    weight = jnp.where(seen >= LEAST_SEEN, middle, 0)
+    weight = jnp.where(seen >= MIN_PHOTOGRAPHS, middle, 0)
     weight = jnp.where(jnp.any(weight > 0), weight, middle)
     pixel = sample_anchor(key, depth, weight)
     column, row = jnp.floor(pixel).astype(jnp.int32)
@@ -71,8 +72,8 @@ def _nearer(camera: Camera, anchor: jax.Array, magnification: float) -> Camera:
     return camera.replace(camtoworld=camera.camtoworld.at[:, 3].set(position))
 
 
-def ladder_in_short(splits: Mapping[str, Any]) -> str:
-    """PSNR at each magnification, in a line."""
+def describe_ladder(splits: Mapping[str, Any]) -> str:
+    """Return the PSNR at each magnification as one line."""
     rungs = ((m, splits[f"{PREFIX}{m}"]["psnr"]) for m in rungs_of(splits))
     return "PSNR (dB) " + ", ".join(
         f"{m}x nearer {'-' if value is None else f'{value:.2f}'}" for m, value in rungs
@@ -80,5 +81,5 @@ def ladder_in_short(splits: Mapping[str, Any]) -> str:
 
 
 def rungs_of(splits: Iterable[str]) -> list[int]:
-    """The magnifications among the names of splits, rising."""
+    """Return the magnifications of the ladder's splits, in ascending order."""
     return sorted(int(name.removeprefix(PREFIX)) for name in splits if name.startswith(PREFIX))

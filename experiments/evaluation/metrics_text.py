@@ -1,4 +1,4 @@
-"""Metrics as people read them: titles, numbers, and a split in a line."""
+"""Metrics for people to read: titles, formatted numbers, and one line for a split."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,20 +11,20 @@ COLUMNS = {
     "lpips_vgg": "LPIPS (VGG)",
     "lpips_alex": "LPIPS (AlexNet)",
     "cc_psnr": "PSNR, color-corrected (dB)",
-    "psnr_seen1": "PSNR where seen by 1+ (dB)",
-    "psnr_seen3": "PSNR where seen by 3+ (dB)",
-    "coverage_seen1": "share seen by 1+",
-    "coverage_seen3": "share seen by 3+",
+    "psnr_seen1": "PSNR where seen by 1+ photographs (dB)",
+    "psnr_seen3": "PSNR where seen by 3+ photographs (dB)",
+    "coverage_seen1": "share seen by 1+ photographs",
+    "coverage_seen3": "share seen by 3+ photographs",
     "depth_error_median": "median depth error (relative)",
-    "depth_error_p90": "90th percentile of it",
+    "depth_error_p90": "90th percentile depth error (relative)",
     "normal_error_median": "median normal error (degrees)",
     "point_depth_error_median": "median depth error at the capture's points (relative)",
-    "point_depth_error_p90": "90th percentile of it",
+    "point_depth_error_p90": "90th percentile depth error at the capture's points (relative)",
 }
 
 
-def in_short(split: Mapping[str, Any]) -> str:
-    """A split's PSNR, and how far its depth is off, in a line."""
+def describe_split(split: Mapping[str, Any]) -> str:
+    """Return a split's PSNR and median relative depth error as one line."""
     text = f"PSNR {format_metric('psnr', split['psnr'])} dB"
     for key in ("depth_error_median", "point_depth_error_median"):
         if split.get(key) is not None:
@@ -33,7 +33,7 @@ def in_short(split: Mapping[str, Any]) -> str:
 
 
 def format_metric(key: str, value: float | None) -> str:
-    """A metric as text, "-" where it could not be computed."""
+    """Format a metric's value; "-" stands for a metric that could not be computed."""
     if value is None:
         return "-"
     return f"{value:.2f}" if "psnr" in key or "normal" in key else f"{value:.4f}"

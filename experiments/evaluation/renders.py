@@ -1,4 +1,4 @@
-"""Renders of held-out views on disk, and what they should be."""
+"""Write renders of held-out views, and their true images, to disk."""
 
 import pathlib
 from collections.abc import Mapping, Sequence
@@ -10,7 +10,7 @@ from jaxcloseup.scene import Scene
 
 
 def write_renders(folder: pathlib.Path, renderings: Mapping[str, Rendering], scene: Scene) -> None:
-    """Write `rgb/<name>.png` and `depth/<name>.png`, the depth in color over the scene's range."""
+    """Write `rgb/<name>.png` and `depth/<name>.png`; colors of depth span the scene's range."""
     for name, rendering in renderings.items():
         write_png(folder / "rgb" / f"{name}.png", rendering.rgb)
         depth = colorize_depth(rendering.depth, near=scene.near, far=scene.far)
@@ -18,7 +18,7 @@ def write_renders(folder: pathlib.Path, renderings: Mapping[str, Rendering], sce
 
 
 def write_truth(folder: pathlib.Path, targets: Mapping[str, Sequence[Target]]) -> None:
-    """Write `<split>/rgb/<name>.png`, what renders are scored against, as anyone may again."""
+    """Write `<split>/rgb/<name>.png`, the true images, so that anyone can score the renders."""
     for split, views in targets.items():
         for target in views:
             write_png(folder / split / "rgb" / f"{target.name}.png", target.rgb)

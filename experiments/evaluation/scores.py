@@ -1,4 +1,4 @@
-"""Scoring a field on held-out views, full frame and where training photographs saw the surface."""
+"""Scores of held-out views: on the full frame, and where training photographs saw the surface."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -23,21 +23,24 @@ from jaxcloseup.scenes import Scene
 from jaxcloseup.support import count_seen
 
 
-SEEN_BY = (1, 3)
+SEEN_BY = (1, 3)  # least numbers of photographs, for metrics of the seen pixels alone
 
 
 class Perceptual(NamedTuple):
-    """LPIPS networks by backbone, and for each that is missing the reason."""
+    """LPIPS networks by backbone, and the reason for each missing one."""
 
     networks: Mapping[str, LpipsWeights]
     reasons: Mapping[str, str]
 
 
 def find_perceptual(folder: str | None = None) -> Perceptual:
-    """The LPIPS networks whose weights are found, in `folder` or where they usually are.
+    """Load the LPIPS networks whose weights are in `folder` or in the default folders.
+
+    Args:
+      folder: folder of weights, or None for the default folders.
 
     Raises:
-      ValueError: a folder is named and has none.
+      ValueError: `folder` holds no weights.
     """
     networks, reasons = {}, {}
     for backbone in BACKBONES:
@@ -50,20 +53,20 @@ def find_perceptual(folder: str | None = None) -> Perceptual:
     return Perceptual(networks, reasons)
 
 
-NO_PERCEPTUAL = Perceptual({}, dict.fromkeys(BACKBONES, "LPIPS was not asked for"))
+NO_PERCEPTUAL = Perceptual({}, dict.fromkeys(BACKBONES, "LPIPS was not requested"))
 
 
 class Target(NamedTuple):
     """A held-out view.
 
     Attributes:
-      name: of its photograph.
+      name: name of its photograph.
       camera: its camera.
-      rgb: `[H, W, 3]` the photograph, float.
-      weight: `[H, W]` 0 in padding.
-      seen: `[H, W]` how many training photographs saw the surface there.
-      surface: the exact one, or None where it is not known.
-      landmarks: points of the capture that it shows, where the surface is not known.
+      rgb: `[H, W, 3]` the photograph, float in [0, 1].
+      weight: `[H, W]` weights; 0 in padding.
+      seen: `[H, W]` number of training photographs that saw the surface at each pixel.
+      surface: the exact surface, or None where it is unknown.
+      landmarks: visible points of the capture, or None where the exact surface is known.
     """
 
     name: str
@@ -76,8 +79,8 @@ class Target(NamedTuple):
 
 
 def exact_depths(scene: Scene, cameras: Camera) -> jax.Array:
-    """Exact z-depths `[V, H, W]` of stacked cameras on a procedural scene."""
-    depth = jax.jit(lambda camera: scene.surface(camera).depth)  # leaves the colors undrawn
+    """Return the exact z-depths `[V, H, W]` of stacked cameras on a procedural scene."""
+    depth = jax.jit(lambda camera: scene.surface(camera).depth)  # jit skips the unused colors
     count = cameras.intrinsics.shape[0]
     return jnp.stack([depth(camera_at(cameras, i)) for i in range(count)])
 
@@ -85,10 +88,16 @@ def exact_depths(scene: Scene, cameras: Camera) -> jax.Array:
 def make_targets(
     scene: Scene, split: str, train_depths: jax.Array, render: Callable[[Camera], Rendering]
 ) -> list[Target]:
-    """The held-out views of a split, with their coverage.
+    """Return the held-out views of a split, with the number of photographs that saw each pixel.
 
-    Depth, for the coverage, is exact on procedural scenes and rendered on captures: from the
-    baseline, so that every stage is scored on the same pixels.
+    That number needs a depth. It is exact on procedural scenes. On captures it is rendered from the
+    baseline, so that all stages are scored on the same pixels.
+
+    Args:
+      scene: the scene.
+      split: name of the split.
+      train_depths: `[V, H, W]` depths of the training views.
+      render: `camera -> Rendering` of the baseline.
     """
     views: Views = getattr(scene, split)
     surface = jax.jit(scene.surface) if scene.surface else None
@@ -113,7 +122,14 @@ def targets_by_split(
     exact: jax.Array | None,
     render: Callable[[Camera], Rendering],
 ) -> dict[str, list[Target]]:
-    """`make_targets` of all splits but the training one; with `exact` depths where there are."""
+    """Return `make_targets` for every split except the training views.
+
+    Args:
+      scene: the scene.
+      train_depths: `[V, H, W]` rendered depths of the training views.
+      exact: `[V, H, W]` exact depths to use instead, or None on captures.
+      render: `camera -> Rendering` of the baseline.
+    """
     seen_from = train_depths if exact is None else exact
     return {
         split: make_targets(scene, split, seen_from, render)
@@ -125,7 +141,16 @@ def targets_by_split(
 def score(
     rendering: Rendering, target: Target, perceptual: Perceptual = NO_PERCEPTUAL
 ) -> dict[str, float | str | None]:
-    """Metrics of one view, on 8-bit colors; what cannot be computed is None beside its reason."""
+    """Return the metrics of one view on 8-bit colors, cropped to its photograph.
+
+    Args:
+      rendering: the rendered view, `[H, W]`.
+      target: the held-out view.
+      perceptual: LPIPS networks.
+
+    Returns:
+      As `score_image`, with the metrics of seen pixels and of the surface.
+    """
     rows, columns = _frame(np.asarray(target.weight))
 
     def crop(array):
@@ -155,18 +180,18 @@ def score_image(
     perceptual: Perceptual = NO_PERCEPTUAL,
     more: Mapping[str, jax.Array | float] | None = None,
 ) -> dict[str, float | str | None]:
-    """Metrics of one image `[H, W, 3]`, on 8-bit colors.
+    """Return the metrics of one image, on 8-bit colors.
 
     Args:
-      image: what was rendered.
-      truth: what it should be.
-      weight: `[H, W]` of each pixel.
-      perceptual: networks of LPIPS, for which pixels without weight show the truth.
-      more: metrics that are known already.
+      image: `[H, W, 3]` rendered image.
+      truth: `[H, W, 3]` true image.
+      weight: `[H, W]` weight of each pixel.
+      perceptual: LPIPS networks; they see the true image at pixels without weight.
+      more: other metrics of the image, to add to the result.
 
     Returns:
-      Each metric; what cannot be computed is None beside its reason, and equal images have an
-      infinite PSNR, which is None too.
+      Each metric by name. A metric that cannot be computed is None, and `<metric>_reason` says why.
+      The PSNR of equal images is infinite, and so None too.
     """
     image, truth = _as_8_bits(image, truth)
     values = dict(_full_metrics(image, truth, weight)) | dict(more or {})
@@ -181,7 +206,7 @@ def score_image(
         elif np.isposinf(value):
             reason = "equals the truth"
         elif "ssim" in key and smallest < SSIM_TAPS:
-            reason = f"SSIM needs {SSIM_TAPS} pixels a side"
+            reason = f"SSIM needs at least {SSIM_TAPS} pixels a side"
         else:
             reason = "no pixel of this view counts"
         result[f"{key}_reason"] = reason
@@ -191,7 +216,7 @@ def score_image(
         if reason is None and not finite_image:
             reason = "the rendering is not finite"
         elif reason is None and smallest < SMALLEST[backbone]:
-            reason = f"LPIPS needs {SMALLEST[backbone]} pixels a side"
+            reason = f"LPIPS needs at least {SMALLEST[backbone]} pixels a side"
         elif reason is None:
             result[key] = float(_lpips(perceptual.networks[backbone], image, truth, weight))
         if reason is not None:
@@ -200,7 +225,7 @@ def score_image(
 
 
 def summarize(views: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Means over views of every metric that some view has, and the views themselves."""
+    """Return the mean over views of every metric that some view has, and each view's in `views`."""
     keys = sorted({key for values in views.values() for key in values if "_reason" not in key})
     summary: dict[str, Any] = {}
     for key in keys:
@@ -217,14 +242,14 @@ def evaluate(
     targets: Sequence[Target],
     perceptual: Perceptual = NO_PERCEPTUAL,
 ) -> tuple[dict[str, Any], dict[str, Rendering]]:
-    """Render and score every target; returns the summary and the renderings by name."""
+    """Render and score every target; return the summary and the renderings by name."""
     renderings = {target.name: jax.device_get(render(target.camera)) for target in targets}
     scores = {t.name: score(renderings[t.name], t, perceptual) for t in targets}
     return summarize(scores), renderings
 
 
 def _as_8_bits(image, truth):
-    # Before what is compiled, where products may be fused and equal images differ by rounding.
+    # Outside the compiled functions, whose fused products make equal images differ by rounding.
     return quantize(image), quantize(truth)
 
 
@@ -252,7 +277,7 @@ def _ssim(image, truth, *, weight):
 
 
 def _frame(weight: np.ndarray) -> tuple[slice, slice]:
-    """The smallest rectangle that holds all weight: photographs are padded at two sides."""
+    """Return the smallest rectangle with all weight: photographs are padded at two sides."""
     rows, columns = np.nonzero(weight.any(axis=1))[0], np.nonzero(weight.any(axis=0))[0]
     if not len(rows):
         return slice(None), slice(None)

@@ -1,4 +1,4 @@
-"""How far rendered surfaces are from the true one, or from a capture's own points."""
+"""Errors of rendered surfaces against the exact surface, or against a capture's points."""
 
 from typing import NamedTuple
 
@@ -14,11 +14,12 @@ from jaxcloseup.splats.regularizers import depth_to_normal
 
 
 class Landmarks(NamedTuple):
-    """Points of a capture that a view shows.
+    """Points of a capture that are visible in a view.
 
     Attributes:
-      row, column: `[P]` the pixels that hold them.
-      depth: `[P]` their z-depth.
+      row: `[P]` pixel row of each point.
+      column: `[P]` pixel column of each point.
+      depth: `[P]` z-depth of each point.
     """
 
     row: np.ndarray
@@ -26,12 +27,17 @@ class Landmarks(NamedTuple):
     depth: np.ndarray
 
 
-_CELLS = 24  # of the image's width, in each of which what is nearest hides the rest
-_THICKNESS = 0.05  # relative depth behind the nearest point that it does not hide
+_CELLS = 24  # cells across the image; the nearest point in a cell hides the points behind it
+_THICKNESS = 0.05  # relative depth up to which the nearest point does not hide others
 
 
 def find_landmarks(camera: Camera, points: np.ndarray) -> Landmarks:
-    """Those of the points `[P, 3]` in front of a camera that no nearer one beside them hides."""
+    """Return the points in the image that no nearer point in the same cell of the image hides.
+
+    Args:
+      camera: camera of the view.
+      points: `[N, 3]` points of the capture, in the world.
+    """
     pixels, depth = points_to_pixels(camera, jnp.asarray(points))
     shown = np.asarray(in_bounds(pixels, camera.height, camera.width) & (depth > 0))
     pixels, depth = np.asarray(pixels)[shown], np.asarray(depth)[shown]
@@ -45,7 +51,12 @@ def find_landmarks(camera: Camera, points: np.ndarray) -> Landmarks:
 
 
 def point_depth_error(depth: np.ndarray, landmarks: Landmarks) -> dict[str, float]:
-    """Relative error of rendered depth `[H, W]` at landmarks: median and 90th percentile."""
+    """Return median and 90th percentile of the relative depth error at the landmarks.
+
+    Args:
+      depth: `[H, W]` rendered z-depth.
+      landmarks: visible points; without any, both metrics are NaN.
+    """
     if not len(landmarks.depth):
         return {"point_depth_error_median": np.nan, "point_depth_error_p90": np.nan}
     rendered = np.asarray(depth)[landmarks.row, landmarks.column]
@@ -58,9 +69,15 @@ def point_depth_error(depth: np.ndarray, landmarks: Landmarks) -> dict[str, floa
 
 @jax.jit
 def surface_error(camera: Camera, rendering: Rendering, surface: Surface) -> dict[str, jax.Array]:
-    """Relative errors of depth and angles between normals, in degrees, against the exact surface.
+    """Return median and 90th percentile of relative depth errors and of normal errors in degrees.
 
-    Normals are the rendered ones, or, of fields that render none, those of their depth.
+    Fields that render no normals are scored on the normals of their rendered depth. Pixels without
+    an exact surface do not count.
+
+    Args:
+      camera: camera of the view.
+      rendering: what the field renders, `[H, W]`.
+      surface: the exact surface, `[H, W]`.
     """
     normal = rendering.normal
     if normal is None:

@@ -1,1 +1,1 @@
-"""What people read: tables, plots, pictures and the report's page."""
+"""Reports for people: tables, plots, pictures and the page `report.html`."""

@@ -1,4 +1,4 @@
-"""The pictures of a run: renders, side-by-side comparisons, labels."""
+"""The pictures of a run: comparisons of its stages with the true images, and pseudo-labels."""
 
 import pathlib
 from collections.abc import Callable, Mapping, Sequence
@@ -23,7 +23,7 @@ from jaxcloseup.pseudo import (
 from jaxcloseup.scenes import Scene
 
 
-SHOWN_LABELS = 6
+SHOWN_LABELS = 6  # pictures of labels for each kind of camera
 
 
 def comparisons(
@@ -31,14 +31,22 @@ def comparisons(
     targets: Mapping[str, Sequence[Target]],
     renderings: Mapping[tuple[str, str], Mapping[str, Rendering]],
 ) -> list[Picture]:
-    """Write `<name>.png`: truth, every stage, error of the last; returns them for the report.
+    """Write `<name>.png`: the true image, every stage, and the error of the last stage.
 
-    A name that an earlier split has taken is prefixed with its split; a split that no stage has
-    rendered, as where every arm of a sweep failed, has no pictures.
+    A name that an earlier split has used gets its split as a prefix. A split that no stage rendered
+    has no pictures, for example if every arm of a sweep failed.
+
+    Args:
+      folder: folder to write to.
+      targets: held-out views by split.
+      renderings: renderings by (stage, split), then by the view's name.
+
+    Returns:
+      The pictures, for the report.
     """
     pictures, written = [], set()
     for split, views in targets.items():
-        stages = [stage for stage, of_split in renderings if of_split == split]
+        stages = [stage for stage, rendered in renderings if rendered == split]
         for target in views if stages else ():
             images = [renderings[stage, split][target.name].rgb for stage in stages]
             truth = np.asarray(target.rgb)
@@ -54,7 +62,7 @@ def comparisons(
 
 
 def enlarge(image: np.ndarray | jax.Array) -> np.ndarray:
-    """A small image with its pixels repeated, to be at least 240 wide."""
+    """Repeat the pixels of an image `[H, W, ...]` until it is at least 240 wide."""
     image = np.asarray(image)
     factor = -(-240 // image.shape[1])
     return image.repeat(factor, axis=0).repeat(factor, axis=1)
@@ -70,7 +78,20 @@ def label_pictures(
     settings: PseudoSettings,
     render_depth: Callable[[Camera], jax.Array],
 ) -> list[Picture]:
-    """Write pictures of labels: of random virtual views, and of the held-out close-ups."""
+    """Write pictures of labels of random virtual cameras and of held-out close-ups.
+
+    Args:
+      key: random key of the virtual cameras.
+      targets: the held-out close-ups.
+      folder: folder to write to.
+      scene: the scene.
+      sources: the training photographs with their depths.
+      settings: settings of poses and labels.
+      render_depth: `camera -> [H, W]`, the depth that labels are made from.
+
+    Returns:
+      The pictures, for the report.
+    """
     label_image = jax.jit(label_pixels)
     sample = jax.jit(sample_virtual_camera)
     shots: list[tuple[str, Camera, jax.Array, Any, Any]] = []

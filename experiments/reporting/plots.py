@@ -1,4 +1,4 @@
-"""Line plots as SVG text, to stand inside a page."""
+"""Line plots as SVG text, for embedding in a page."""
 
 import io
 from collections.abc import Mapping, Sequence
@@ -13,7 +13,7 @@ from matplotlib import pyplot as plt
 from experiments.evaluation.ladder import PREFIX, rungs_of
 
 
-# Same data, same file: without names drawn at random and without a date. Text stays text.
+# The same data gives the same file: no random names and no date. Text stays text.
 _STYLE = {"svg.hashsalt": "jaxcloseup", "svg.fonttype": "none", "font.size": 10}
 
 
@@ -21,9 +21,11 @@ class Curve(NamedTuple):
     """One line of a plot.
 
     Attributes:
-      name: for the legend.
-      x, y: its points.
-      low, high: of an interval at each point, if there is one.
+      name: name in the legend.
+      x: x coordinates of its points.
+      y: y coordinates of its points.
+      low: lower ends of an interval at each point, or None.
+      high: upper ends of an interval at each point, or None.
     """
 
     name: str
@@ -42,14 +44,15 @@ def line_plot(
     doubling: bool = False,
     level: float | None = None,
 ) -> str:
-    """An `<svg>` element.
+    """Draw curves as an `<svg>` element.
 
     Args:
-      curves: one line each, told apart by color and by mark.
-      x, y: names of the axes, with units.
-      title: of the plot.
-      doubling: x on a scale of doublings, with a tick at each point.
-      level: where a thin horizontal line is drawn.
+      curves: the curves; each has its own color and marker.
+      x: label of the x axis, with its unit.
+      y: label of the y axis, with its unit.
+      title: title of the plot.
+      doubling: whether the x axis is logarithmic with base 2, with a tick at each point.
+      level: y of a thin horizontal line, or None.
     """
     with plt.style.context(["tableau-colorblind10", _STYLE]):
         figure, axes = plt.subplots(figsize=(6.5, 3.6), layout="constrained")
@@ -75,11 +78,11 @@ def line_plot(
 
 
 def zoom_curves(stages: Mapping[str, Mapping[str, Any]], metric: str = "psnr") -> list[Curve]:
-    """A metric against magnification for each stage that climbed the ladder.
+    """Return a curve of a metric against magnification for each stage scored on the zoom ladder.
 
     Args:
-      stages: for each stage its splits, as `results.json` has them.
-      metric: its name.
+      stages: metrics by stage and split, as in `results.json`.
+      metric: name of the metric.
     """
     curves = []
     for stage, splits in stages.items():
@@ -91,7 +94,7 @@ def zoom_curves(stages: Mapping[str, Mapping[str, Any]], metric: str = "psnr") -
 
 
 def gains_over(curves: Sequence[Curve], base: str) -> list[Curve]:
-    """Curves less that of the stage `base`, where both have points."""
+    """Subtract the curve named `base` from all curves, at the points that both have."""
     named = {curve.name: dict(zip(curve.x, curve.y, strict=True)) for curve in curves}
     below = named.get(base, {})
     gains = []

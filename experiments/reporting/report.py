@@ -1,4 +1,4 @@
-"""What a run leaves behind: a table, results.json and one self-contained page."""
+"""The report of a run: a table for the terminal, and one self-contained page."""
 
 import html
 import itertools
@@ -19,7 +19,13 @@ from jaxcloseup.files import write_file
 
 
 class Picture(NamedTuple):
-    """A picture of the page: `image` is uint8 `[H, W, 3]`, `section` groups pictures."""
+    """A picture on the page.
+
+    Attributes:
+      section: heading that groups pictures.
+      caption: text below the picture.
+      image: uint8 `[H, W, 3]`.
+    """
 
     section: str
     caption: str
@@ -27,7 +33,7 @@ class Picture(NamedTuple):
 
 
 def rows(results: Mapping[str, Any]) -> list[list[str]]:
-    """The table of a run: a row for each split and stage, first the header."""
+    """Return the table of a run as text: a header, then a row for each split and stage."""
     shown = [
         key
         for key in COLUMNS
@@ -45,7 +51,7 @@ def rows(results: Mapping[str, Any]) -> list[list[str]]:
 
 
 def print_table(results: Mapping[str, Any]) -> None:
-    """Print a table for each split, a column for each stage: it fits a narrow terminal."""
+    """Print a table for each split, with a column for each stage to fit a narrow terminal."""
     header, *body = rows(results)
     for split, group in itertools.groupby(body, key=lambda row: row[0]):
         _, stages, *metrics = zip(*group, strict=True)
@@ -58,7 +64,13 @@ def print_table(results: Mapping[str, Any]) -> None:
 def write_report(
     path: pathlib.Path, results: Mapping[str, Any], pictures: Sequence[Picture]
 ) -> None:
-    """Write the page: title, table, pictures by section, configuration; no file beside it."""
+    """Write the page, which needs no other file.
+
+    Args:
+      path: file to write.
+      results: what `results.json` holds.
+      pictures: pictures to embed, grouped by section.
+    """
     title = f"{results['scene']}: {results['method']}, preset {results['preset']}"
     width, height = results["resolution"]
     header, *body = rows(results)
@@ -67,10 +79,14 @@ def write_report(
         "<meta name=viewport content='width=device-width'>",
         f"<title>{html.escape(title)}</title><style>{STYLE}</style>",
         f"<h1>{html.escape(title)}</h1>",
-        f"<p>{width} x {height} pixels, seed {results['seed']}. Metrics are means over views, on "
-        "8-bit images. <i>control</i> is the baseline after as many further steps as "
-        "<i>closeup</i>, without pseudo-labels: a gain counts against it. <i>test_time_control</i> "
-        "is the same for <i>test_time</i>, where that takes another number of steps.</p>",
+        f"<p>{width} x {height} pixels, seed {results['seed']}. The table shows the mean of each "
+        "metric over the held-out views, on 8-bit images. Higher PSNR and SSIM are better; lower "
+        "LPIPS and errors are better. <i>Seen by 3+ photographs</i> means the pixels whose surface "
+        "at least 3 training photographs saw.</p>",
+        "<p><i>closeup</i> and <i>test_time</i> continue the baseline with pseudo-labels. "
+        "<i>control</i> continues it for as many steps without them, so compare <i>closeup</i> "
+        "with <i>control</i>, not with <i>baseline</i>. <i>test_time_control</i> is the control of "
+        "<i>test_time</i>, if that takes a different number of steps.</p>",
         "<div class=wide><table><tr>",
         *(f"<th>{html.escape(cell)}" for cell in header),
         *("<tr>" + "".join(f"<td>{html.escape(cell)}" for cell in row) for row in body),
@@ -88,13 +104,28 @@ def write_report(
     write_file(path, "\n".join(parts).encode())
 
 
+_COMPARISON_NOTE = (
+    "Each picture shows the true image, the renders of the stages in the order trained, and the "
+    "error of the last one: black is none, bright yellow is large."
+)
+_PICTURE_NOTES = {
+    **dict.fromkeys(SPLIT_TITLES.values(), _COMPARISON_NOTE),
+    "Pseudo-labels": "Each picture shows how one label is made: colors warped backward from the "
+    "source photograph that the caption names, colors warped forward from all photographs, the "
+    "pixels where both agree (kept), the same as a mask (white), the rendered depth, and the true "
+    "image where it is known. Good labels cover much of the image and look like the true image.",
+}
+
+
 def figures(pictures: Sequence[Picture]) -> list[str]:
-    """Lines of a page with pictures in it, under a heading for each section."""
+    """Return the lines of a page with the pictures, under a heading for each section."""
     parts, section = [], None
     for picture in pictures:
         if picture.section != section:
             section = picture.section
             parts.append(f"<h2>{html.escape(section)}</h2>")
+            note = _PICTURE_NOTES.get(section.split(": ")[-1])  # a sweep's begin with the scene
+            parts += [f"<p>{note}</p>"] if note else []
         caption = html.escape(picture.caption)
         parts.append(
             f"<figure><img alt='{caption}' src='{png_data_uri(picture.image)}'>"
@@ -107,37 +138,46 @@ def _zoom_plots(stages):
     curves = zoom_curves(stages)
     if not curves:
         return []
-    axis = {"x": "times nearer", "doubling": True}
-    parts = [
-        "<h2>Against magnification</h2><p>Cameras that come nearer and nearer to points of the "
-        "ordinary views.</p><div class=plots>",
-        line_plot(curves, y="PSNR (dB)", title="PSNR", **axis),
-    ]
+    axis = {"x": "magnification (times nearer)", "doubling": True}
+    plots = [line_plot(curves, y="PSNR (dB)", title="PSNR", **axis)]
+    text = (
+        "Cameras move up to 16 times nearer to points of the ordinary views. The first plot shows "
+        "the mean PSNR of each stage; higher is better."
+    )
     gains = gains_over(curves, "control")
     if gains:
-        axis |= {"y": "PSNR above control (dB)"}
-        parts.append(line_plot(gains, title="Gain", **axis))
-    return [*parts, "</div>"]
+        plots.append(line_plot(gains, y="PSNR above control (dB)", title="Gain", **axis))
+        text += (
+            " The second plot shows how far each stage is above <i>control</i>: labels help where "
+            "the curve of <i>closeup</i> is above 0."
+        )
+    return [f"<h2>PSNR by magnification</h2><p>{text}</p><div class=plots>", *plots, "</div>"]
 
 
 def _label_plots(labels, left_out):
     plots = []
-    names = {"error": "by the mask", "oracle": "by their true error"}
-    axis = {"x": "share of all pixels", "y": "mean absolute error"}
-    for depth, of_depth in labels.items():
-        if of_depth["curve"] is not None:
+    names = {"error": "by agreement", "oracle": "by true error"}
+    axis = {"x": "labels kept, as a share of all pixels", "y": "mean absolute error"}
+    for depth, audit in labels.items():
+        if audit["curve"] is not None:
             title = f"Labels from {depth.replace('_', ' ')}"
-            plots.append((title, of_depth["curve"], names))
+            plots.append((title, audit["curve"], names))
+    text = (
+        "Each plot shows the mean error of the labels kept so far; lower is better. <i>By "
+        "agreement</i> keeps the labels first whose two warps agree best, as the mask does. <i>By "
+        "true error</i> keeps the best labels first, which no mask can beat. AUSE, the area "
+        "between the two curves relative to the error of all labels, is 0 for a perfect mask."
+    )
     if left_out is not None:
-        more = names | {"model": "of the model there"}
+        more = names | {"model": "model's own error"}
         plots.append(("Left-out photographs", left_out, more))
+        text += (
+            " On left-out photographs, labels above the <i>model's own error</i> are worse than "
+            "the model on the same pixels."
+        )
     if not plots:
         return []
-    parts = [
-        "<h2>How many labels, and how good</h2><p>Labels are kept by how well the two warps agree, "
-        "those that agree best first; the lower curve is the best order there is. The area between "
-        "them, AUSE, is 0 for a mask that knows.</p><div class=plots>"
-    ]
+    parts = [f"<h2>Error by number of labels</h2><p>{text}</p><div class=plots>"]
     for title, curve, shown in plots:
         curves = [Curve(name, curve["coverage"], curve[key]) for key, name in shown.items()]
         parts.append(line_plot(curves, title=f"{title}: AUSE {curve['ause']:.2f}", **axis))
@@ -151,10 +191,13 @@ def _labels_table(labels):
         for depth, values in labels.items()
     )
     return (
-        "<h2>Labels against the truth</h2><p>Random virtual close-ups; the truth is blurred to the "
-        "source photograph's pixels.</p><table><tr><th>depth<th>mean absolute error of kept "
-        "labels<th>kept, of what the source sees<th>leaked: kept though the source does not see it"
-        f"{lines}</table>"
+        "<h2>Labels against the exact scene</h2><p>The table compares labels of random virtual "
+        "close-ups with the true image, blurred to the resolution of the source photograph. The "
+        "labels are made from the exact depth and from the trained depth. Good labels have a small "
+        "error, cover much of what the source photograph sees, and leak little: a leaked label "
+        "colors a surface that the source does not see.</p><table><tr><th>depth"
+        "<th>mean absolute error of kept labels<th>share of seen pixels that keep a label"
+        f"<th>share of kept labels that leaked{lines}</table>"
     )
 
 
@@ -166,11 +209,13 @@ def _gate_table(gate):
         for row in gate["left_out"]
     )
     return (
-        "<h2>Labels against left-out photographs</h2><p>Training photographs are left out one by "
-        "one and labeled from the others. The model was trained on them, and labels need not be "
-        "nearer to them than it is; but where few of them agree closely (the first line) they do "
-        f"harm. Here {html.escape(verdict(gate))}.</p><table><tr>"
-        "<th>tolerance of color<th>of depth<th>labeled<th>PSNR of labels (dB)"
+        "<h2>Labels against left-out photographs (the gate)</h2><p>The gate leaves out training "
+        "photographs one by one and labels them from the others. Each row shows, for one pair of "
+        "tolerances, the share of pixels with a label, and the PSNR of the labels and of the model "
+        "on these pixels. The model was trained on these photographs, so labels may score below "
+        "it and still help elsewhere. The first row decides, because labels do harm on scenes "
+        f"where few of them agree so closely. Here {html.escape(verdict(gate))}.</p><table><tr>"
+        "<th>color tolerance<th>depth tolerance<th>share with a label<th>PSNR of labels (dB)"
         f"<th>PSNR of the model (dB){lines}</table>"
     )
 

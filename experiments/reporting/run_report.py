@@ -1,4 +1,4 @@
-"""What a run leaves for people: results.json, pictures and the report's page."""
+"""Write everything that reports a run: results.json, pictures and the page."""
 
 import pathlib
 from collections.abc import Mapping
@@ -17,12 +17,12 @@ from jaxcloseup.label_rules import label_depth
 def report_run(
     output_dir: pathlib.Path, training: Training, outcome: Outcome, about: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Write `results.json`, `compare/`, `labels/` and `report.html`; returns the results.
+    """Write `results.json`, `compare/`, `labels/` and `report.html`; return the results.
 
     Args:
       output_dir: folder of the run.
-      training: what trained, with the seconds and metrics of its stages.
-      outcome: what the stages left.
+      training: the training, with the seconds and the history of its stages.
+      outcome: what the stages produced.
       about: "method", "preset", "seed", "config" and "versions".
     """
     programs, scene = training.programs, training.programs.scene

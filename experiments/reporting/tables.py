@@ -1,7 +1,7 @@
 """Tables of a sweep: means over seeds and scenes, and intervals of differences from control.
 
-An interval says how the mean difference of these trained models varies with the views that happen
-to be looked at; how it varies with the seed is for the standard deviation.
+The interval measures how the mean difference of the trained models varies with the choice of views.
+The standard deviation measures how the mean varies with the seed.
 """
 
 import csv
@@ -27,20 +27,21 @@ RESAMPLES = 4000
 
 
 class Row(NamedTuple):
-    """One arm on one kind of views.
+    """One arm on one split.
 
     Attributes:
-      arm: its name.
-      split: of the views.
-      psnr: mean over scenes, seeds and views, dB.
-      spread: standard deviation over seeds of the mean over scenes and views, of those seeds that
-        have all of them; None of one seed.
-      ssim: mean.
-      lpips: mean, with VGG.
-      gain: mean difference of PSNR from control, or None without one.
-      low, high: its 95 % interval; None of a single view.
-      count: images, of all scenes, seeds and views, that the means are over.
-      skipped: steps that were not finite, of all seeds and scenes.
+      arm: name of the arm.
+      split: name of the split.
+      psnr: mean PSNR over scenes, seeds and views, in dB.
+      spread: standard deviation over seeds of the mean PSNR over scenes and views. Only seeds that
+        have all views count; None for one seed.
+      ssim: mean SSIM.
+      lpips: mean LPIPS with VGG.
+      gain: mean difference of PSNR from control in dB, or None without control.
+      low: lower end of the 95 % interval of `gain`; None for a single view.
+      high: upper end of that interval.
+      count: number of images in the means, over scenes, seeds and views.
+      skipped: number of steps that were not finite, over seeds and scenes.
     """
 
     arm: str
@@ -59,13 +60,13 @@ class Row(NamedTuple):
 def paired_bootstrap(
     differences: Sequence[np.ndarray], *, resamples: int = RESAMPLES, share: float = 0.95
 ) -> tuple[float, float] | tuple[None, None]:
-    """Interval of the mean of paired differences, by resampling groups of them.
+    """Return a bootstrap interval of the mean of paired differences, or (None, None) for one group.
 
     Args:
-      differences: of each group, which is drawn as a whole: the seeds of a view, for these resemble
-        each other.
-      resamples: how often.
-      share: of the resampled means that lie within.
+      differences: the differences of each group. Groups are resampled as a whole; a group holds the
+        seeds of one view, which resemble each other.
+      resamples: number of resamples.
+      share: share of the resampled means inside the interval.
     """
     means = np.array([np.mean(group) for group in differences])
     if len(means) < 2:
@@ -76,10 +77,10 @@ def paired_bootstrap(
 
 
 def rows(scenes: Mapping[str, Mapping[str, Any]]) -> list[Row]:
-    """A row for each split and arm.
+    """Return a row for each split and arm.
 
     Args:
-      scenes: for each scene the metrics that `run_sweep` returns.
+      scenes: the scores of `run_sweep` by scene.
     """
     table = []
     arms = _arms(scenes)
@@ -95,8 +96,8 @@ def rows(scenes: Mapping[str, Mapping[str, Any]]) -> list[Row]:
             seeds = [float(np.mean(values)) for values in by_seed.values() if len(values) == most]
             skipped = sum(
                 result["skipped"]
-                for of_scene in scenes.values()
-                for result in of_scene.get(arm, {}).values()
+                for by_arm in scenes.values()
+                for result in by_arm.get(arm, {}).values()
             )
             table.append(
                 Row(
@@ -116,7 +117,7 @@ def rows(scenes: Mapping[str, Mapping[str, Any]]) -> list[Row]:
 def gain_over_control(
     scenes: Mapping[str, Mapping[str, Any]], arm: str, split: str
 ) -> tuple[float, float | None, float | None] | None:
-    """Mean difference of an arm's PSNR from control, and its interval; None if there is none."""
+    """Return an arm's mean PSNR difference from control and its 95 % interval; None if unknown."""
     if arm == "control":
         return None
     control = _by_view(scenes, "control", split, "psnr")
@@ -131,7 +132,7 @@ def gain_over_control(
 
 
 def gain_curves(scenes: Mapping[str, Mapping[str, Any]]) -> list[Curve]:
-    """For each arm the gain over control against magnification, with its interval."""
+    """Return each arm's gain over control against magnification, with its 95 % interval."""
     curves = []
     for arm in _arms(scenes):
         found = {}
@@ -147,7 +148,7 @@ def gain_curves(scenes: Mapping[str, Mapping[str, Any]]) -> list[Curve]:
 
 
 def print_sweep(scenes: Mapping[str, Mapping[str, Any]]) -> None:
-    """Print a table for each kind of views."""
+    """Print a table for each split."""
     header, *body = _cells(rows(scenes))
     for title, lines in itertools.groupby(body, key=lambda line: line[0]):
         table = Table(*header[1:], title=title)
@@ -162,13 +163,13 @@ def write_sweep(
     about: Mapping[str, Any],
     pictures: Sequence[Picture] = (),
 ) -> None:
-    """Write sweep.json, table.md, table.csv and report.html.
+    """Write `sweep.json`, `table.md`, `table.csv` and `report.html`.
 
     Args:
-      folder: where.
-      scenes: for each scene the metrics that `run_sweep` returns.
-      about: how they were made.
-      pictures: for the report.
+      folder: folder to write to.
+      scenes: the scores of `run_sweep` by scene.
+      about: method, preset and other facts about the sweep.
+      pictures: pictures for the report.
     """
     found = rows(scenes)
     write_json(folder / "sweep.json", {"scenes": scenes, **about})
@@ -186,9 +187,12 @@ def write_sweep(
         "<!doctype html><html lang=en><meta charset=utf-8>",
         "<meta name=viewport content='width=device-width'>",
         f"<title>{html.escape(title)}</title><style>{STYLE}</style><h1>{html.escape(title)}</h1>",
-        "<p>Means over scenes, seeds and views, and the standard deviation over seeds. The gain is "
-        "the difference from <i>control</i>, further steps without labels, on the same views, with "
-        "its 95 % interval over views drawn again. All take as many steps, but for "
+        "<p>The table shows the mean of each metric over scenes, seeds and views, and the standard "
+        "deviation of PSNR over seeds (s.d.). Higher PSNR and SSIM and lower LPIPS are better. "
+        "<i>control</i> continues the baseline without labels. The gain is an arm's PSNR above "
+        "<i>control</i> on the same views, with a 95 % bootstrap interval over views: an arm "
+        "helps if its whole interval is above 0. n is the number of images, and skipped is the "
+        "number of steps that were not finite. All arms take the same number of steps, except "
         "<i>baseline</i>, which takes none, and <i>test_time</i>, which has its own number.</p>",
         "<div class=wide><table><tr>",
         *(f"<th>{html.escape(cell)}" for cell in header),
@@ -198,12 +202,13 @@ def write_sweep(
     curves = gain_curves(scenes)
     if curves:
         parts += [
-            "<h2>Against magnification</h2><p>Gain over control, of cameras that come nearer and "
-            "nearer to points of the ordinary views; shaded is the 95 % interval.</p>",
+            "<h2>Gain by magnification</h2><p>Cameras move up to 16 times nearer to points of the "
+            "ordinary views. The plot shows each arm's PSNR above <i>control</i>, with its 95 % "
+            "interval shaded: an arm helps where its curve is above 0.</p>",
             "<div class=plots>",
             line_plot(
                 curves,
-                x="times nearer",
+                x="magnification (times nearer)",
                 y="PSNR above control (dB)",
                 title="Gain",
                 doubling=True,
@@ -216,7 +221,7 @@ def write_sweep(
 
 
 def _arms(scenes):
-    return list(dict.fromkeys(arm for of_scene in scenes.values() for arm in of_scene))
+    return list(dict.fromkeys(arm for by_arm in scenes.values() for arm in by_arm))
 
 
 def _mean(scenes, arm, split, metric):
@@ -225,11 +230,11 @@ def _mean(scenes, arm, split, metric):
 
 
 def _by_view(scenes, arm, split, metric):
-    """A metric by (scene, seed, view), where it is known."""
+    """Return a metric by (scene, seed, view), where it is known."""
     return {
         (scene, seed, view): values[metric]
-        for scene, of_scene in scenes.items()
-        for seed, result in of_scene.get(arm, {}).items()
+        for scene, by_arm in scenes.items()
+        for seed, result in by_arm.get(arm, {}).items()
         for view, values in result["splits"].get(split, {"views": {}})["views"].items()
         if values.get(metric) is not None
     }

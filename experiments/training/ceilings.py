@@ -1,4 +1,4 @@
-"""Ceilings of what labels can do: random close-ups with true pixels, or with better depth."""
+"""Upper bounds for labels: random virtual close-ups with true pixels, or with better depth."""
 
 from collections.abc import Callable
 
@@ -30,10 +30,21 @@ def true_close_ups(
     *,
     blurred: bool,
 ) -> Views:
-    """Random virtual close-ups with their true pixels, where a training view sees the surface.
+    """Render random virtual close-ups with their true pixels, where a training view sees them.
 
-    The ceiling of what labels can do: no photograph holds so much detail, unless `blurred` leaves
-    of it what the nearest one resolves.
+    This is an upper bound for labels, because no photograph has so much detail. `blurred` lowers
+    the bound to the detail of the photograph with the smallest footprint.
+
+    Args:
+      key: random key.
+      scene: a scene with `surface`.
+      sources: the training photographs with their depths, for sampling cameras.
+      exact: `[V, H, W]` exact depths of the training views.
+      settings: settings of poses.
+      blurred: whether to blur the true pixels to the detail of the photographs.
+
+    Returns:
+      `CEILING_VIEWS` close-ups; weight 0 where no photograph sees the surface.
     """
     sample, surface = jax.jit(sample_virtual_camera), jax.jit(scene.surface)
     images = []
@@ -45,7 +56,7 @@ def true_close_ups(
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *images)
 
 
-def labels_of_less_error(
+def labels_with_better_depth(
     key: jax.Array,
     scene: Scene,
     sources: LabelSources,
@@ -55,18 +66,21 @@ def labels_of_less_error(
     *,
     share: float,
 ) -> Views:
-    """Random virtual close-ups with labels whose depth has a share of its error left.
+    """Make labels for random virtual close-ups from depth with less error.
 
-    What better geometry would bring: 1 is depth as it was trained, 0 the exact one.
+    They show what better geometry would bring.
 
     Args:
       key: random key.
-      scene: with `surface`.
-      sources: the photographs with their trained depths.
-      exact: `[V, H, W]` exact ones.
-      render_depths: stacked cameras `[Q]` to their trained depths `[Q, H, W]`.
-      settings: of poses and labels.
-      share: of the error.
+      scene: a scene with `surface`.
+      sources: the training photographs with their trained depths.
+      exact: `[V, H, W]` exact depths of the training views.
+      render_depths: function from stacked cameras `[Q]` to their trained depths `[Q, H, W]`.
+      settings: settings of poses and labels.
+      share: share of the depth error that remains: 1 is the trained depth, 0 the exact depth.
+
+    Returns:
+      `CEILING_VIEWS` labeled close-ups.
     """
 
     def mix(trained, true):

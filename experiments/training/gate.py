@@ -1,10 +1,10 @@
-"""Whether to use pseudo-labels, and with which weight: decided by left-out photographs.
+"""The gate: left-out photographs decide whether pseudo-labels are used, and with which weight.
 
-A model has learnt the photographs that it is trained on, so that labels lose against it there even
-where they would teach it something elsewhere. What separates captures on which labels help from
-those on which they harm is how often a label, its check by the other photographs and the depth
-agree closely: on a tenth of the pixels where colors or depth are poor, on a fifth to a third where
-labels help (BUILD.md has the figures).
+The model has learned its training photographs, so it beats labels there even if the labels would
+improve it elsewhere. The gate therefore measures on how many pixels a label's two warps and the
+depth agree closely. That share separates captures on which labels help from those on which they
+harm: it is about a tenth where colors or depth are poor, and a fifth to a third where labels help
+(docs/results.md has the figures).
 """
 
 from collections.abc import Callable, Mapping
@@ -18,25 +18,25 @@ from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.pseudo import LabelSources, PseudoSettings
 
 
-# Colors and relative depths agree closely, and looser pairs to look at.
+# Pairs of color and relative depth tolerance: the first decides, the looser ones are reported.
 TOLERANCES = [(rgb, depth) for rgb in (0.02, 0.04, 0.08) for depth in (0.005, 0.02)]
-# Shares of pixels that agree closely, from which labels are used at all, and with full weight.
+# Shares of closely agreeing pixels above which labels have some weight, and full weight.
 AGREEMENT = (0.1, 0.2)
 
 
 def print_gate(found: Mapping[str, Any]) -> None:
-    """Say what the left-out photographs showed."""
+    """Print what the gate decided and why."""
     print(f"     gate: {verdict(found)}")
 
 
 def verdict(found: Mapping[str, Any]) -> str:
-    """What the left-out photographs showed, in a sentence."""
+    """Return in one sentence what the gate decided and why, without a final period."""
     weight = found["weight"]
-    used = "labels are used" if weight == 1 else f"labels weigh {weight:.0%} of their share"
-    used = used if weight else "no labels are used"
+    used = "labels have full weight" if weight == 1 else f"labels have {weight:.0%} of their weight"
+    used = used if weight else "labels are not used"
     return (
-        f"{used}, for on {found['agreement']:.0%} of the pixels of left-out photographs they agree "
-        f"closely (none under {AGREEMENT[0]:.0%}, all from {AGREEMENT[1]:.0%})"
+        f"{used}, because they agree closely on {found['agreement']:.0%} of the pixels of left-out "
+        f"photographs (no weight up to {AGREEMENT[0]:.0%}, full weight from {AGREEMENT[1]:.0%})"
     )
 
 
@@ -45,17 +45,18 @@ def weigh_labels(
     render: Callable[[Camera], Rendering],
     settings: PseudoSettings,
 ) -> tuple[PseudoSettings, dict[str, Any]]:
-    """The settings with the share that labels deserve, which may be 0, and the evidence.
+    """Scale the weight of labels by how well they agree on left-out photographs.
 
     Args:
-      sources: the training photographs.
+      sources: the training photographs with their depths.
       render: `camera -> Rendering` of the model.
-      settings: of the labels.
+      settings: settings of the labels.
 
     Returns:
-      Settings, and as JSON can hold it: `weight` in [0, 1], the factor on the labels' share;
-      `agreement`, the share of pixels of left-out photographs on which labels agree closely; and
-      `left_out`, for each pair of tolerances the labels' PSNR and the model's on the same pixels.
+      The settings with the scaled `label_loss_weight`, and a record for JSON. `weight`: the factor,
+      in [0, 1]. `agreement`: share of the pixels of left-out photographs on which labels agree
+      closely. `left_out`: for each pair of tolerances, the PSNR of labels and of the model on the
+      labeled pixels, and the share of these pixels.
     """
     candidates = [
         settings.replace(

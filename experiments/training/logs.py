@@ -1,7 +1,7 @@
-"""What a run says while it trains: `stats/train.jsonl`, and event files of TensorBoard.
+"""Logs of training: `stats/train.jsonl`, and event files for TensorBoard.
 
-Checkpoints decide what has happened. When a stage is begun or gone on with, both are brought to its
-history: what was said after its last checkpoint is said again when it is done again.
+Checkpoints decide which steps count. When a stage starts or resumes, both logs are rewritten to
+match its history. Steps after the last checkpoint are redone, and so logged only once.
 """
 
 import json
@@ -16,7 +16,7 @@ from jaxcloseup.files import append_file, strict, write_file
 
 
 def check_tensorboard() -> None:
-    """Raise a ValueError where event files cannot be written."""
+    """Raise a ValueError if tensorboardX, which writes event files, is not installed."""
     try:
         import tensorboardX  # noqa: F401
     except ImportError:
@@ -29,18 +29,18 @@ class TrainLog:
     """The log of a run, or of one scene of a sweep.
 
     `stats/<scene>/train.jsonl` has a line for each chunk of steps: `stage`, `step` within it, the
-    chunk's metrics (one that is not finite is left out, as in results.json), `steps_per_second` of
-    the chunk and `seconds` of the stage so far, without those between a cut and its resumption;
-    null where nobody knows. `tb/<scene>/<stage>` has the same, and evaluations, as event files.
+    chunk's metrics (null if not finite), `steps_per_second` of the chunk, and `seconds` of training
+    in the stage so far. The last two are null for a chunk whose line was lost.
+    `tb/<scene>/<stage>` has the same values, and evaluations, as event files.
 
     Args:
-      folder: of the run or the sweep.
-      scene: of a sweep.
+      folder: folder of the run or the sweep.
+      scene: name of the scene in a sweep; empty for a run.
       tensorboard: whether to write event files.
     """
 
     def __init__(self, folder: pathlib.Path, scene: str = "", *, tensorboard: bool = False) -> None:
-        """Write nothing yet."""
+        """Set the paths; `begin` writes the first files."""
         self._file = folder / "stats" / scene / "train.jsonl"
         self._folder = folder / "tb" / scene if tensorboard else None
         self._events: _EventFile | None = None
@@ -48,19 +48,20 @@ class TrainLog:
         self._step, self._seconds, self._start = 0, 0.0, 0.0
 
     def begin(self, stage: str, history: Sequence[Mapping[str, Any]]) -> None:
-        """Begin a stage, or go on with it after the chunks of `history`."""
+        """Start a stage, or resume it after the chunks of `history`."""
         old = self._file.read_bytes() if self._file.exists() else b""
         stages: dict[str, list[Mapping[str, Any]]] = {}
         for line in filter(None, map(_parse, old.splitlines())):
             stages.setdefault(line["stage"], []).append(line)
-        said = {line["step"]: line for line in stages.get(stage, ())}
+        logged = {line["step"]: line for line in stages.get(stage, ())}
         rates = {"steps_per_second": None, "seconds": None}
         stages[stage] = [
-            {"stage": stage, **entry} | {key: said.get(entry["step"], rates)[key] for key in rates}
+            {"stage": stage, **entry}
+            | {key: logged.get(entry["step"], rates)[key] for key in rates}
             for entry in history
         ]
         new = b"".join(_format(line) for lines in stages.values() for line in lines)
-        if new != old:  # else whoever follows the file would lose it
+        if new != old:  # rewriting an unchanged file would break `tail -f`
             write_file(self._file, new)
         last = stages[stage][-1] if history else {"step": 0, "seconds": 0.0}
         self._step, self._seconds = last["step"], last["seconds"] or 0.0
@@ -70,7 +71,7 @@ class TrainLog:
             self._send(line)
 
     def write(self, entry: Mapping[str, Any]) -> None:
-        """Say what the newest chunk of the stage's history is."""
+        """Log the newest chunk of the stage's history."""
         seconds = time.perf_counter() - self._start
         rate = (entry["step"] - self._step) / (seconds - self._seconds)
         self._step, self._seconds = entry["step"], seconds
@@ -81,14 +82,23 @@ class TrainLog:
     def evaluated(
         self, stage: str, splits: Mapping[str, Mapping[str, Any]], images: Mapping[str, Image]
     ) -> None:
-        """Send a stage's metrics by split, and images by their tags, to its event file.
+        """Write a stage's evaluation to its event file.
 
-        A stage that took no steps has those of the stage before it.
+        A stage that took no steps uses the step of the stage before it.
+
+        Args:
+          stage: name of the stage.
+          splits: metrics of the stage, by split.
+          images: images to show, by tag.
         """
         if stage != self._stage:
             self._open(stage)
         if self._events is not None:
-            numbers = {f"{s}/{key}": value for s, of in splits.items() for key, value in of.items()}
+            numbers = {
+                f"{s}/{key}": value
+                for s, metrics in splits.items()
+                for key, value in metrics.items()
+            }
             self._events.write(self._step, numbers, images)
 
     def _open(self, stage):
@@ -104,24 +114,24 @@ class TrainLog:
 
 
 class _EventFile:
-    """A new event file of a folder, which takes the place of older ones.
+    """A new event file in a folder, which replaces older ones without deleting them.
 
-    These stay, for a TensorBoard that is reading them would stop; the new one's second event tells
-    it to forget all steps from 0 on. tensorboardX's `SummaryWriter` keeps events in a queue, which
-    a run that is killed loses; what it writes with does not.
+    A TensorBoard that reads an old file would stop if the file disappeared. The second event of the
+    new file tells TensorBoard to forget all steps from 0 on. The class uses tensorboardX's
+    `EventsWriter`, because `SummaryWriter` queues events and a killed run loses the queue.
     """
 
     def __init__(self, folder):
         from tensorboardX.event_file_writer import EventsWriter
 
         folder.mkdir(parents=True, exist_ok=True)
-        # The files of a folder are read in the order of their names, which tell seconds.
+        # TensorBoard reads files in the order of their names, which hold only seconds.
         self._writer = EventsWriter(str(folder / "events"), f".{time.time_ns()}")
         weakref.finalize(self, self._writer.close)
         self._add(step=0, session_log={"status": "START"})
 
     def write(self, step, numbers, images=None, *, ago=0.0):
-        """What is no number is left out; `ago` is in seconds."""
+        """Write the numbers and images of a step that ended `ago` seconds ago; skip the rest."""
         values = [
             {"tag": tag, "simple_value": number}
             for tag, number in numbers.items()
@@ -141,7 +151,7 @@ class _EventFile:
 
 
 def _parse(text):
-    """A line, or None for half of one."""
+    """Parse a line of the log; None for a truncated one."""
     try:
         line = json.loads(text)
         return line if {"stage", "step", "steps_per_second", "seconds"} <= line.keys() else None

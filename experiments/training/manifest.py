@@ -1,4 +1,4 @@
-"""manifest.json: what made a run, so that its numbers can be traced and its scene loaded again."""
+"""manifest.json: the code, configuration and data of a run, so that others can reproduce it."""
 
 import contextlib
 import hashlib
@@ -21,19 +21,22 @@ from jaxcloseup.scenes import Scene
 NAME = "manifest.json"
 _HASHED = (
     "rgb, weight, camtoworld and intrinsics of the training views, points and their rgb, near and "
-    "far, as they are after loading; each as its name, dtype, shape and bytes"
+    "far, after loading; each as its name, dtype, shape and bytes"
 )
 
 
 def write_manifest(
     folder: pathlib.Path, about: Mapping[str, Any], seconds: Mapping[str, Any] | None = None
 ) -> None:
-    """Write `manifest.json`, whole or not at all; without `seconds` the run is not over yet.
+    """Write `manifest.json` atomically.
+
+    A run that another commit continues prints a warning.
 
     Args:
-      folder: of the run.
-      about: configuration, versions (the device among them), seeds and scenes.
-      seconds: wall time of each stage since the run was begun or resumed; for a sweep by scene.
+      folder: folder of the run.
+      about: configuration, versions (including the device), seeds and scenes.
+      seconds: wall time of each stage since the run started or resumed, by scene for a sweep; None
+        while the run is not finished.
     """
     commit, changed = git_commit(pathlib.Path(jaxcloseup.__file__).parent)
     before = None
@@ -41,8 +44,8 @@ def write_manifest(
         before = json.loads((folder / NAME).read_bytes())["git_commit"]
     if None not in (before, commit) and before != commit:
         warnings.warn(
-            f"{folder} was begun with commit {before[:9]} and goes on with {commit[:9]}: start "
-            "anew if what lies between them matters",
+            f"{folder} was started by commit {before[:9]} and continues with {commit[:9]}: start a "
+            "new run if the changes between them matter",
             stacklevel=2,
         )
     git = {"git_commit": commit, "git_changed": changed}
@@ -50,11 +53,11 @@ def write_manifest(
 
 
 def about_scene(scene: Scene, load_options: Mapping[str, Any]) -> dict[str, Any]:
-    """How to load a scene again, and the hash of what was loaded.
+    """Return how to load a scene again, and a hash of the loaded data.
 
     Args:
-      scene: as `load_scene` returned it.
-      load_options: those that it was given, beside the name or path.
+      scene: the scene that `load_scene` returned.
+      load_options: options that `load_scene` took beside the name or path.
     """
     path = scene.metadata.get("path")
     return {
@@ -66,11 +69,15 @@ def about_scene(scene: Scene, load_options: Mapping[str, Any]) -> dict[str, Any]
 
 
 def write_dataparser_transforms(folder: pathlib.Path, scene: Scene) -> None:
-    """Write `dataparser_transforms.json`, nerfstudio's record of how a run changed coordinates.
+    """Write `dataparser_transforms.json`, nerfstudio's record of a run's change of coordinates.
 
-    Exports are in the scene's world, in which training is too: `transform` and `scale` are the
-    `applied_transform` and `applied_scale` of the capture's `transforms.json`, from its original
-    world to this one.
+    Training and exports use the scene's world. `transform` and `scale` lead to it from the
+    capture's original world: they are the `applied_transform` and `applied_scale` of the capture's
+    `transforms.json`.
+
+    Args:
+      folder: folder of the run.
+      scene: the scene of the run.
     """
     applied = scene.metadata.get("applied_transform")
     transform = np.eye(3, 4) if applied is None else applied
@@ -79,7 +86,7 @@ def write_dataparser_transforms(folder: pathlib.Path, scene: Scene) -> None:
 
 
 def hash_data(scene: Scene) -> str:
-    """SHA-256, in hexadecimal, of what training reads of a scene, wanted views apart."""
+    """Return the SHA-256, in hexadecimal, of all scene data that training reads, except targets."""
     views = scene.train
     arrays = {
         "rgb": views.rgb,
@@ -93,8 +100,8 @@ def hash_data(scene: Scene) -> str:
     return _hash(arrays)
 
 
-def hash_wanted(scene: Scene) -> str | None:
-    """SHA-256 of the cameras of the close-ups, which `test_time` labels; None without any."""
+def hash_targets(scene: Scene) -> str | None:
+    """Return the SHA-256 of the target cameras that `test_time` labels; None without close-ups."""
     if scene.test is None:
         return None
     cameras = scene.test.cameras
@@ -111,11 +118,11 @@ def _hash(arrays):
 
 
 def git_commit(folder: pathlib.Path) -> tuple[str | None, bool | None]:
-    """The commit that a folder is checked out at, and whether tracked files differ from it.
+    """Return the commit of a folder's checkout, and whether tracked files differ from the commit.
 
-    Both are None where the folder is no part of a checkout, as in site-packages, or git is missing.
+    Both are None if the folder is not part of a checkout, as in site-packages, or git is missing.
     """
-    # A folder that git ignores, such as an environment inside of another project, is not tracked.
+    # An ignored folder, such as an environment inside another project, is not part of the checkout.
     tracked = _git(folder, "ls-files", "--", ".")
     commit = _git(folder, "rev-parse", "HEAD") if tracked else None
     if not commit:
@@ -135,7 +142,7 @@ def _git(folder, *args):
 
 
 def versions() -> dict[str, str]:
-    """What made the numbers."""
+    """Return the versions of the software that made the numbers, and the device."""
     return {
         "jaxcloseup": jaxcloseup.__version__,
         "python": platform.python_version(),

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import jax
 
-from experiments.evaluation.ladder import ladder_in_short, ladder_targets
-from experiments.evaluation.metrics_text import in_short
+from experiments.evaluation.ladder import describe_ladder, ladder_targets
+from experiments.evaluation.metrics_text import describe_split
 from experiments.evaluation.renders import write_renders
 from experiments.evaluation.scores import (
     Perceptual,
@@ -85,10 +85,10 @@ class Scorer:
                     self.renderings[stage, split] = seen
                     name, first = next(iter(seen.items()))
                     shown[f"{split}/{name}"] = first.rgb
-                    print(f"{stage:>9} {split}: {in_short(scores[split])}", flush=True)
+                    print(f"{stage:>9} {split}: {describe_split(scores[split])}", flush=True)
             self.scores[stage] = scores
             if log is not None:
                 log.evaluated(stage, scores, shown)
             if ladder:
-                print(f"{stage:>9} {ladder_in_short(scores)}", flush=True)
+                print(f"{stage:>9} {describe_ladder(scores)}", flush=True)
             programs.method.export(self._folder, stage, state.params, state.buffers)

@@ -15,7 +15,7 @@ import jaxcloseup
 from experiments.methods import Preset
 from experiments.training.logs import TrainLog
 from experiments.training.loop import run_stage
-from experiments.training.manifest import hash_data, hash_wanted
+from experiments.training.manifest import hash_data, hash_targets
 from experiments.training.programs import Programs
 from experiments.training.settings import plain_config
 from jaxcloseup.artifacts.checkpoints import Checkpoints
@@ -97,7 +97,7 @@ def identity_of(scene: Scene, preset: Preset, names: Mapping[str, str]) -> dict[
         "resolution": [size.width, size.height],
         "version": jaxcloseup.__version__,
         "data_sha256": hash_data(scene),
-        "wanted_sha256": hash_wanted(scene),
+        "wanted_sha256": hash_targets(scene),
     }
 
 

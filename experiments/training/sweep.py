@@ -13,7 +13,7 @@ from experiments.evaluation.metrics_text import SPLIT_TITLES
 from experiments.evaluation.scores import NO_PERCEPTUAL, Perceptual, Target, evaluate
 from experiments.methods import Preset
 from experiments.training.arms import Arm, describe, make_arm, why_not
-from experiments.training.ceilings import labels_of_less_error, true_close_ups
+from experiments.training.ceilings import labels_with_better_depth, true_close_ups
 from experiments.training.logs import TrainLog
 from experiments.training.loop import TrainingError
 from experiments.training.programs import Programs
@@ -252,7 +252,7 @@ def label_arm(
     scene, key = programs.scene, jax.random.key(seed)
     if arm.depth_error is not None:
         render = functools.partial(programs.render, start.state)
-        return labels_of_less_error(
+        return labels_with_better_depth(
             key,
             scene,
             start.sources,

@@ -1,1 +1,1 @@
-"""Looking at a stored run: cameras, frames, and the viewer's page."""
+"""Rendering and viewing a stored run: camera paths, frames, and the viewer's page."""

@@ -1,6 +1,7 @@
-"""Cameras to render: of a capture's views, of a file, on an orbit, on a dolly towards the surface.
+"""Cameras to render: a split's views, a camera_path.json, an orbit, or a dolly towards a surface.
 
-Poses are camera-to-world in the scene's own world: for a capture that of its `transforms*.json`.
+Poses are camera-to-world in the scene's own world; for a capture, that is the world of its
+`transforms*.json`.
 """
 
 import math
@@ -18,21 +19,21 @@ from jaxcloseup.photographs import Views, camera_at
 from jaxcloseup.scenes import Scene, SceneError
 
 
-OPENGL = np.diag([1.0, -1, -1])  # y and z change sign between OpenGL's frame and OpenCV's
+OPENGL = np.diag([1.0, -1, -1])  # y and z change sign between the OpenGL and OpenCV frames
 _RIGID = 1e-3
 
 
 class CameraError(Exception):
-    """Cameras that cannot be had. The message is one sentence that says what to do."""
+    """The requested cameras are invalid. The message is one sentence that says what to do."""
 
 
 class Shots(NamedTuple):
-    """What to render.
+    """Cameras to render.
 
     Attributes:
-      cameras: stacked `[Q]`.
-      names: one for each, for files.
-      fps: frames a second that the file asks for, or None.
+      cameras: `[Q]` stacked cameras.
+      names: file name of each camera's images, without ending.
+      fps: frames per second that the camera path asks for, or None.
     """
 
     cameras: Camera
@@ -41,24 +42,28 @@ class Shots(NamedTuple):
 
 
 def view_shots(scene: Scene, split: str) -> Shots:
-    """The cameras of a split of the scene, by their photographs' names."""
+    """Return the cameras of a split, named after their photographs.
+
+    Raises:
+      CameraError: the scene has no such split.
+    """
     views: Views | None = getattr(scene, split, None) if split in scene.names else None
     if views is None:
         raise CameraError(
-            f"--views={split}: {scene.name} has no such views: choose " + ", ".join(scene.names)
+            f"--views={split}: {scene.name} has no such split: choose " + ", ".join(scene.names)
         )
     return Shots(views.cameras, list(scene.names[split]))
 
 
 def read_camera_path(path: pathlib.Path) -> Shots:
-    """The cameras of a `camera_path.json`, nerfstudio's, in the world of the scene.
+    """Read the cameras of nerfstudio's `camera_path.json`, in the file's own world.
 
-    Read are `render_height`, `render_width`, `fps` or `seconds`, and for each entry of
+    The function reads `render_height`, `render_width`, `fps` or `seconds`, and for each entry of
     `camera_path` its `camera_to_world` (16 numbers by rows, OpenGL) and `fov` (vertical, degrees;
-    else the file's `default_fov`). Pixels are square, so `aspect` says nothing new and is not read.
+    default: the file's `default_fov`). Pixels are square, so `aspect` is redundant and ignored.
 
     Raises:
-      CameraError: names the file, the entry and the field.
+      CameraError: the file is invalid; the message names the file, the entry and the field.
     """
     try:
         fields = read_object(path, "a camera_path")
@@ -66,11 +71,11 @@ def read_camera_path(path: pathlib.Path) -> Shots:
         raise CameraError(str(error)) from None
     kind = fields.get("camera_type", "perspective")
     if kind != "perspective":
-        raise CameraError(f"{path}: camera_type is {kind!r}: only perspective can be rendered")
+        raise CameraError(f"{path}: camera_type is {kind!r}: make it perspective")
     height, width = (_size(path, fields, key) for key in ("render_height", "render_width"))
     entries = fields.get("camera_path")
     if not isinstance(entries, list) or not entries:
-        raise CameraError(f"{path}: camera_path must be a list of one camera or more")
+        raise CameraError(f"{path}: camera_path must be a list of at least one camera")
     poses, focals = [], []
     for i, entry in enumerate(entries):
         label = f"{path}: camera_path[{i}]"
@@ -87,16 +92,16 @@ def read_camera_path(path: pathlib.Path) -> Shots:
     elif fields.get("seconds") is not None:
         fps = len(entries) / max(_number(str(path), fields, "seconds"), 1e-9)
     if fps is not None and not 0 < fps <= 1000:
-        raise CameraError(f"{path}: fps and seconds must be positive, and give 1000 fps at most")
+        raise CameraError(f"{path}: fps and seconds must be positive and give at most 1000 fps")
     intrinsics = [[f, f, width / 2, height / 2] for f in focals]
     return Shots(_stack(poses, intrinsics, height, width), _numbered(len(poses)), fps)
 
 
 def read_camera_transform(path: pathlib.Path) -> tuple[np.ndarray, float]:
-    """The `transform` `[3, 4]`, float64, and the `scale` of a `dataparser_transforms.json`.
+    """Read the `transform`, `[3, 4]` float64, and `scale` of a `dataparser_transforms.json`.
 
     Raises:
-      SceneError: names the file and the field.
+      SceneError: the file is invalid; the message names the file and the field.
     """
     fields = read_object(path, "a transform and a scale")
     transform = rigid_transform(str(path), "transform", fields.get("transform"))
@@ -104,20 +109,20 @@ def read_camera_transform(path: pathlib.Path) -> tuple[np.ndarray, float]:
 
 
 def to_capture(shots: Shots, transform: np.ndarray, scale: float, scene: Scene) -> Shots:
-    """Cameras of nerfstudio's world in that of the scene.
+    """Map cameras from nerfstudio's world to the scene's world.
 
-    nerfstudio moves a point x of the capture's original world, which is the scene's world before
-    the `applied_transform` of its `transforms.json`, to scale * transform (x, 1). Of the scale that
-    it records the `applied_scale` is a part; its cameras do not have it.
+    nerfstudio maps a point x of the capture's original world to scale * transform (x, 1). The
+    original world is the scene's world before the `applied_transform` of its `transforms.json`.
+    The recorded scale includes the `applied_scale`, but nerfstudio's cameras do not.
 
     Args:
-      shots: cameras that nerfstudio shows.
-      transform: `[3, 4]`.
-      scale: of positions.
-      scene: that nerfstudio was given.
+      shots: cameras in nerfstudio's world.
+      transform: `[3, 4]` nerfstudio's recorded transform.
+      scale: nerfstudio's recorded scale of positions.
+      scene: the scene of the capture that nerfstudio loaded.
 
     Raises:
-      SceneError: the `applied_transform` does not go with the transform.
+      SceneError: the scene's `applied_transform` and the transform do not combine to a rigid one.
     """
     last = [0.0, 0, 0, 1]
     applied = scene.metadata.get("applied_transform")
@@ -132,46 +137,50 @@ def to_capture(shots: Shots, transform: np.ndarray, scale: float, scene: Scene) 
 
 
 def orbit(scene: Scene, frames: int, *, up: Sequence[float] | None = None) -> Shots:
-    """Cameras on a circle around what the training cameras look at, all looking there.
+    """Return cameras on a circle around the training cameras' focus point, looking at it.
 
-    The circle has the training cameras' median height over that point and their median distance
-    from the vertical through it; lens and size are those of the first training view.
+    The circle has the training cameras' median height above that point and their median distance
+    from the vertical through it. Lens and image size are those of the first training view.
 
     Args:
-      scene: of the training cameras.
-      frames: how many.
-      up: direction `[3]` of the vertical, in the world; by default the cameras' mean one.
+      scene: the scene with the training cameras.
+      frames: number of cameras.
+      up: `[3]` up direction in the world; default: the mean of the training cameras' up directions.
     """
     cameras = scene.train.cameras
     positions, rotations = (np.asarray(a, np.float64) for a in (cameras.position, cameras.rotation))
     forward = rotations[..., 2]
-    center = looked_at(positions, forward, near=scene.near, far=scene.far)
+    center = focus_point(positions, forward, near=scene.near, far=scene.far)
     up = _unit(-rotations[..., 1].mean(axis=0) if up is None else np.asarray(up, np.float64))
     offset = positions - center
     height = np.median(offset @ up)
     flat = offset - (offset @ up)[:, None] * up
     radius = np.median(np.linalg.norm(flat, axis=1))
-    # Two axes across `up`; the first frame is as near to the first training view as can be.
+    # Two axes perpendicular to `up`; the first frame is as near as possible to the first view.
     start = flat[0] if np.linalg.norm(flat[0]) > 1e-6 else np.cross(up, forward[0])
     east = _unit(start)
     north = np.cross(up, east)
     poses = []
     for angle in np.arange(frames) * (2 * np.pi / frames):
         position = radius * (np.cos(angle) * east + np.sin(angle) * north) + height * up
-        poses.append(look(center + position, center, up))
+        poses.append(look_at(center + position, center, up))
     intrinsics = np.tile(np.asarray(cameras.intrinsics[0]), (frames, 1))
     return Shots(_stack(poses, intrinsics, cameras.height, cameras.width), _numbered(frames))
 
 
-def looked_at(positions: np.ndarray, forward: np.ndarray, *, near: float, far: float) -> np.ndarray:
-    """The point `[3]` nearest to all lines of sight, or, where that is no point that they see, the
-    mean of what lies half-way (in inverse depth) between `near` and `far`.
+def focus_point(
+    positions: np.ndarray, forward: np.ndarray, *, near: float, far: float
+) -> np.ndarray:
+    """Return the point `[3]` nearest to all optical axes, in the least-squares sense.
+
+    If the median depth of that point is outside `near` to `far`, return the mean over cameras of
+    the point on the optical axis half-way, in inverse depth, between `near` and `far`.
 
     Args:
-      positions: `[V, 3]` of the cameras.
-      forward: `[V, 3]` their viewing directions, of unit length.
-      near: least depth.
-      far: largest depth.
+      positions: `[V, 3]` camera positions.
+      forward: `[V, 3]` viewing directions, of unit length.
+      near: smallest depth that the cameras see.
+      far: largest depth that the cameras see.
     """
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
     matrix, vector = across.sum(0), np.einsum("vij,vj->i", across, positions)
@@ -184,22 +193,30 @@ def looked_at(positions: np.ndarray, forward: np.ndarray, *, near: float, far: f
 
 
 def find_view(scene: Scene, name: str) -> int:
-    """The index of a training view by its name, with or without the ending of its file."""
+    """Return the index of a training view by its name, with or without file ending.
+
+    Raises:
+      CameraError: no training view has this name.
+    """
     names = scene.names["train"]
-    for wanted in (name, pathlib.Path(name).stem):
-        if wanted in names:
-            return names.index(wanted)
+    for candidate in (name, pathlib.Path(name).stem):
+        if candidate in names:
+            return names.index(candidate)
     some = ", ".join(names[:3]) + (f" ... {names[-1]}" if len(names) > 3 else "")
-    raise CameraError(f"--from={name} is no training view of {scene.name}: there are {some}")
+    raise CameraError(f"--from={name} is no training view of {scene.name}: choose one of {some}")
 
 
 def check_pixel(camera: Camera, pixel: tuple[float, float]) -> tuple[int, int]:
-    """Row and column of a pixel (x, y) of a camera."""
+    """Return the row and column of a pixel (x, y) of a camera.
+
+    Raises:
+      CameraError: the pixel is outside the image.
+    """
     x, y = pixel
     if not (0 <= x < camera.width and 0 <= y < camera.height):
         raise CameraError(
-            f"--pixel={x:g},{y:g} is outside of the view, which was trained with "
-            f"{camera.width} x {camera.height} pixels"
+            f"--pixel={x:g},{y:g} is outside the view: choose a pixel within the "
+            f"{camera.width} x {camera.height} pixels that the view was trained with"
         )
     return int(y), int(x)
 
@@ -212,17 +229,17 @@ def dolly(
     magnification: float,
     frames: int,
 ) -> Shots:
-    """Cameras from a view towards the surface at a pixel, without turning.
+    """Return cameras that move from a view towards the surface at a pixel, without turning.
 
-    The last one is `magnification` times nearer to the surface; the apparent size grows by the same
-    factor from frame to frame. A single frame is the last one.
+    The last camera is `magnification` times nearer to the surface. The surface's apparent size
+    grows by the same factor from each frame to the next. A single frame is the last one.
 
     Args:
-      camera: of the view.
-      pixel: (x, y) of it.
-      depth: z-depth of the surface there.
-      magnification: at least 1.
-      frames: how many.
+      camera: camera of the view.
+      pixel: (x, y) of the surface in the view.
+      depth: z-depth of the surface at the pixel.
+      magnification: how many times nearer the last camera is; at least 1.
+      frames: number of cameras.
     """
     anchor = pixels_to_points(camera, jnp.asarray(pixel, jnp.float32), jnp.float32(depth))
     powers = np.linspace(0, 1, frames) if frames > 1 else np.ones(1)
@@ -235,7 +252,13 @@ def dolly(
 
 
 def resized(camera: Camera, width: int | None, height: int | None) -> Camera:
-    """A camera, or stacked ones, with images of another size; of None the aspect is kept."""
+    """Change the image size of a camera or of stacked cameras; the field of view stays.
+
+    Args:
+      camera: one camera, or stacked cameras.
+      width: new width in pixels; None keeps the aspect ratio.
+      height: new height in pixels; None keeps the aspect ratio.
+    """
     if width is None and height is None:
         return camera
     if width is None:
@@ -248,8 +271,8 @@ def resized(camera: Camera, width: int | None, height: int | None) -> Camera:
     return camera.replace(intrinsics=camera.intrinsics * scale, height=height, width=width)
 
 
-def one_by_one(shots: Shots) -> list[tuple[str, Camera]]:
-    """Names and single cameras."""
+def named_cameras(shots: Shots) -> list[tuple[str, Camera]]:
+    """Return each camera with its name."""
     return [(name, camera_at(shots.cameras, i)) for i, name in enumerate(shots.names)]
 
 
@@ -266,11 +289,17 @@ def _stack(poses: Any, intrinsics: Any, height: int, width: int) -> Camera:
     )
 
 
-def look(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Pose `[3, 4]` at a position `[3]`, looking at a target, in OpenCV's frame."""
+def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Return the camera-to-world pose `[3, 4]` at a position that looks at a target.
+
+    Args:
+      position: `[3]` camera position, in the world.
+      target: `[3]` point to look at, in the world.
+      up: `[3]` direction that points up in the image.
+    """
     forward = _unit(target - position)
     right = np.cross(forward, up)
-    if np.linalg.norm(right) < 1e-6:  # straight up or down: any right will do
+    if np.linalg.norm(right) < 1e-6:  # looks straight up or down: choose any right
         right = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
     right = _unit(right)
     return np.column_stack([right, np.cross(forward, right), forward, position])
@@ -282,7 +311,7 @@ def _unit(vector):
 
 def _pose(label, entry):
     if "camera_to_world" not in entry:
-        raise CameraError(f"{label}: no camera_to_world: give 16 numbers, by rows")
+        raise CameraError(f"{label}: camera_to_world is missing: give 16 numbers, by rows")
     try:
         matrix = np.array(entry["camera_to_world"], np.float64)
     except (TypeError, ValueError):
@@ -298,7 +327,7 @@ def _pose(label, entry):
     error = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if error > _RIGID or np.linalg.det(rotation) < 0:
         raise CameraError(
-            f"{label}: camera_to_world is not a rotation and a position: leave out scales and "
+            f"{label}: camera_to_world is not a rotation and a position: remove scales and "
             "reflections"
         )
     return np.column_stack([rotation @ OPENGL, matrix[:3, 3]])
@@ -307,7 +336,7 @@ def _pose(label, entry):
 def _number(label, fields, key):
     value = fields.get(key)
     if value is None:
-        raise CameraError(f"{label}: no {key}: give it")
+        raise CameraError(f"{label}: {key} is missing: add it")
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise CameraError(f"{label}: {key} must be a finite number, not {value!r}")
     return float(value)

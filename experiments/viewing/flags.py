@@ -1,4 +1,4 @@
-"""Flags of the programs that load a stored run, and the run that they name."""
+"""Flags of the programs that load a stored run, and the run that the flags name."""
 
 import pathlib
 
@@ -16,16 +16,18 @@ from experiments.training.stored_run import (
 
 FLAGS = flags.FLAGS
 flags.adopt_module_key_flags(set_flag)
-flags.DEFINE_string("run", None, "folder of the run")
-flags.DEFINE_string("stage", None, "stage to render; default: closeup, or the last that trained")
-flags.DEFINE_string("data", None, "where the run's capture lies now, if it was moved")
+flags.DEFINE_string("run", None, "folder of a run of experiments.run")
+flags.DEFINE_string("stage", None, "stage to render; default: closeup, else control, else baseline")
+flags.DEFINE_string(
+    "data", None, "folder of the run's capture, if the capture was moved since training"
+)
 
 
-def named_run() -> tuple[StoredRun, str]:
-    """The run that `--run` names with the settings of `--set`, and its stage that `--stage` names.
+def run_from_flags() -> tuple[StoredRun, str]:
+    """Return the run that `--run` names, with the settings of `--set`, and the stage to render.
 
     Raises:
-      RunError: there is none.
+      RunError: the run, the stage or a setting does not exist.
     """
     if FLAGS.run is None:
         raise RunError("--run is missing: name the folder of a run of experiments.run")

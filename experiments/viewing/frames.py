@@ -1,4 +1,4 @@
-"""Frames of cameras: color, depth, normals and support as pictures."""
+"""Frames of a camera path: color, depth, normals and support as images."""
 
 import pathlib
 from collections.abc import Sequence
@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from experiments.training.programs import Programs
-from experiments.viewing.camera_paths import Shots, one_by_one
+from experiments.viewing.camera_paths import Shots, named_cameras
 from jaxcloseup.artifacts.images import (
     Image,
     colorize_depth,
@@ -34,29 +34,29 @@ def render_shots(
     *,
     sources: LabelSources | None,
 ) -> list[pathlib.Path]:
-    """Write `<kind>/<name>.png` for every camera; returns the folders.
+    """Write `<kind>/<name>.png` for every camera, and return the folders.
 
     Args:
       output_dir: folder for `rgb`, `depth`, `normals` (from fields that render them) and `support`.
-      programs: the run's.
-      state: what is rendered.
+      programs: the run's compiled programs.
+      state: the state to render.
       shots: the cameras.
-      sources: the training photographs with their depths, or None for no support.
+      sources: the training photographs with their depths, or None to leave out support.
     """
     scene = programs.scene
-    cameras = one_by_one(shots)
-    # Depth has the colors of three frames in all of them, so that videos do not flicker.
+    cameras = named_cameras(shots)
+    # Three frames set the depth colors of all frames, so that videos do not flicker.
     some = [programs.render(state, cameras[i][1]) for i in {0, len(cameras) // 2, len(cameras) - 1}]
     limits = depth_range([label_depth(one, near=0, far=scene.far) for one in some], scene)
     images: dict[str, Image] = {}
     for name, camera in cameras:
-        images = pictures(programs, state, camera, sources=sources, limits=limits)
+        images = render_pictures(programs, state, camera, sources=sources, limits=limits)
         for kind, image in images.items():
             write_png(output_dir / kind / f"{name}.png", image)
     return [output_dir / kind for kind in images]
 
 
-def pictures(
+def render_pictures(
     programs: Programs,
     state: TrainState,
     camera: Camera,
@@ -64,14 +64,16 @@ def pictures(
     sources: LabelSources | None,
     limits: tuple[float, float] | None = None,
 ) -> dict[str, Image]:
-    """One camera's pictures: `rgb`, `depth`, `normals` and `support`, the last two if it has them.
+    """Render one camera's images by kind: `rgb`, `depth`, `normals` and `support`.
+
+    `normals` is missing for fields that render none, `support` is missing without `sources`.
 
     Args:
-      programs: the run's.
-      state: what is rendered.
-      camera: the camera.
-      sources: the training photographs with their depths, or None for no support.
-      limits: depths of the extreme colors; by default those of most of the picture.
+      programs: the run's compiled programs.
+      state: the state to render.
+      camera: camera of the images.
+      sources: the training photographs with their depths, or None to leave out support.
+      limits: nearest and farthest depth of the color scale; default: `depth_range` of the image.
     """
     scene = programs.scene
     seen = programs.render(state, camera)
@@ -90,7 +92,10 @@ def pictures(
 
 
 def depth_range(depths: Sequence[jax.Array], scene: Scene) -> tuple[float, float]:
-    """Near and far of most of these depths, 0 being undefined, or else the scene's."""
+    """Return the 1st and 99th percentile of the depths; the scene's near and far if all are 0.
+
+    A depth of 0 is undefined and does not count.
+    """
     known = np.concatenate([np.asarray(depth).ravel() for depth in depths])
     known = known[known > 0]
     if not len(known):

@@ -1,4 +1,4 @@
-"""The page of `experiments.view`: a run's scene, its photographs, and buttons. Needs Viser."""
+"""The page of `experiments.view`: a run's scene, its photographs and buttons. Needs Viser."""
 
 import functools
 import queue
@@ -15,14 +15,14 @@ from experiments.training.fine_tuning import fine_tune
 from experiments.training.loop import TrainingError
 from experiments.training.programs import Programs
 from experiments.training.setup import LabelStart, start_labels
-from experiments.viewing.camera_paths import looked_at
-from experiments.viewing.frames import pictures
+from experiments.viewing.camera_paths import focus_point
+from experiments.viewing.frames import render_pictures
 from experiments.viewing.picking import (
     closeup_camera,
     rank_views,
     ray_camera,
-    seen_camera,
     vertical_fov,
+    viewer_camera,
 )
 from experiments.viewing.server import Server
 from jaxcloseup.artifacts.images import encode_png, to_uint8
@@ -32,22 +32,23 @@ from jaxcloseup.photographs import camera_at
 from jaxcloseup.train import TrainState
 
 
-_HELP = """Click on the scene for a close-up of what is there, on a camera to go to it.
-A picture is rendered for the red camera, or else from where you are."""
-_BUSY = "There is still work to do: wait for it, and try again."
-_THUMBNAIL = 80  # pixels wide
-_SHOWN = 360  # what is narrower is drawn larger
+_HELP = """Click on the scene to place the red close-up camera in front of that point.
+Click on a training camera to move there.
+"Render" renders what the red camera sees, or your own view if there is no red camera."""
+_BUSY = "The viewer is still busy: wait until it has finished, and try again."
+_THUMBNAIL = 80  # width of a photograph's thumbnail, in pixels
+_MIN_WIDTH = 360  # the page enlarges narrower pictures to at least this width, in pixels
 
 
 class ViewError(Exception):
-    """Something cannot be done here. The message is one sentence that says what to do."""
+    """A visitor's request cannot be met. The message is one sentence that says what to do."""
 
 
 class Viewer:
-    """What the page shows, and what its buttons do.
+    """The contents of the page and the actions of its buttons.
 
-    Viser calls back in threads of its own. Such a call leaves its work in a queue of one, which the
-    main thread empties: so nothing is computed twice at a time, and the page never waits.
+    Viser calls back in its own threads. Each callback puts its work into a queue that holds one
+    job, and the main thread runs the job. So only one job runs at a time, and the page never waits.
     """
 
     def __init__(
@@ -56,24 +57,24 @@ class Viewer:
         """Fill the page.
 
         Args:
-          server: Viser's.
-          programs: of the run.
-          state: what is shown, and what every fine-tuning starts from.
-          stage: its name.
-          seed: of the run.
+          server: Viser's server.
+          programs: the run's compiled programs.
+          state: the state to show; every fine-tuning starts from it.
+          stage: name of the state's stage.
+          seed: the run's seed.
         """
         self._server, self._programs, self._state = server, programs, state
         self._scene, self._stage, self._seed = programs.scene, stage, seed
         self._jobs: queue.Queue = queue.Queue(maxsize=1)
         self._start: LabelStart | None = None
-        self._camera: Camera | None = None  # of the close-up
-        self._aim: tuple[Camera, np.ndarray] | None = None  # its photograph's, and the point
+        self._camera: Camera | None = None  # the close-up camera
+        self._aim: tuple[Camera, np.ndarray] | None = None  # source camera, point
         self._picture: np.ndarray | None = None
-        self._visited = -np.inf  # when, seconds
+        self._visited = -np.inf  # time of the last visit to a camera, seconds
         cameras = self._scene.train.cameras
         positions, rotations = (np.asarray(a) for a in (cameras.position, cameras.rotation))
         near, far = self._scene.near, self._scene.far
-        center = looked_at(positions, rotations[..., 2], near=near, far=far)
+        center = focus_point(positions, rotations[..., 2], near=near, far=far)
         self._distance = float(np.median(np.linalg.norm(positions - center, axis=1)))
         gaps = np.linalg.norm(positions[:, None] - positions, axis=-1)
         gap = np.median(np.sort(gaps)[:, 1]) if len(gaps) > 1 else np.inf
@@ -87,10 +88,13 @@ class Viewer:
         server.scene.on_click()(self._on_click)
 
     def work(self, timeout: float | None = None) -> None:
-        """Wait for something to do, and do it.
+        """Wait for one job, and run it.
+
+        Args:
+          timeout: longest wait in seconds; None waits forever.
 
         Raises:
-          queue.Empty: there was nothing to do for `timeout` seconds.
+          queue.Empty: no job arrived within `timeout` seconds.
         """
         what, job = self._jobs.get(timeout=timeout)
         self._say(f"{what} ...")
@@ -99,16 +103,16 @@ class Viewer:
             self._say(f"{job()} ({time.perf_counter() - start:.1f} s)")
         except (ViewError, TrainingError) as error:
             self._say(str(error))
-        except Exception as error:  # whoever looks has more to lose than this picture
+        except Exception as error:  # a bug must not end the page for its visitors
             traceback.print_exc()
-            self._say(f"{what} failed ({type(error).__name__}): the terminal says more.")
+            self._say(f"{what} failed ({type(error).__name__}): see the terminal for details.")
 
     def _add_scene(self):
         scene, params = self._server.scene, self._state.params
         method, config = self._programs.method, self._programs.preset.field
         if method.gaussians is not None:
             found = method.gaussians(params, self._state.buffers)
-            # Viser keeps covariances in 16 bits: the largest radius is 100 in the units it gets.
+            # Viser stores covariances in 16 bits, so scale the largest radius to 100 units.
             variances = np.trace(found.covariances, axis1=1, axis2=2)
             unit = np.sqrt(variances.max(initial=1e-18)) / 100
             scene.add_gaussian_splats(
@@ -119,7 +123,7 @@ class Viewer:
                 found.opacities[:, None],
                 scale=unit,
             )
-            # As the run's own renderer has it.
+            # The background that the run's own renderer uses.
             scene.set_background_image(to_uint8(np.full((1, 1), method.background(config))))
         elif len(self._scene.points):
             size = 0.003 * self._distance
@@ -159,9 +163,9 @@ class Viewer:
         shown = gui.add_checkbox("training cameras", initial_value=True)
         shown.on_update(lambda _: setattr(self._cameras, "visible", shown.value))
         buttons = {
-            "Camera here": self._on_here,
+            "Place camera here": self._on_here,
             "Render": functools.partial(self._on_render, tuned=False),
-            "Fine-tune for it, and render": functools.partial(self._on_render, tuned=True),
+            "Fine-tune and render": functools.partial(self._on_render, tuned=True),
             "Download PNG": self._on_download,
         }
         for name, call in buttons.items():
@@ -182,17 +186,17 @@ class Viewer:
             self._status.content = _BUSY
 
     def _visit(self, client, index):
-        """Bring a visitor to a training camera, whose photograph would hide the scene."""
+        """Move a visitor to a training camera; hide its photograph, which would cover the scene."""
         self._visited = time.monotonic()
         for i, frustum in enumerate(self._frustums):
             frustum.visible = i != index
         _bring(client, camera_at(self._scene.train.cameras, index), self._distance)
 
     def _on_click(self, event):
-        # A click on a training camera is told a second time, as one on the scene.
+        # Viser reports a click on a training camera a second time, as a click on the scene.
         if time.monotonic() - self._visited > 0.5:
             ray = np.array(event.ray_origin), np.array(event.ray_direction)
-            self._later("looking there", lambda: self._aim_at(event.client, *ray))
+            self._later("finding that surface", lambda: self._aim_at(event.client, *ray))
 
     def _on_here(self, event):
         self._aim, self._camera = None, self._seen_by(event.client)
@@ -205,34 +209,34 @@ class Viewer:
 
     def _on_download(self, event):
         if self._picture is None:
-            self._status.content = "There is no picture yet: render one."
+            self._status.content = "There is no picture yet: render one first."
         else:
             name = f"{self._scene.name}_{self._stage}.png"
             event.client.send_file_download(name, encode_png(self._picture), save_immediately=True)
 
     def _aim_at(self, client, origin, direction):
-        """Put the close-up's camera in front of the surface along a ray."""
+        """Put the close-up camera in front of the first surface along a ray."""
         views = self._scene.train
         focal = float(np.median(np.asarray(views.cameras.intrinsics)[:, 1]))
         ray = ray_camera(origin, direction, focal)
         seen = label_depth(self._programs.render(self._state, ray), near=0, far=np.inf)
         depth = float(seen[1, 1])
         if depth <= 0:
-            raise ViewError("There is no surface: click where the scene is.")
+            raise ViewError("There is no surface at that pixel: click on the scene.")
         point = np.asarray(ray.position) + depth * np.asarray(ray.rotation)[:, 2]
         data = (jnp.asarray(a, jnp.float32) for a in (point, direction))
         ranks = np.asarray(rank_views(views, self._label_start().sources.depths, *data))
         if not ranks.any():
-            raise ViewError("No photograph shows what is there: click somewhere else.")
+            raise ViewError("No photograph shows that point: click somewhere else.")
         best = int(ranks.argmax())
         self._aim = camera_at(views.cameras, best), point
         self._place(client)
-        shown = f"{np.count_nonzero(ranks)} of {len(ranks)} photographs show that"
-        return f"{shown}; the camera came nearer from {self._scene.names['train'][best]}"
+        shown = f"{np.count_nonzero(ranks)} of {len(ranks)} photographs show that point"
+        return f"{shown}; the close-up camera starts from {self._scene.names['train'][best]}"
 
     def _place(self, client):
-        """The close-up's camera as far from the point as the slider says."""
-        aim = self._aim  # once: another thread may forget it meanwhile
+        """Put the close-up camera as near to the point as the slider says."""
+        aim = self._aim  # read once: another thread may reset it
         if aim is None:
             return
         source, point = aim
@@ -249,14 +253,14 @@ class Viewer:
         if tuned:
             cameras = jax.tree.map(lambda leaf: leaf[None], camera)
             state = fine_tune(self._programs, start, cameras, most=None)
-        images = pictures(self._programs, state, camera, sources=start.sources)
+        images = render_pictures(self._programs, state, camera, sources=start.sources)
         self._picture = picture = to_uint8(images["rgb"])
-        factor = -(-_SHOWN // picture.shape[1])
+        factor = -(-_MIN_WIDTH // picture.shape[1])
         self._image.image = picture.repeat(factor, axis=0).repeat(factor, axis=1)
         self._support.image = images["support"]
         self._image.visible = self._support.visible = True
         if tuned and state is start.state:
-            return "No labels are let in for this camera, so nothing was fine-tuned; rendered"
+            return "The gate let no labels in for this camera, so nothing was fine-tuned; rendered"
         return "Fine-tuned and rendered" if tuned else "Rendered"
 
     def _label_start(self):
@@ -268,14 +272,14 @@ class Viewer:
         return self._start
 
     def _seen_by(self, client):
-        """The camera of a visitor, of the photographs' size."""
+        """Return a visitor's camera, with the photographs' image size."""
         rotation = SO3(client.camera.wxyz).as_matrix()
         like = self._scene.train.cameras
-        return seen_camera(rotation, client.camera.position, client.camera.fov, like)
+        return viewer_camera(rotation, client.camera.position, client.camera.fov, like)
 
 
 def _bring(client, camera, distance):
-    """Give a visitor a camera's pose and field of view, to turn about what is so far ahead."""
+    """Give a visitor a camera's pose and field of view; orbit a point `distance` ahead of it."""
     position, forward = np.asarray(camera.position), np.asarray(camera.rotation)[:, 2]
     with client.atomic():
         client.camera.position = position

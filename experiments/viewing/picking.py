@@ -1,10 +1,10 @@
-"""A close-up camera for a point that somebody clicked at: arrays only, no window."""
+"""A close-up camera for a point that a visitor clicked on. Works on arrays, without a window."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.viewing.camera_paths import look
+from experiments.viewing.camera_paths import look_at
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.geometry.poses import closeup_position
 from jaxcloseup.geometry.visibility import sample_where_visible
@@ -13,12 +13,17 @@ from jaxcloseup.photographs import Views
 
 
 def ray_camera(origin: np.ndarray, direction: np.ndarray, focal: float) -> Camera:
-    """A camera of 3 x 3 pixels whose middle one looks from `origin [3]` along `direction [3]`.
+    """Return a camera of 3 x 3 pixels whose center pixel looks along a ray.
 
-    Its z-depth is the distance along the ray; `focal`, in pixels, says how wide they are.
+    At the center pixel, z-depth is the distance along the ray.
+
+    Args:
+      origin: `[3]` start of the ray, in the world.
+      direction: `[3]` direction of the ray, of any length.
+      focal: focal length in pixels.
     """
     origin, direction = (np.asarray(array, np.float64) for array in (origin, direction))
-    pose = look(origin, origin + direction, np.eye(3)[np.argmin(np.abs(direction))])
+    pose = look_at(origin, origin + direction, np.eye(3)[np.argmin(np.abs(direction))])
     intrinsics = jnp.array([focal, focal, 1.5, 1.5], jnp.float32)
     return Camera(jnp.asarray(pose, jnp.float32), intrinsics, height=3, width=3)
 
@@ -31,18 +36,21 @@ def rank_views(
     direction: jax.Array,
     tolerance: jax.Array | float = 0.02,
 ) -> jax.Array:
-    """How well each photograph shows a point, `[V]`; 0 where it does not.
+    """Score how well each photograph shows a point.
 
-    The focal length over the depth, so that the finest photograph is the best, times the cosine
-    between its ray and the one that was clicked along: a view from the side is worth less, and one
-    from behind hardly anything.
+    The score is the focal length over the point's z-depth, which prefers fine photographs, times
+    the cosine between the photograph's ray and the clicked ray, which prefers similar directions.
+    A photograph from behind keeps a thousandth of its score.
 
     Args:
-      views: the training photographs, `V`.
-      depths: `[V, H, W]` their z-depth; 0 is undefined.
-      point: `[3]` in the world.
-      direction: `[3]` of the click, of any length.
-      tolerance: relative, within which a photograph's depth must confirm the point's.
+      views: the `V` training photographs.
+      depths: `[V, H, W]` z-depths of the photographs; 0 is undefined.
+      point: `[3]` the point, in the world.
+      direction: `[3]` direction of the clicked ray, of any length.
+      tolerance: relative tolerance within which a photograph's depth must confirm the point.
+
+    Returns:
+      `[V]` scores; 0 where a photograph does not show the point.
     """
 
     def one(camera, depth, weight):
@@ -57,25 +65,30 @@ def rank_views(
 
 
 def closeup_camera(source: Camera, point: np.ndarray, magnification: float) -> Camera:
-    """A training camera that came so many times nearer to a point `[3]` and turned towards it.
+    """Move a training camera `magnification` times nearer to a point, and turn it to the point.
 
-    It is at `closeup_position`, has the point at its principal point and the source's upward
-    direction, lens and size.
+    The camera is at `closeup_position` and shows the point at its principal point. It keeps the
+    source's up direction, lens and image size.
+
+    Args:
+      source: the training camera.
+      point: `[3]` the point, in the world.
+      magnification: factor by which the distance to the point shrinks.
     """
     point = np.asarray(point, np.float64)
     rotation, position = (np.asarray(a, np.float64) for a in (source.rotation, source.position))
-    pose = look(closeup_position(point, position, magnification), point, -rotation[:, 1])
+    pose = look_at(closeup_position(point, position, magnification), point, -rotation[:, 1])
     return source.replace(camtoworld=jnp.asarray(pose, jnp.float32))
 
 
-def seen_camera(rotation: np.ndarray, position: np.ndarray, fov: float, like: Camera) -> Camera:
-    """A camera with a pose and a vertical field of view (radians), square pixels, of `like`'s size.
+def viewer_camera(rotation: np.ndarray, position: np.ndarray, fov: float, like: Camera) -> Camera:
+    """Return a camera with square pixels and a given pose, field of view and image size.
 
     Args:
-      rotation: `[3, 3]` camera to world, OpenCV's frame.
-      position: `[3]`.
-      fov: between 0 and pi.
-      like: whose size it has.
+      rotation: `[3, 3]` camera-to-world rotation, OpenCV frame.
+      position: `[3]` position, in the world.
+      fov: vertical field of view in radians, between 0 and pi.
+      like: a camera with the image size to use.
     """
     focal = like.height / 2 / np.tan(fov / 2)
     return Camera(
@@ -87,5 +100,5 @@ def seen_camera(rotation: np.ndarray, position: np.ndarray, fov: float, like: Ca
 
 
 def vertical_fov(camera: Camera) -> float:
-    """Radians between the upper and the lower edge, were the principal point in the middle."""
+    """Return the vertical field of view in radians, for a principal point at the image center."""
     return float(2 * np.arctan(camera.height / 2 / np.asarray(camera.intrinsics)[1]))

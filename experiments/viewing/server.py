@@ -1,4 +1,4 @@
-"""Viser's server at one address: it is there and nowhere else, or a sentence says why not."""
+"""Viser's server at exactly the requested address, or an error that says why not."""
 
 import contextlib
 import io
@@ -10,40 +10,44 @@ import viser
 
 
 class ServeError(Exception):
-    """Nothing can be served. The message is one sentence that says what to do."""
+    """The server cannot use its address. The message is one sentence that says what to do."""
 
 
 class Server(viser.ViserServer):
-    """Viser's, without its tunnel to a public server, which any page could ask for."""
+    """Viser's server without its tunnel to a public server, which any page could request."""
 
     def request_share_url(self, verbose: bool = True) -> None:
-        """Not done."""
+        """Do nothing, so that no visitor can make the page public."""
 
 
 def serve(host: str, port: int) -> Server:
-    """A server that can be reached at this address only.
+    """Start a server at this address.
+
+    Args:
+      host: address to serve at.
+      port: port to serve at.
 
     Raises:
-      ServeError: the address cannot be had.
+      ServeError: the address is in use or is not this computer's.
     """
     check_address(host, port)
 
     logging.getLogger("websockets").setLevel(logging.WARNING)
-    # Viser has a banner of its own, and takes the next port where one is in use.
+    # Viser prints a banner, and takes the next port if this one is in use.
     with contextlib.redirect_stdout(io.StringIO()):
         server = Server(host=host, port=port, verbose=False)
     if server.get_port() != port:
         server.stop()
-        raise ServeError(f"--port={port} was taken just now: choose another")
+        raise ServeError(f"--port={port} is already in use: choose another port")
     server.gui.configure_theme(show_share_button=False, control_width="large")
     return server
 
 
 def check_address(host: str, port: int) -> None:
-    """Complain where no server can be: Viser would take another port without a word.
+    """Check that the address is free, because Viser would silently take another port.
 
     Raises:
-      ServeError: the address cannot be had.
+      ServeError: the address is in use or is not this computer's.
     """
     try:
         with socket.create_server((host, port)):
@@ -51,6 +55,6 @@ def check_address(host: str, port: int) -> None:
     except OSError as error:
         reason = os.strerror(error.errno) if error.errno and error.errno > 0 else error.strerror
         raise ServeError(
-            f"--host={host} --port={port} cannot be served at ({reason}): choose another port, or "
-            "an address of this computer"
+            f"cannot serve at --host={host} --port={port} ({reason}): choose another port, or an "
+            "address of this computer"
         ) from None
