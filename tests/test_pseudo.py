@@ -157,7 +157,7 @@ def test_blended_labels_are_the_mean_of_the_photographs_that_see_most(capture):
     np.testing.assert_allclose(several.rgb[..., 0], mean, atol=1e-5)
     np.testing.assert_array_equal(several.weight > 0, seen.any(axis=0))
     np.testing.assert_allclose(np.asarray(alone.rgb[..., 0])[seen[1]], 0.2, atol=1e-6)
-    # Of two, the second is the one that sees most under small angles.
+    # The second of two sources is the view that sees most under small angles.
     cosines = [
         rays_cosine(points, closeup, plane.camera_above(x, 0.1 * x, 4.0, tilt=0.1 * x))
         for x in POSITIONS

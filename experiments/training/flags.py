@@ -1,4 +1,4 @@
-"""Flags of the programs that train, and what they say together."""
+"""Flags of the programs that train: the preset, the settings and the capture that they describe."""
 
 import datetime
 import os

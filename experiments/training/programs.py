@@ -28,7 +28,7 @@ class Programs:
 
     A field may have room for a fixed amount of work. Where an image needs more, `Programs` discards
     it, doubles the room, compiles everything anew and does the work again: no step learns from a
-    truncated image, and nobody sees one.
+    truncated image, and no render shows one.
     """
 
     def __init__(self, preset: Preset, scene: Scene) -> None:
@@ -60,8 +60,8 @@ class Programs:
     def _run_arms(self, step: Callable[..., Any]) -> Callable[..., Any]:
         """Steps of all arms of a sweep together, spread over the devices.
 
-        Arms share the count of steps, so that what is due at a step is no question of arms, and the
-        photographs. Each device has arms of its own and exchanges nothing with the others.
+        Arms share the photographs and the count of steps, so the same changes are due in all of them
+        at a step. Each device has its own arms and exchanges nothing with the others.
         """
         arms_states = TrainState(step=None, params=0, buffers=0, opt_state=0, key=0)
         arms_sources = LabelSources(views=None, depths=0, blocks=0)
@@ -95,7 +95,7 @@ class Programs:
         return run_arms
 
     def make_room(self, growth: int) -> None:
-        """Have room for `growth` times as much as the preset has, or more."""
+        """Grow the room to at least `growth` times the preset's."""
         if growth > self.growth:
             self.growth = growth
             self._compile()
@@ -151,7 +151,7 @@ class Programs:
             )
 
     def render(self, state: TrainState, camera: Camera, key: jax.Array | None = None) -> Rendering:
-        """Render a whole image; without a key, as ever, deterministically."""
+        """Render a whole image; without a key, deterministically."""
         while True:
             rendering = self._render(state, camera, key)
             if rendering.overflow is None or not int(rendering.overflow):

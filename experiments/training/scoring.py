@@ -1,4 +1,4 @@
-"""What stages and arms are scored on, and the scores, renders and exports of a run's stages."""
+"""The views to score on, and the scores, renders and exports of a run's stages."""
 
 import functools
 import pathlib
@@ -51,7 +51,7 @@ def hold_out(programs: Programs, start: LabelStart) -> HeldOut:
 
 
 class Scorer:
-    """Scores stages on what is held out, and leaves their renders and exports.
+    """Scores stages on the held-out views, and writes their renders and exports.
 
     Attributes:
       scores: by stage and split.

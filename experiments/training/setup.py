@@ -1,4 +1,4 @@
-"""What the stages of a run and the arms of a sweep begin with, and what both train with."""
+"""Set-up that the stages of a run and the arms of a sweep share: states, labels, checkpoints."""
 
 import contextlib
 import dataclasses
@@ -51,7 +51,7 @@ class Training:
     Attributes:
       programs: what is compiled.
       checkpoints: keep the states of every stage.
-      log: gets every report; None: none is kept.
+      log: gets every report; None keeps none.
       save_every: steps between checkpoints.
       seconds: filled with the wall time of each part.
       history: filled with the metrics of each stage.
@@ -88,7 +88,7 @@ class Training:
 
 
 def identity_of(scene: Scene, preset: Preset, names: Mapping[str, str]) -> dict[str, Any]:
-    """What makes a training this training, as JSON can hold it; runs and sweeps add their own."""
+    """What tells one training from another, as JSON; runs and sweeps add their own entries."""
     size = scene.train.cameras
     return {
         "scene": scene.name,

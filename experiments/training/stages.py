@@ -32,13 +32,13 @@ STAGES = ("baseline", "control", "closeup", "test_time")
 
 
 class Outcome(NamedTuple):
-    """What the stages of a run leave for its report.
+    """Everything that the report of a run needs from its stages.
 
     Attributes:
       start: what fine-tuning began with.
-      settings: of the labels, as the gate left them.
-      gate: what left-out photographs showed, or None without a gate.
-      held_out: what was scored.
+      settings: how labels are made, after the gate.
+      gate: the evidence of the left-out photographs, or None without a gate.
+      held_out: the views that were scored.
       scores: by stage and split.
       renderings: of held-out views, by stage and split, then by name.
       audit: labels against the truth, by the depth they are made from; empty on captures.
@@ -125,7 +125,7 @@ def run_stages(
 
 
 def weigh(training: Training, start: LabelStart) -> tuple[PseudoSettings, Mapping[str, Any] | None]:
-    """The preset's settings of labels as its gate leaves them, and what the gate found, if any."""
+    """The preset's settings of labels after its gate, and the gate's evidence, if it has one."""
     programs = training.programs
     settings = pseudo_settings(programs.preset.labels)
     if not programs.preset.gated:

@@ -54,7 +54,7 @@ class StoredRun(NamedTuple):
 def read_run(folder: pathlib.Path) -> StoredRun:
     """Read how a run was trained, and which states it left.
 
-    Prints the settings that its version lacked, with the values that render it as that version did.
+    Prints the settings that its version lacked, with the values that reproduce its renders.
 
     Raises:
       RunError: the folder holds no run, or none that this version can render.
@@ -74,7 +74,7 @@ def read_run(folder: pathlib.Path) -> StoredRun:
         ) from None
     if absent:
         values = ", ".join(f"{name}={value}" for name, value in absent.items())
-        print(f"{folder}: version {version} had no setting for {values}; it rendered like that")
+        print(f"{folder}: version {version} had no such settings; it renders with {values}")
     checkpoints = folder / "checkpoints"
     stages = sorted(
         path.name

@@ -84,7 +84,7 @@ def run_sweep(
     together, in_turn = order_arms(chosen, seeds)
     identity = identity_of(scene, preset, names) | {"seeds": seeds, "arms": describe(chosen)}
     identity |= {"max_parallel": max_parallel, "devices": len(jax.devices())}
-    # Rows of what is kept are told apart by their place.
+    # Checkpoints tell the arms that train together apart by their place alone.
     identity["together"] = [[arm.name, seed] for arm, seed in together]
     programs = Programs(preset, scene)
     training = Training(programs, Checkpoints(folder, identity), log)
@@ -146,7 +146,7 @@ class Starts:
 
 
 class ArmScorer:
-    """Scores arms on what is held out.
+    """Scores arms on the held-out views.
 
     Attributes:
       scores: see `SweepOutcome`.
@@ -174,7 +174,7 @@ class ArmScorer:
         self.scores[arm][str(seed)] = {"skipped": skipped, "splits": splits}
 
     def outcome(self) -> SweepOutcome:
-        """What was found, arms in the order in which they were named."""
+        """Everything that was scored, with arms in the order in which the user named them."""
         order = {arm: i for i, arm in enumerate(self.scores)}
         pairs = sorted(self._renderings.items(), key=lambda pair: order[pair[0][0]])
         return SweepOutcome(self.scores, self._shown, dict(pairs))
