@@ -51,7 +51,7 @@ class Arm(NamedTuple):
 
     @property
     def outlook(self) -> str:
-        """Its settings that decide, beside the seed, which cameras it draws and what it warps there."""
+        """Settings that decide, with the seed, which cameras it draws and what it warps there."""
         settings, labels = self.settings, self.labels
         seen_from = settings.pose, settings.fixed_anchors, settings.leave_out_source
         return str(jax.device_get((seen_from, labels.expected_depth)))

@@ -60,8 +60,8 @@ class Programs:
     def _run_arms(self, step: Callable[..., Any]) -> Callable[..., Any]:
         """Steps of all arms of a sweep together, spread over the devices.
 
-        Arms share the photographs and the count of steps, so the same changes are due in all of them
-        at a step. Each device has its own arms and exchanges nothing with the others.
+        Arms share the photographs and the count of steps, so all of them change what is due at a
+        step together. Each device has its own arms and exchanges nothing with the others.
         """
         arms_states = TrainState(step=None, params=0, buffers=0, opt_state=0, key=0)
         arms_sources = LabelSources(views=None, depths=0, blocks=0)
