@@ -3,6 +3,7 @@
 import dataclasses
 import json
 
+import chex
 import constant_color
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,13 @@ from tiny_runs import TINY_SURFELS
 from experiments import render, run, sweep
 from experiments.methods import METHODS, surfels
 from experiments.methods.surfels import extent, make_field
-from experiments.training.setup import FEWEST_POINTS, initial_points
+from experiments.training.programs import Programs
+from experiments.training.setup import (
+    FEWEST_POINTS,
+    initial_points,
+    initial_state,
+    state_shapes,
+)
 from jaxcloseup.scenes import load_scene
 
 
@@ -61,6 +68,13 @@ def test_few_points_have_random_ones_beside_them(scene):
         np.testing.assert_array_equal(points[:count], some)
         np.testing.assert_array_equal(rgb[:count], some)
         np.testing.assert_array_equal(rgb[count:], 0.5)
+
+
+def test_the_shapes_of_a_state_are_those_of_the_state(scene):
+    points = np.random.default_rng(0).uniform(-1, 1, (FEWEST_POINTS, 3)).astype(np.float32)
+    programs = Programs(TINY_SURFELS, dataclasses.replace(scene, points=points, rgb=points))
+    shapes, state = state_shapes(programs), initial_state(programs, seed=0)
+    chex.assert_trees_all_equal_shapes_and_dtypes(shapes, state)
 
 
 def test_a_new_method_runs_through_every_program(capture_folder, tmp_path, monkeypatch):

@@ -103,9 +103,22 @@ def identity_of(scene: Scene, preset: Preset, names: Mapping[str, str]) -> dict[
 
 def initial_state(programs: Programs, seed: int) -> TrainState:
     """The state before the first step of a seed's baseline."""
+    return _initial_state(programs)(*_initial_data(programs, seed))
+
+
+def state_shapes(programs: Programs) -> TrainState:
+    """The structure of a state, with shapes and types in place of arrays."""
+    return jax.eval_shape(_initial_state(programs), *_initial_data(programs, seed=0))
+
+
+def _initial_state(programs):
+    return functools.partial(init_state, field=programs.field, optimizer=programs.optimizer)
+
+
+def _initial_data(programs, seed):
     key_init, _, _ = jax.random.split(jax.random.key(seed), 3)
     points, rgb = initial_points(jax.random.fold_in(key_init, 2), programs.scene)
-    return init_state(key_init, points, rgb, field=programs.field, optimizer=programs.optimizer)
+    return key_init, points, rgb
 
 
 def initial_points(key: jax.Array, scene: Scene, count: int = 5000) -> tuple[Any, Any]:

@@ -13,7 +13,7 @@ from experiments.methods import Preset
 from experiments.training import manifest
 from experiments.training.programs import Programs
 from experiments.training.settings import with_settings
-from experiments.training.setup import initial_state
+from experiments.training.setup import state_shapes
 from experiments.training.stored_config import preset_from_config
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.scene import Scene
@@ -149,8 +149,8 @@ def restore(run: StoredRun, scene: Scene, stage: str) -> tuple[Programs, TrainSt
       CheckpointError: the state has another form.
     """
     programs = Programs(run.preset, scene)
-    shapes = _shapes(programs)
-    if run.preset != run.trained and shapes != _shapes(Programs(run.trained, scene)):
+    shapes = state_shapes(programs)
+    if run.preset != run.trained and shapes != state_shapes(Programs(run.trained, scene)):
         raise RunError(
             f"--set changes the shape of what was trained: --run={run.folder} was trained with "
             "other shapes, so train anew with these settings, or leave them out"
@@ -165,11 +165,6 @@ def restore(run: StoredRun, scene: Scene, stage: str) -> tuple[Programs, TrainSt
     programs.make_room(progress["growth"])
     print(f"{run.folder}: {scene.name}, {stage} after {step} steps")
     return programs, state
-
-
-def _shapes(programs: Programs) -> TrainState:
-    """The structure of a state, with shapes and types in place of arrays."""
-    return jax.eval_shape(lambda: initial_state(programs, seed=0))
 
 
 def _read_json(folder, name):
