@@ -217,14 +217,15 @@ def test_settings_stack_and_no_gradient_flows(capture):
 
 def test_virtual_cameras_come_from_every_view_and_keep_to_their_anchors(capture):
     views, depths, _ = capture
-    sample = jax.jit(jax.vmap(sample_virtual_camera, (0, None, None, None)))
+    sample = jax.jit(jax.vmap(sample_virtual_camera, (0, None, None)))
     keys = jax.random.split(jax.random.key(0), 64)
-    cameras, index = sample(keys, views, depths, settings())
+    sources = label_sources(views, depths)
+    cameras, index = sample(keys, sources, settings())
     assert set(np.asarray(index).tolist()) == {0, 1, 2, 3}
     heights = np.asarray(cameras.position)[:, 2]
     assert heights.min() > 4 / 8 - 1e-3  # the anchor is on the plane, 4 below the photographs
     assert heights.max() < 4 / 2 + 1e-3
-    cameras, _ = sample(keys, views, depths, settings(fixed_anchors=1.0))
+    cameras, _ = sample(keys, sources, settings(fixed_anchors=1.0))
     ground = np.asarray(cameras.position)[:, :2]
     assert len(np.unique(np.round(ground, 1), axis=0)) > 4  # magnification still varies
 
@@ -232,9 +233,9 @@ def test_virtual_cameras_come_from_every_view_and_keep_to_their_anchors(capture)
 def test_fixed_anchors_keep_out_of_what_weighs_nothing(capture):
     views, depths, _ = capture
     left = views.replace(weight=views.weight.at[:, :, plane.WIDTH // 2 :].set(0))
-    sample = jax.jit(jax.vmap(sample_virtual_camera, (0, None, None, None)))
+    sample = jax.jit(jax.vmap(sample_virtual_camera, (0, None, None)))
     keys = jax.random.split(jax.random.key(0), 64)
-    cameras, index = sample(keys, left, depths, settings(fixed_anchors=1.0))
+    cameras, index = sample(keys, label_sources(left, depths), settings(fixed_anchors=1.0))
     assert jnp.all(cameras.position[:, 0] < views.cameras.position[index, 0])
 
 
@@ -256,13 +257,13 @@ def test_best_source_does_not_look_through_walls(capture):
     assert best_source(target, views, behind, depth=jnp.asarray(depth, jnp.float32)) != 1
 
 
-def test_wanted_views_may_have_the_published_source(capture):
+def test_target_views_may_have_the_published_source(capture):
     views, depths, _ = capture
-    behind = depths.at[1].multiply(1.5)  # as above: most of its pixels land, of what nobody sees
+    behind = depths.at[1].multiply(1.5)  # as above: most of its pixels land, of hidden points
     stacked, exact = plane.make_views([plane.camera_above(0.0, 0.0, 3.9)])
-    label_all = jax.jit(label_views)
+    label_all, sources = jax.jit(label_views), label_sources(views, behind)
     seen = [
-        label_all(stacked.cameras, exact, views, behind, settings(use_mask=0.0, **changed)).rgb
+        label_all(stacked.cameras, exact, sources, settings(use_mask=0.0, **changed)).rgb
         for changed in ({}, {"source_tolerance": jnp.inf})
     ]
     camera = jax.tree.map(lambda leaf: leaf[0], stacked.cameras)

@@ -10,6 +10,7 @@ from test_pseudo import settings
 
 from jaxcloseup.field import RadianceField, Rendering
 from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_rays
+from jaxcloseup.label_rules import undivided_label_depth
 from jaxcloseup.photographs import sample_image, sample_pixels
 from jaxcloseup.train import (
     TrainConfig,
@@ -126,7 +127,7 @@ def test_labels_pull_with_half_the_weight_whatever_their_number(capture):
         after.params, state.params - RATE * 2 * (state.params - 1), atol=1e-6
     )
     # With loss summed per mean, a coverage under 1 does not weaken the labels.
-    pooled = bind(pseudo_step, num_rays=64, num_label_rays=256, pooled_loss=True)
+    pooled = bind(pseudo_step, num_rays=64, num_label_rays=256, label_rule="pooled")
     after_pooled, _ = pooled(state, white, depths, settings())
     np.testing.assert_allclose(after_pooled.params, after.params, atol=1e-6)
 
@@ -136,7 +137,7 @@ def test_pooling_weighs_photographs_and_labels_by_their_pixels(capture):
     state = fresh_state()
     arguments = views, depths, settings(use_mask=0.0)
     halves, metrics = bind(pseudo_step, num_rays=64, num_label_rays=256)(state, *arguments)
-    pooled, _ = bind(pseudo_step, num_rays=64, num_label_rays=256, pooled_loss=True)(
+    pooled, _ = bind(pseudo_step, num_rays=64, num_label_rays=256, label_rule="pooled")(
         state, *arguments
     )
     photographs = drawn(state, views, 64).mean(axis=0)
@@ -159,26 +160,46 @@ def test_the_control_sees_the_same_photographs(capture):
     np.testing.assert_allclose(unlabeled.params - state.params, half_way, atol=1e-6)
 
 
-@pytest.mark.parametrize("pooled", [False, True])
-def test_a_share_of_nothing_is_the_control(capture, pooled):
+@pytest.mark.parametrize("rule", ["paper", "pooled"])
+def test_without_label_weight_a_step_is_the_control(capture, rule):
     views, depths = capture
     state = fresh_state()
-    step = bind(pseudo_step, num_rays=64, num_label_rays=256, pooled_loss=pooled)
+    step = bind(pseudo_step, num_rays=64, num_label_rays=256, label_rule=rule)
     arm, metrics = step(state, views, depths, settings(label_loss_weight=0.0, use_mask=0.0))
     assert metrics["label_coverage"] > 0
     control, _ = bind(train_step, num_rays=64)(state, views)
     np.testing.assert_allclose(arm.params, control.params, atol=1e-6)
 
 
-def test_the_rate_scales_what_a_step_with_labels_changes(capture):
+def test_lr_scale_scales_what_a_step_with_labels_changes(capture):
     views, depths = capture
     state = fresh_state()
     step = bind(pseudo_step, num_rays=64, num_label_rays=256)
     whole, _ = step(state, views, depths, settings())
-    half, _ = step(state, views, depths, settings().replace(rate=jnp.float32(0.5)))
+    half, _ = step(state, views, depths, settings().replace(lr_scale=jnp.float32(0.5)))
     np.testing.assert_allclose(
         half.params - state.params, (whole.params - state.params) / 2, atol=1e-6
     )
+
+
+@pytest.mark.parametrize(("rule", "noisy"), [("paper", False), ("released", True)])
+def test_the_released_rule_alone_renders_label_depth_with_noise(capture, rule, noisy):
+    views, depths = capture
+    keys = []
+
+    def render(params, buffers, camera, pixels, key):
+        if camera.intrinsics.ndim == 1:  # the virtual view
+            keys.append(key)
+        return one_color_field().render(params, buffers, camera, pixels, key)
+
+    step = functools.partial(
+        pseudo_step,
+        field=one_color_field()._replace(render=render),
+        optimizer=optax.sgd(RATE),
+        config=TrainConfig(num_rays=64, num_label_rays=256, label_rule=rule),
+    )
+    jax.eval_shape(step, fresh_state(), views, depths, settings())
+    assert (keys[0] is not None) == noisy
 
 
 @pytest.mark.parametrize("count", [64, None])
@@ -243,7 +264,9 @@ def test_depths_are_undefined_where_the_field_is_thin_or_out_of_range(capture):
     result = render_depths(field, None, (), views.cameras, near=2, far=4)
     expected = np.where((alpha >= 0.5) & (depth >= 2) & (depth <= 4), depth, 0)
     np.testing.assert_array_equal(result, np.stack([expected] * 3))
-    result = render_depths(field, None, (), views.cameras, near=2, far=4, divided=False)
+    result = render_depths(
+        field, None, (), views.cameras, near=2, far=4, depth=undivided_label_depth
+    )
     thin = np.asarray(depth * alpha)
     expected = np.where((alpha >= 0.5) & (thin >= 2) & (thin <= 4), thin, 0)
     np.testing.assert_array_equal(result, np.stack([expected] * 3))
