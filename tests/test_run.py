@@ -168,7 +168,7 @@ def test_labels_weigh_what_they_deserve(off):
         assert found["weight"] > 0
     if off == 1.3:
         assert found["weight"] == 0
-    assert ("no labels" in verdict(found)) == (found["weight"] == 0)
+    assert ("labels are not used" in verdict(found)) == (found["weight"] == 0)
 
 
 def test_a_saved_render_reproduces_its_score(finished, capture_folder):
