@@ -22,7 +22,7 @@ from experiments.training.programs import Programs
 from experiments.training.settings import plain_config
 from experiments.training.setup import LabelStart
 from experiments.training.stored_config import preset_from_config
-from experiments.training.stored_run import load_run_scene, read_run
+from experiments.training.stored_run import RunError, change_settings, load_run_scene, read_run
 from jaxcloseup.scenes import load_scene
 
 
@@ -80,7 +80,7 @@ def test_a_dolly_is_frames_and_videos(render):
 def test_a_camera_path_may_be_fine_tuned_for(render, tmp_path, capsys):
     entry = json.loads(path_file(tmp_path).read_text())["camera_path"][0]
     file = path_file(tmp_path, camera_path=[entry])
-    out = render(target=str(file), target_steps=1)
+    out = render(target=str(file), target_steps=1, set=["label_loss_weight=0.5"])
     said = capsys.readouterr().out
     assert "pixels to be rendered; 1 steps" in said and "label_psnr" in said
     tuned = (out / "rgb" / "0000.png").read_bytes()
@@ -239,9 +239,12 @@ def test_a_run_of_version_0_1_0_renders_as_it_did(render, tmp_path, capsys):
     assert preset.train.label_rule == "paper" and preset.labels.label_loss_weight == 0.05
 
 
-def test_settings_change_what_is_fine_tuned(render, tmp_path, capsys):
-    entry = json.loads(path_file(tmp_path).read_text())["camera_path"][0]
-    file = path_file(tmp_path, camera_path=[entry])
-    given = ["steps_per_target=1", "label_loss_weight=0.5"]
-    render(target=str(file), set=given)
-    assert "pixels to be rendered; 1 steps" in capsys.readouterr().out
+def test_settings_change_what_is_fine_tuned(kept):
+    changed = change_settings(read_run(kept), ["steps_per_target=7", "label_loss_weight=0.5"])
+    assert (changed.preset.field.steps_per_target, changed.preset.labels.label_loss_weight) == (
+        7,
+        0.5,
+    )
+    assert changed.trained == KEPT
+    with pytest.raises(RunError, match="--set=sharpness=3: .* no setting sharpness"):
+        change_settings(read_run(kept), ["sharpness=3"])

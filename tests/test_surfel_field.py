@@ -287,7 +287,7 @@ def test_without_density_control_only_the_schedule_changes(trained):
 
 
 def test_a_field_with_more_capacity_renders_what_overflowed(trained, capture):
-    """A caller doubles the capacity until everything fits, with the same parameters and buffers."""
+    """A caller grows the capacity until everything fits, with the same parameters and buffers."""
     state, camera = trained[0], jax.tree.map(lambda leaf: leaf[0], capture[0].cameras)
 
     def render_with(capacity):
@@ -299,7 +299,7 @@ def test_a_field_with_more_capacity_renders_what_overflowed(trained, capture):
     image = render_with(capacity)
     assert image.overflow > 0
     while int(image.overflow) > 0:
-        capacity *= 2
+        capacity *= 4
         image = render_with(capacity)
     assert 300 < capacity < CONFIG.raster.capacity
     ample = render(state.params, state.buffers, camera)
