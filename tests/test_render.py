@@ -246,5 +246,5 @@ def test_settings_change_what_is_fine_tuned(kept):
         0.5,
     )
     assert changed.trained == KEPT
-    with pytest.raises(RunError, match="--set=sharpness=3: .* no setting sharpness"):
+    with pytest.raises(RunError, match=r"--set=sharpness=3: .* no setting sharpness"):
         change_settings(read_run(kept), ["sharpness=3"])
