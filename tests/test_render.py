@@ -226,7 +226,7 @@ def test_a_setting_that_a_run_lacks_has_its_default():
 
 def test_a_run_of_version_0_1_0_renders_as_it_did(render, tmp_path, capsys):
     stored = shutil.copytree(OLD_RUN / "run", tmp_path / "run")
-    out = render(run=str(stored), data=str(OLD_RUN / "capture"), views="test")
+    out = render(run=str(stored), data=str(OLD_RUN / "capture"), views="test", support=False)
     said = capsys.readouterr().out
     assert "version 0.1.0 had no such settings; it renders with look_at=False" in said
     image, as_it_was = (
