@@ -93,11 +93,12 @@ def run(
     )
     load_options = {"downscale": preset.downscale} if load_options is None else load_options
     about = {**names, "seed": seed, "config": plain_config(preset), "versions": versions()}
-    write_manifest(output_dir, about | about_scene(scene, load_options))
+    manifest = about | about_scene(scene, load_options)
+    write_manifest(output_dir, manifest)
     write_dataparser_transforms(output_dir, scene)
     outcome = run_stages(training, seed, output_dir, to_run=to_run, perceptual=perceptual)
     results = report_run(output_dir, training, outcome, about)
-    write_manifest(output_dir, about | about_scene(scene, load_options), training.seconds)
+    write_manifest(output_dir, manifest, training.seconds)
     return results
 
 
