@@ -5,8 +5,9 @@
     python -m experiments.render --run=... --orbit --frames=120
     python -m experiments.render --run=... --from=train_003 --pixel=60,40 --magnification=4
 
-The program writes a folder of images for each of `rgb`, `depth`, `normals` (surfels only) and
-`support`, which shows how many training photographs saw each pixel and how sharply. Except for
+The program writes a folder of images for each of `rgb`, `depth`, `normals` (surfels only),
+`support`, which shows how many training photographs saw each pixel and how sharply, and `trust`,
+how much of their detail was added to `rgb`; `--nodetail` shows the field alone. Except for
 `--views`, it also writes each folder as a video. A dolly moves from a training view straight
 towards the surface at a pixel. `--fine_tune` first trains for exactly the rendered cameras, on
 pseudo-labels made for them; `--target=FILE` is short for `--camera_path=FILE --fine_tune`.
@@ -23,6 +24,7 @@ import numpy as np
 from absl import app, flags
 
 from experiments.command_line import check_unused, set_up
+from experiments.training.detail import detail_path, find_detail
 from experiments.training.fine_tuning import fine_tune
 from experiments.training.loop import TrainingError
 from experiments.training.setup import start_labels
@@ -79,6 +81,9 @@ flags.DEFINE_integer(
 )
 flags.DEFINE_bool(
     "support", True, "also render support, which needs the depth of every training photograph"
+)
+flags.DEFINE_bool(
+    "detail", True, "add the detail that the photographs show beyond the field; made once for a run"
 )
 
 
@@ -150,7 +155,12 @@ def _render() -> None:
         sources = start.sources if FLAGS.support else None
     if fine_tuned:
         state = fine_tune(programs, start, shots.cameras, most=FLAGS.target_steps)
-    folders = render_shots(output_dir, programs, state, shots, sources=sources)
+    detail = None
+    if FLAGS.detail:
+        # What was fine-tuned for these cameras is not kept, and its detail neither.
+        path = None if fine_tuned else detail_path(record.folder, stage)
+        detail, _ = find_detail(programs, state, path)
+    folders = render_shots(output_dir, programs, state, shots, sources=sources, detail=detail)
     print(f"{len(shots.names)} frames: {', '.join(str(folder) for folder in folders)}")
     if chosen != "views" and len(shots.names) > 1:
         for folder in folders:

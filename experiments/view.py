@@ -14,6 +14,7 @@ import sys
 from absl import app, flags
 
 from experiments.command_line import set_up
+from experiments.training.detail import detail_path
 from experiments.training.stored_run import RunError, load_run_scene, restore
 from experiments.viewing.flags import run_from_flags
 from jaxcloseup.artifacts.checkpoints import CheckpointError
@@ -47,7 +48,12 @@ def main(argv: list[str]) -> None:
         programs, state = restore(record, scene, stage)
         viser_server = server.serve(FLAGS.host, FLAGS.port)
         viewer = page.Viewer(
-            viser_server, programs, state, stage=stage, seed=record.identity["seed"]
+            viser_server,
+            programs,
+            state,
+            stage=stage,
+            seed=record.identity["seed"],
+            kept=detail_path(record.folder, stage),
         )
     except (RunError, server.ServeError, SceneError, CheckpointError, OSError) as error:
         sys.exit(f"experiments.view: {error}")

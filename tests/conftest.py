@@ -30,6 +30,13 @@ def pytest_configure(config):
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 
+def pytest_collection_modifyitems(items):
+    """Begin with the files that take longest, so that no process waits for one at the end."""
+    first = ["test_sweep", "test_run", "test_render", "test_procedural", "test_rasterize"]
+    ranks = {name: rank for rank, name in enumerate(first)}
+    items.sort(key=lambda item: ranks.get(item.path.stem, len(first)))
+
+
 def pytest_unconfigure(config):
     """Remove them."""
     if not hasattr(config, "workerinput"):

@@ -185,3 +185,78 @@ def first_crossing(solids, origin, direction, nearest=1e-4):
                 world = world / np.linalg.norm(world)
                 best = (t, -np.sign(world @ direction) * world, index)
     return (*best, margin)
+
+
+def gather_view(
+    point,
+    side,
+    position,
+    camtoworld,
+    intrinsics,
+    inverse_depth,
+    trust,
+    levels,
+    level_intrinsics,
+    settings,
+    finest,
+):
+    """What one photograph adds to one gathered point; None where it does not see it.
+
+    Args:
+      point: `[3]`; `side` is that of the view's pixel on the surface, 0 where undefined.
+      position: `[3]` of the view.
+      camtoworld: of the photograph, with `intrinsics`, `inverse_depth` and `trust` of its depth.
+      levels: its values `[H, W, C]`, finest first, with `level_intrinsics` `[L, 4]`.
+      settings: tolerance, angle_scale and finer.
+      finest: first level to read.
+    """
+    if side <= 0:
+        return None
+    ((x, y),), (z,) = project(camtoworld, intrinsics, [point])
+    height, width = trust.shape
+    if z <= 0 or not (0 <= x < width and 0 <= y < height):
+        return None
+    inverse, sure = bilinear(np.stack([inverse_depth, trust], -1), x, y)
+    off = (z * inverse - 1) / settings.tolerance
+    seen = sure * max(1 - off**2, 0) ** 2
+    if seen == 0:
+        return None
+    rays = [(point - eye) / np.linalg.norm(point - eye) for eye in (position, camtoworld[:, 3])]
+    angle = np.arccos(min(np.dot(*rays), 1))
+    footprints = [z / np.sqrt(fx * fy) / side for fx, fy, _, _ in level_intrinsics]
+    footprint = footprints[finest]
+    weight = seen * np.exp(-angle / settings.angle_scale) / max(footprint, 1) ** 2
+    level = min(max(-np.log2(footprints[0]) - settings.finer, finest), len(levels) - 1)
+    value = 0
+    for i, image in enumerate(levels):
+        fx, fy, cx, cy = level_intrinsics[i]
+        ((u, v),), _ = project(camtoworld, (fx, fy, cx, cy), [point])
+        share = max(1 - abs(level - i), 0)
+        value = value + share * bilinear(image, u, v) if share else value
+    return {"w": weight, "value": value, "seen": seen, "footprint": footprint, "angle": angle}
+
+
+def gather_mean(views, settings):
+    """Weighted mean and statistics of what `gather_view` found of one point."""
+    if not views:
+        return {"weight": 0, "count": 0, "footprint": np.inf}
+    w = np.array([view["w"] for view in views])
+    values = np.stack([view["value"] for view in views])
+
+    def mean(of):
+        return np.tensordot(w, np.stack(of), 1) / w.sum()
+
+    first = mean(values)
+    variance = max(mean(np.mean(values**2, axis=1)) - np.mean(first**2), 0)
+    found = {
+        "variance": variance,
+        "count": sum(view["seen"] for view in views),
+        "footprint": min(view["footprint"] for view in views),
+        "detail": mean([-np.log2(view["footprint"]) for view in views]),
+        "angle": mean([view["angle"] for view in views]),
+    }
+    if settings.robust and variance > 1e-7:
+        apart = np.mean((values - first) ** 2, axis=1) / variance
+        w = w / (1 + settings.robust * apart) ** 2
+        first = mean(values)
+    return found | {"weight": w.sum(), "mean": first}

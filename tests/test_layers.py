@@ -28,6 +28,9 @@ MAY_IMPORT = {
     "splats": {"numerics", "geometry", "field", "metrics"},
     "pseudo": {"numerics", "geometry", "field", "photographs"},
     "support": {"numerics", "geometry", "photographs"},
+    "pyramids": {"geometry", "photographs", "scene"},
+    "gather": {"numerics", "geometry", "photographs", "pyramids"},
+    "detail": {"numerics", "geometry", "gather", "pyramids"},
     "train": {
         *("numerics", "geometry", "field", "photographs"),
         *("pseudo", "label_rules", "rendered_loss"),

@@ -99,6 +99,6 @@ def test_a_new_method_runs_through_every_program(capture_folder, tmp_path, monke
     swept = call(sweep, "sweep", scenes=[str(capture_folder)], seeds=1, arms=arms, **given)
     found = json.loads((swept / "sweep.json").read_text())["scenes"]
     assert list(found[capture_folder.name]) == arms
-    rendered = call(render, "render", run=str(trained), views="test", support=False)
+    rendered = call(render, "render", run=str(trained), views="test", support=False, detail=False)
     assert (rendered / "rgb" / "0.png").exists() and (rendered / "depth" / "0.png").exists()
     assert not (rendered / "normals").exists()

@@ -35,7 +35,7 @@ def render(kept, tmp_path):
     flags.FLAGS(["render"])
 
     def call(**given):
-        given = {"run": str(kept), "output_dir": str(tmp_path / "out")} | given
+        given = {"run": str(kept), "output_dir": str(tmp_path / "out"), "detail": False} | given
         promotion = jax.numpy_dtype_promotion("standard")
         with promotion, flagsaver.flagsaver(compilation_cache="", **given):
             program.main(["render"])
@@ -49,8 +49,8 @@ def files(folder):
 
 
 def test_test_views_are_rendered_with_their_own_cameras(render, capture_folder, capsys):
-    out = render(views="test")
-    kinds = ("depth", "normals", "rgb", "support")
+    out = render(views="test", detail=True)
+    kinds = ("depth", "normals", "rgb", "support", "trust")
     assert files(out) == [f"{kind}/0.png" for kind in kinds]
     truth = cv2.imread(str(capture_folder / "test" / "0.png"))
     image = cv2.imread(str(out / "rgb" / "0.png"))

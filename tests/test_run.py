@@ -62,7 +62,7 @@ def test_a_run_scores_every_stage_on_every_split(finished):
     results, output_dir = finished
     assert json.loads((output_dir / "results.json").read_text()) == results
     assert results["resolution"] == [plane.WIDTH, plane.HEIGHT]
-    for stage in ("baseline", "control", "closeup", "test_time_control", "test_time"):
+    for stage in ("baseline", "control", "closeup", "test_time_control", "test_time", "detail"):
         for split in ("test", "test_far"):
             scores = results["stages"][stage][split]
             assert scores["psnr"] == pytest.approx(scores["views"]["0"]["psnr"])
@@ -71,6 +71,8 @@ def test_a_run_scores_every_stage_on_every_split(finished):
             assert scores["lpips_vgg_reason"]
         assert results["seconds"][stage] > 0
     assert results["stages"]["control"] != results["stages"]["closeup"]
+    assert results["detail"]["stage"] == "closeup" and results["detail"]["divisor"] == 1
+    assert (output_dir / "detail" / "closeup.npz").exists()
     assert_log_is_history(output_dir, results["history"])
 
 

@@ -86,7 +86,8 @@ def write_report(
         "<p><i>closeup</i> and <i>test_time</i> continue the baseline with pseudo-labels. "
         "<i>control</i> continues it for as many steps without them, so compare <i>closeup</i> "
         "with <i>control</i>, not with <i>baseline</i>. <i>test_time_control</i> is the control of "
-        "<i>test_time</i>, if that takes a different number of steps.</p>",
+        "<i>test_time</i>, if that takes a different number of steps. <i>detail</i> adds to "
+        "the renders of a stage, without training, what the photographs show beyond it.</p>",
         "<div class=wide><table><tr>",
         *(f"<th>{html.escape(cell)}" for cell in header),
         *("<tr>" + "".join(f"<td>{html.escape(cell)}" for cell in row) for row in body),
@@ -98,6 +99,8 @@ def write_report(
     parts += _label_plots(results["labels"], results["left_out"])
     if results["gate"]:
         parts.append(_gate_table(results["gate"]))
+    if results["detail"]:
+        parts.append(_detail_table(results["detail"]))
     parts += figures(pictures)
     config = html.escape(json.dumps({k: results[k] for k in ("config", "versions")}, indent=1))
     parts.append(f"<details><summary>Configuration</summary><pre>{config}</pre></details></html>")
@@ -217,6 +220,23 @@ def _gate_table(gate):
         f"where few of them agree so closely. Here {html.escape(verdict(gate))}.</p><table><tr>"
         "<th>color tolerance<th>depth tolerance<th>share with a label<th>PSNR of labels (dB)"
         f"<th>PSNR of the model (dB){lines}</table>"
+    )
+
+
+def _detail_table(detail):
+    lines = "".join(
+        f"<tr><td>{row['predicted']:.2f}<td>{row['actual']:.2f}<td>{row['pixels']:.1%}"
+        for row in detail["reliability"]
+    )
+    (height, width), *_ = detail["sizes"]
+    return (
+        "<h2>Detail of the photographs</h2><p>The stage <i>detail</i> shows the renders of "
+        f"<i>{html.escape(detail['stage'])}</i> with what photographs of {width} x {height} pixels "
+        "show beyond them. How much of it is added at a pixel is predicted from how well the "
+        "photographs agree, how sharply and from which angles they see the surface. The table "
+        "compares the prediction with left-out photographs: of the detail that the other "
+        "photographs show, the share that is predicted and that is really there.</p><table><tr>"
+        f"<th>predicted share<th>actual share<th>share of pixels{lines}</table>"
     )
 
 

@@ -48,6 +48,7 @@ def report_run(
         "labels": outcome.audit,
         "left_out": outcome.left_out,
         "gate": outcome.gate,
+        "detail": outcome.detail,
         "seconds": training.seconds,
         "history": training.history,
     }

@@ -2,7 +2,7 @@
 
 import functools
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -20,6 +20,7 @@ from experiments.evaluation.scores import (
 from experiments.training.programs import Programs
 from experiments.training.setup import LabelStart, Training, timed
 from jaxcloseup.field import Rendering
+from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.train import TrainState
 
 
@@ -71,10 +72,20 @@ class Scorer:
         self.scores: dict[str, dict[str, Any]] = {}
         self.renderings: dict[tuple[str, str], Mapping[str, Rendering]] = {}
 
-    def score(self, stage: str, state: TrainState) -> None:
-        """Render, score and keep one stage."""
+    def score(
+        self, stage: str, state: TrainState, render: Callable[[Camera], Rendering] | None = None
+    ) -> None:
+        """Render, score and keep one stage.
+
+        Args:
+          stage: its name.
+          state: its state.
+          render: `camera -> Rendering`; default: the state's, which is exported too.
+        """
         programs, log = self._training.programs, self._training.log
-        render = functools.partial(programs.render, state)
+        if render is None:
+            render = functools.partial(programs.render, state)
+            programs.method.export(self._folder, stage, state.params, state.buffers)
         targets, ladder = self._held_out.targets, self._held_out.ladder
         with timed(self._training.seconds, f"{stage}_evaluation"):
             scores, shown = {}, {}
@@ -91,4 +102,3 @@ class Scorer:
                 log.evaluated(stage, scores, shown)
             if ladder:
                 print(f"{stage:>9} {describe_ladder(scores)}", flush=True)
-            programs.method.export(self._folder, stage, state.params, state.buffers)

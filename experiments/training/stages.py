@@ -1,4 +1,4 @@
-"""The stages of a run on one scene: baseline, control, closeup, test_time."""
+"""The stages of a run on one scene: baseline, control, closeup, test_time, detail."""
 
 import functools
 import pathlib
@@ -11,6 +11,7 @@ from experiments.evaluation.audit import audit_labels, left_out_curve
 from experiments.evaluation.renders import write_truth
 from experiments.evaluation.scores import NO_PERCEPTUAL, Perceptual
 from experiments.methods import pseudo_settings
+from experiments.training.detail import detail_path, detailed, find_detail
 from experiments.training.gate import print_gate, weigh_labels
 from experiments.training.programs import Programs
 from experiments.training.scoring import HeldOut, Scorer, hold_out
@@ -28,7 +29,7 @@ from jaxcloseup.pseudo import PseudoSettings, label_sources
 from jaxcloseup.train import TrainState
 
 
-STAGES = ("baseline", "control", "closeup", "test_time")
+STAGES = ("baseline", "control", "closeup", "test_time", "detail")
 
 
 class Outcome(NamedTuple):
@@ -43,6 +44,7 @@ class Outcome(NamedTuple):
       renderings: of held-out views, by stage and split, then by name.
       audit: labels against the truth, by the depth they are made from; empty on captures.
       left_out: `error_curve` of labels of left-out photographs.
+      detail: what `find_detail` says of the stage that got detail, with its `stage`; None without.
     """
 
     start: LabelStart
@@ -53,6 +55,7 @@ class Outcome(NamedTuple):
     renderings: Mapping[tuple[str, str], Mapping[str, Rendering]]
     audit: Mapping[str, Any]
     left_out: Mapping[str, Any] | None
+    detail: Mapping[str, Any] | None
 
 
 def run_stages(
@@ -86,6 +89,7 @@ def run_stages(
     settings, gate = weigh(training, start)
     use_labels = gate is None or gate["weight"] > 0
     controls: dict[int, TrainState] = {}
+    latest = "baseline", baseline
 
     def control(name, steps):
         if steps not in controls:
@@ -103,12 +107,14 @@ def run_stages(
         if use_labels:
             state = training.train(stage, kind, start.state, *data, steps=steps)
         scorer.score(stage, state)
+        return state
 
     if "control" in to_run:
-        control("control", preset.closeup_steps)
+        latest = "control", control("control", preset.closeup_steps)
     if "closeup" in to_run:
         kind, steps = "random_closeups", preset.closeup_steps
-        fine_tune("closeup", "control", kind, start.sources, settings, steps=steps)
+        state = fine_tune("closeup", "control", kind, start.sources, settings, steps=steps)
+        latest = ("closeup" if use_labels else "control"), state
     if "test_time" in to_run and scene.test is None:
         print(f"no test_time: {scene.name} holds out no close-ups (--split=closest does)")
     elif "test_time" in to_run:
@@ -117,11 +123,31 @@ def run_stages(
         steps = method.target_steps(preset.field, len(scene.test))
         control_name, kind = "test_time_control", "target_views"
         fine_tune("test_time", control_name, kind, scene.train, labels, settings, steps=steps)
+    detail = None
+    if "detail" in to_run:
+        detail = add_detail_stage(training, scorer, output_dir, *latest)
     with timed(training.seconds, "audit"):
         audit, left_out = audit_all(programs, start, held_out.exact, settings, seed)
     return Outcome(
-        start, settings, gate, held_out, scorer.scores, scorer.renderings, audit, left_out
+        *(start, settings, gate, held_out, scorer.scores, scorer.renderings),
+        *(audit, left_out, detail),
     )
+
+
+def add_detail_stage(
+    training: Training, scorer: Scorer, output_dir: pathlib.Path, stage: str, state: TrainState
+) -> dict[str, Any]:
+    """Score the renders of a stage again with the detail of the photographs; return its record."""
+    programs = training.programs
+    with timed(training.seconds, "detail"):
+        detail, about = find_detail(programs, state, detail_path(output_dir, stage))
+
+    def render(camera):
+        rendering = programs.render(state, camera)
+        return rendering._replace(rgb=detailed(programs, detail, camera, rendering).rgb)
+
+    scorer.score("detail", state, render)
+    return {"stage": stage, **about}
 
 
 def weigh(training: Training, start: LabelStart) -> tuple[PseudoSettings, Mapping[str, Any] | None]:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
+from experiments.training.detail import detailed
 from experiments.training.programs import Programs
 from experiments.viewing.camera_paths import Shots, named_cameras
 from jaxcloseup.artifacts.images import (
@@ -15,6 +16,7 @@ from jaxcloseup.artifacts.images import (
     colorize_support,
     write_png,
 )
+from jaxcloseup.detail import Detail
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.label_rules import label_depth
 from jaxcloseup.pseudo import LabelSources
@@ -33,15 +35,18 @@ def render_shots(
     shots: Shots,
     *,
     sources: LabelSources | None,
+    detail: Detail | None = None,
 ) -> list[pathlib.Path]:
     """Write `<kind>/<name>.png` for every camera, and return the folders.
 
     Args:
-      output_dir: folder for `rgb`, `depth`, `normals` (from fields that render them) and `support`.
+      output_dir: folder for `rgb`, `depth`, `normals` (from fields that render them), `support`
+        and `trust`.
       programs: the run's compiled programs.
       state: the state to render.
       shots: the cameras.
       sources: the training photographs with their depths, or None to leave out support.
+      detail: of the state, or None to render the state alone.
     """
     scene = programs.scene
     cameras = named_cameras(shots)
@@ -50,7 +55,9 @@ def render_shots(
     limits = depth_range([label_depth(one, near=0, far=scene.far) for one in some], scene)
     images: dict[str, Image] = {}
     for name, camera in cameras:
-        images = render_pictures(programs, state, camera, sources=sources, limits=limits)
+        images = render_pictures(
+            programs, state, camera, sources=sources, detail=detail, limits=limits
+        )
         for kind, image in images.items():
             write_png(output_dir / kind / f"{name}.png", image)
     return [output_dir / kind for kind in images]
@@ -62,17 +69,20 @@ def render_pictures(
     camera: Camera,
     *,
     sources: LabelSources | None,
+    detail: Detail | None = None,
     limits: tuple[float, float] | None = None,
 ) -> dict[str, Image]:
-    """Render one camera's images by kind: `rgb`, `depth`, `normals` and `support`.
+    """Render one camera's images by kind: `rgb`, `depth`, `normals`, `support` and `trust`.
 
-    `normals` is missing for fields that render none, `support` is missing without `sources`.
+    `normals` is missing for fields that render none, `support` without `sources`, and `trust`, how
+    much of the photographs' detail was added from black to white, without `detail`.
 
     Args:
       programs: the run's compiled programs.
       state: the state to render.
       camera: camera of the images.
       sources: the training photographs with their depths, or None to leave out support.
+      detail: of the state, or None to render the state alone.
       limits: nearest and farthest depth of the color scale; default: `depth_range` of the image.
     """
     scene = programs.scene
@@ -88,6 +98,9 @@ def render_pictures(
         pixels = pixel_grid(camera.height, camera.width)
         support = _support(camera, pixels, depth, sources.views, sources.depths)
         images["support"] = colorize_support(*support)
+    if detail is not None:
+        sharper = detailed(programs, detail, camera, seen)
+        images |= {"rgb": sharper.rgb, "trust": sharper.weight}
     return images
 
 

@@ -1,6 +1,7 @@
 """The page of `experiments.view`: a run's scene, its photographs and buttons. Needs Viser."""
 
 import functools
+import pathlib
 import queue
 import time
 import traceback
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from viser.transforms import SO3
 
+from experiments.training.detail import find_detail
 from experiments.training.fine_tuning import fine_tune
 from experiments.training.loop import TrainingError
 from experiments.training.programs import Programs
@@ -52,7 +54,14 @@ class Viewer:
     """
 
     def __init__(
-        self, server: Server, programs: Programs, state: TrainState, *, stage: str, seed: int
+        self,
+        server: Server,
+        programs: Programs,
+        state: TrainState,
+        *,
+        stage: str,
+        seed: int,
+        kept: pathlib.Path | None = None,
     ) -> None:
         """Fill the page.
 
@@ -62,11 +71,13 @@ class Viewer:
           state: the state to show; every fine-tuning starts from it.
           stage: name of the state's stage.
           seed: the run's seed.
+          kept: file that keeps the state's detail, or None.
         """
         self._server, self._programs, self._state = server, programs, state
         self._scene, self._stage, self._seed = programs.scene, stage, seed
         self._jobs: queue.Queue = queue.Queue(maxsize=1)
         self._start: LabelStart | None = None
+        self._kept, self._detail = kept, None
         self._camera: Camera | None = None  # the close-up camera
         self._aim: tuple[Camera, np.ndarray] | None = None  # source camera, point
         self._picture: np.ndarray | None = None
@@ -160,6 +171,7 @@ class Viewer:
         gui.add_markdown(_HELP)
         self._nearer = gui.add_slider("times nearer", 1, 16, 0.5, 4)
         self._nearer.on_update(lambda event: self._place(event.client))
+        self._sharpen = gui.add_checkbox("detail of the photographs", initial_value=True)
         shown = gui.add_checkbox("training cameras", initial_value=True)
         shown.on_update(lambda _: setattr(self._cameras, "visible", shown.value))
         buttons = {
@@ -253,7 +265,11 @@ class Viewer:
         if tuned:
             cameras = jax.tree.map(lambda leaf: leaf[None], camera)
             state = fine_tune(self._programs, start, cameras, most=None)
-        images = render_pictures(self._programs, state, camera, sources=start.sources)
+        # A state tuned for one camera differs from the one whose detail is known.
+        detail = self._find_detail() if self._sharpen.value and state is self._state else None
+        images = render_pictures(
+            self._programs, state, camera, sources=start.sources, detail=detail
+        )
         self._picture = picture = to_uint8(images["rgb"])
         factor = -(-_MIN_WIDTH // picture.shape[1])
         self._image.image = picture.repeat(factor, axis=0).repeat(factor, axis=1)
@@ -270,6 +286,11 @@ class Viewer:
                 self._programs, self._state, self._seed, expected_depth=expected
             )
         return self._start
+
+    def _find_detail(self):
+        if self._detail is None:
+            self._detail, _ = find_detail(self._programs, self._state, self._kept)
+        return self._detail
 
     def _seen_by(self, client):
         """Return a visitor's camera, with the photographs' image size."""

@@ -1,5 +1,6 @@
 """Load a capture: the photographs, cameras, points and depth range of one folder."""
 
+import functools
 import logging
 import pathlib
 import warnings
@@ -78,16 +79,7 @@ def _load(listing: Listing, reading: Reading) -> Scene:
     ends = np.cumsum([len(members) for members in parts.values()])[:-1]
     rows = dict(zip(parts, np.split(np.arange(len(photos)), ends), strict=True))
     views = {
-        split: Views(
-            cameras=Camera(
-                camtoworld=jnp.asarray(camtoworld[rows[split]], jnp.float32),
-                intrinsics=jnp.asarray(intrinsics[rows[split]], jnp.float32),
-                height=height,
-                width=width,
-            ),
-            rgb=jnp.asarray(pad_images([photo.rgb for photo in part], height, width)),
-            weight=jnp.asarray(pad_images([photo.mask for photo in part], height, width)) / 255,
-        )
+        split: _padded(part, intrinsics[rows[split]], height, width)
         for split, part in parts.items()
     }
     files = {split: [photo.frame.file for photo in part] for split, part in parts.items()}
@@ -117,6 +109,32 @@ def _load(listing: Listing, reading: Reading) -> Scene:
         far=far,
         names=names,
         metadata=metadata,
+        # With a zoom, finer photographs would show the very crops that are held out.
+        photographs_at=None if reading.zoom > 1 else functools.partial(_train_at, listing, reading),
+    )
+
+
+def _train_at(listing: Listing, reading: Reading, factor: int) -> Views:
+    """Read the training photographs again, at 1 / `factor` of their own size."""
+    frames = [frame._replace(reduced=None) for frame in listing.frames["train"]]
+    photos = read_photos({"train": frames}, reading._replace(downscale=factor))["train"]
+    intrinsics = np.stack([photo.intrinsics(reading.half_pixel) for photo in photos])
+    width, height = np.array([photo.size for photo in photos]).max(0).tolist()
+    return _padded(photos, intrinsics, height, width)
+
+
+def _padded(photos: Sequence[Photo], intrinsics: np.ndarray, height: int, width: int) -> Views:
+    """Photographs padded to one size."""
+    poses = np.stack([photo.frame.camtoworld for photo in photos])
+    return Views(
+        cameras=Camera(
+            camtoworld=jnp.asarray(poses, jnp.float32),
+            intrinsics=jnp.asarray(intrinsics, jnp.float32),
+            height=height,
+            width=width,
+        ),
+        rgb=jnp.asarray(pad_images([photo.rgb for photo in photos], height, width)),
+        weight=jnp.asarray(pad_images([photo.mask for photo in photos], height, width)) / 255,
     )
 
 

@@ -84,13 +84,17 @@ def procedural_scene(
         rgb = jnp.asarray(capture[f"{split}_rgb"])
         cameras = _cameras(capture[f"{split}_poses"], width, height)
         splits[split] = Views(cameras, rgb, jnp.ones(rgb.shape[:3], jnp.float32))
-    if noise or exposure_jitter or pose_noise:
+    degraded = bool(noise or exposure_jitter or pose_noise)
+    if degraded:
         splits["train"] = _degrade(
             splits["train"], _rng(name, 2), noise, exposure_jitter, pose_noise
         )
 
     def surface(camera: Camera) -> Surface:
         return _render_surface(_world(name), camera)
+
+    def photographs_at(factor: int) -> Views:
+        return procedural_scene(name, downscale=factor).train
 
     return Scene(
         name=name,
@@ -109,6 +113,7 @@ def procedural_scene(
             "subjects": capture["subjects"].tolist(),
         },
         surface=surface,
+        photographs_at=None if degraded else photographs_at,
     )
 
 

@@ -1,0 +1,331 @@
+"""Gather: what photographs that see the points of a view show there, read at the view's detail.
+
+Any field and any values: colors make a view from photographs alone, residuals (photograph minus
+render) show what the photographs know beyond a model.
+"""
+
+from typing import NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxcloseup.geometry.cameras import Camera, pixels_to_points, points_to_pixels
+from jaxcloseup.geometry.warp import backward_warp
+from jaxcloseup.numerics import matmul, safe_divide, safe_norm
+from jaxcloseup.photographs import camera_at
+from jaxcloseup.pyramids import Pyramid
+
+
+_CHUNK = 4096  # points that are culled together
+_WIDEST = 10  # angles in units of `angle_scale`, beyond which all weigh alike
+_COARSEST = 64  # footprints beyond which all weigh alike
+
+
+@struct.dataclass
+class GatherSources:
+    """Depth maps that confirm what photographs see, V views.
+
+    Attributes:
+      cameras: stacked cameras of the depth maps.
+      inverse_depth: `[V, H, W]` 1 / z-depth, 0 where undefined.
+      trust: `[V, H, W]` in [0, 1], 0 where the photograph does not count or its depth has an edge.
+    """
+
+    cameras: Camera
+    inverse_depth: jax.Array
+    trust: jax.Array
+
+
+class GatherSettings(NamedTuple):
+    """How photographs are weighed.
+
+    Attributes:
+      tolerance: relative difference of depths at which a photograph no longer sees a point.
+      angle_scale: angle in radians between two rays at which a photograph's weight falls to 1 / e.
+      finer: levels by which values are read finer than the view's pixels: interpolation blurs.
+      robust: 0 averages all alike; at 1, a photograph that differs from the others by their
+        standard deviation has a quarter of its weight.
+    """
+
+    tolerance: float = 0.08
+    angle_scale: float = 0.05
+    finer: float = 0.3
+    robust: float = 0.0
+
+
+DEFAULT = GatherSettings()
+
+
+class Gathered(NamedTuple):
+    """What the photographs show at points `[...]`; 0 where none sees a point.
+
+    Attributes:
+      mean: `[..., C]` weighted mean of the values.
+      weight: `[...]` sum of the weights.
+      variance: `[...]` weighted variance between the photographs, the mean over channels.
+      count: `[...]` number of photographs that see the point, each counted in [0, 1] by how surely.
+      footprint: `[...]` side of the finest pixel on the surface, in pixels of the view; infinity
+        where no photograph sees the point.
+      detail: `[...]` weighted mean of -log2 of all these photographs' footprints.
+      angle: `[...]` weighted mean of the angle between the rays, radians.
+    """
+
+    mean: jax.Array
+    weight: jax.Array
+    variance: jax.Array
+    count: jax.Array
+    footprint: jax.Array
+    detail: jax.Array
+    angle: jax.Array
+
+
+def gather_sources(
+    cameras: Camera, depths: jax.Array, weight: jax.Array, *, edge: float = 0.2
+) -> GatherSources:
+    """Prepare depth maps for `gather`, once for many views.
+
+    Inverse depth is linear over a plane, so its second difference, relative to the inverse depth
+    itself, shows the edges of a depth map and nothing else.
+
+    Args:
+      cameras: stacked cameras of the depth maps.
+      depths: `[V, H, W]` z-depths; 0 is undefined.
+      weight: `[V, H, W]` weights of the photographs in [0, 1].
+      edge: relative second difference at which a pixel, and its neighbors, have 1 / 4 of their
+        trust.
+    """
+    chex.assert_equal_shape([depths, weight])
+    inverse = safe_divide(jnp.ones_like(depths), depths)
+    bend = jnp.zeros_like(inverse)
+    for axis in (1, 2):
+        size = inverse.shape[axis]
+        if size > 2:
+            before, here, after = (
+                jax.lax.slice_in_dim(inverse, start, start + size - 2, axis=axis)
+                for start in (0, 1, 2)
+            )
+            inner = tuple(slice(1, -1) if i == axis else slice(None) for i in range(3))
+            bend = bend.at[inner].max(jnp.abs(before + after - 2 * here))
+    trust = weight / (1 + (safe_divide(bend, inverse) / edge) ** 2) ** 2
+    trust = jnp.where(depths > 0, trust, 0)
+    trust = jax.lax.reduce_window(trust, jnp.inf, jax.lax.min, (1, 3, 3), (1, 1, 1), "SAME")
+    return GatherSources(cameras, inverse, trust)
+
+
+def gather(
+    camera: Camera,
+    pixels: jax.Array,
+    depth: jax.Array,
+    sources: GatherSources,
+    pyramid: Pyramid,
+    settings: GatherSettings = DEFAULT,
+    *,
+    exclude: jax.Array | int = -1,
+    finest: jax.Array | int = 0,
+) -> Gathered:
+    """Average what the photographs show at the surface of a view.
+
+    A photograph sees a point where its own depth map, interpolated, confirms the point's z-depth,
+    away from the map's edges. Its value is read bilinearly from the two levels of the pyramid whose
+    pixels on the surface are next in size to the view's. Its weight is exp(-angle / angle_scale),
+    divided by the square of the footprint of its finest pixel where that is above 1.
+
+    Args:
+      camera: camera of the view.
+      pixels: `[..., 2]` pixel centers of the view.
+      depth: `[...]` their z-depth; 0 is undefined.
+      sources: depth maps of the photographs.
+      pyramid: values of the same photographs.
+      settings: see there.
+      exclude: index of a photograph to leave out; -1 leaves out none.
+      finest: the first level to read, as if there were no finer one.
+
+    Returns:
+      `Gathered` of the pixels `[...]`. `mean` is differentiable in float values and in `depth`,
+      which no photograph's choice of level or of photographs makes discontinuous.
+    """
+    chex.assert_equal_shape_prefix([pixels, depth], depth.ndim)
+    defined = (depth > 0) & jnp.isfinite(depth)
+    points = pixels_to_points(camera, pixels, jnp.where(defined, depth, 1)).reshape(-1, 3)
+    side = jnp.where(defined, depth, 0).reshape(-1) / _focal(camera.intrinsics)
+    count = side.size
+    chunk = min(_CHUNK, count)
+    pad = -count % chunk
+    points = jnp.pad(points, ((0, pad), (0, 0))).reshape(-1, chunk, 3)
+    side = jnp.pad(side, (0, pad)).reshape(-1, chunk)
+    reader = _Reader(camera.position, sources, pyramid, settings, finest)
+    found = jax.lax.map(lambda data: _gather_chunk(*data, reader, exclude), (points, side))
+
+    def restore(array):
+        array = array.reshape(-1, *array.shape[2:])[:count]
+        return array.reshape(*depth.shape, *array.shape[1:])
+
+    return jax.tree.map(restore, found)
+
+
+class _Reader(NamedTuple):
+    """What reading one photograph needs."""
+
+    position: jax.Array
+    sources: GatherSources
+    pyramid: Pyramid
+    settings: GatherSettings
+    finest: jax.Array | int
+
+
+class _Sums(NamedTuple):
+    weight: jax.Array
+    values: jax.Array
+    squares: jax.Array
+    count: jax.Array
+    footprint: jax.Array
+    detail: jax.Array
+    angle: jax.Array
+
+
+def _gather_chunk(points, side, reader, exclude):
+    """`Gathered` of points `[N, 3]` that are visited together; `side` 0 marks undefined ones."""
+    views = jnp.arange(reader.sources.trust.shape[0])
+    may_see = jax.vmap(lambda camera: _may_see(camera, points, side))(reader.sources.cameras)
+    may_see &= views != exclude
+
+    def sums(reference):
+        def add(so_far, item):
+            view, visible = item
+            return jax.lax.cond(
+                visible,
+                lambda: _add_view(so_far, points, side, view, reader, reference),
+                lambda: so_far,
+            ), None
+
+        none, channels = jnp.zeros(side.shape, points.dtype), reader.pyramid.values.shape[-1]
+        zero = jnp.zeros((*side.shape, channels), points.dtype)
+        start = _Sums(none, zero, none, none, jnp.full_like(none, jnp.inf), none, none)
+        return _finish(jax.lax.scan(add, start, (views, may_see))[0])
+
+    found = sums(None)
+    if reader.settings.robust:
+        robust = sums((found.mean, found.variance))
+        found = found._replace(mean=robust.mean, weight=robust.weight)
+    return found
+
+
+def _finish(sums: _Sums) -> Gathered:
+    mean = safe_divide(sums.values, sums.weight[:, None])
+    squares = safe_divide(sums.squares, sums.weight)
+    return Gathered(
+        mean,
+        sums.weight,
+        jnp.maximum(squares - jnp.mean(mean * mean, axis=-1), 0),
+        sums.count,
+        sums.footprint,
+        safe_divide(sums.detail, sums.weight),
+        safe_divide(sums.angle, sums.weight),
+    )
+
+
+def _add_view(sums, points, side, view, reader, reference):
+    sources, settings = reader.sources, reader.settings
+    source = camera_at(sources.cameras, view)
+    landed, depth = points_to_pixels(source, points)
+    maps = jnp.stack([sources.inverse_depth[view], sources.trust[view]], axis=-1)
+    inverse, trust = jnp.moveaxis(backward_warp(maps, landed), -1, 0)
+    difference = (depth * inverse - 1) / settings.tolerance
+    seen = trust * jnp.maximum(1 - difference * difference, 0) ** 2
+    seen = jnp.where((side > 0) & (depth > 0), seen, 0)
+
+    intrinsics = reader.pyramid.intrinsics[view]
+    alike = jnp.where((side > 0) & (depth > 0), depth, 1)
+    own = jnp.where(side > 0, side, 1)
+    # log2 of the footprint of the finest level's pixel, and of the finest that is read.
+    size = jnp.log2(alike / own) - jnp.log2(_focal(intrinsics[0]))
+    sharpest = size + jnp.asarray(reader.finest, size.dtype)
+    angle = _angle(points - reader.position[None], points - source.position[None])
+    weight = seen * jnp.exp(-jnp.minimum(angle / settings.angle_scale, _WIDEST))
+    footprint = jnp.exp2(sharpest)
+    weight = weight / jnp.clip(footprint, 1, _COARSEST) ** 2
+
+    last = len(reader.pyramid.sizes) - 1
+    level = jnp.clip(-size - settings.finer, jnp.asarray(reader.finest, size.dtype), last)
+    ray = (landed - source.intrinsics[None, 2:]) / source.intrinsics[None, :2]
+    value = _read(reader.pyramid, view, ray, level)
+    if reference is not None:
+        mean, variance = reference
+        apart = jnp.mean((value - mean) ** 2, axis=-1)
+        apart = settings.robust * safe_divide(apart, variance)
+        weight = weight / (1 + apart) ** 2
+    return _Sums(
+        sums.weight + weight,
+        sums.values + weight[:, None] * value,
+        sums.squares + weight * jnp.mean(value * value, axis=-1),
+        sums.count + seen,
+        jnp.where(seen > 0, jnp.minimum(sums.footprint, footprint), sums.footprint),
+        sums.detail - weight * sharpest,
+        sums.angle + weight * angle,
+    )
+
+
+def _read(pyramid, view, ray, level):
+    """Values `[N, C]` of one view at rays (x / z, y / z) `[N, 2]` and fractional levels `[N]`."""
+    sizes = jnp.asarray(pyramid.sizes, jnp.int32)
+    starts = jnp.cumsum(sizes[:, 0] * sizes[:, 1]) - sizes[:, 0] * sizes[:, 1]
+    finer = jnp.floor(jax.lax.stop_gradient(level)).astype(jnp.int32)
+    share = (level - finer.astype(level.dtype))[:, None]
+
+    def read(index):
+        index = jnp.minimum(index, len(pyramid.sizes) - 1)
+        height, width = sizes[index, 0], sizes[index, 1]
+        intrinsics = pyramid.intrinsics[view][index]
+        pixel = ray * intrinsics[:, :2] + intrinsics[:, 2:] - 0.5
+        corner = jnp.floor(jax.lax.stop_gradient(pixel))
+        wx, wy = jnp.moveaxis(pixel - corner, -1, 0)
+        x, y = jnp.moveaxis(jnp.clip(corner, -2.0, 2.0**20).astype(jnp.int32), -1, 0)
+
+        def tap(dx, dy):
+            row, column = jnp.clip(y + dy, 0, height - 1), jnp.clip(x + dx, 0, width - 1)
+            return to_unit(pyramid.values[view, starts[index] + row * width + column])
+
+        top = (1 - wx)[:, None] * tap(0, 0) + wx[:, None] * tap(1, 0)
+        bottom = (1 - wx)[:, None] * tap(0, 1) + wx[:, None] * tap(1, 1)
+        return (1 - wy)[:, None] * top + wy[:, None] * bottom
+
+    return (1 - share) * read(finer) + share * read(finer + 1)
+
+
+def to_unit(values: jax.Array) -> jax.Array:
+    """Values of a pyramid as floats: uint8 in [0, 1], int8 in [-1, 1], floats as they are."""
+    if jnp.issubdtype(values.dtype, jnp.floating):
+        return values
+    return values.astype(jnp.float32) / jnp.iinfo(values.dtype).max
+
+
+def _may_see(camera, points, side):
+    """Whether the sphere around points `[N, 3]` meets the camera's view: `[]`, never wrongly no."""
+    known = side > 0
+    number = jnp.sum(known, dtype=points.dtype)
+    center = jnp.sum(jnp.where(known[:, None], points, 0), axis=0) / jnp.maximum(number, 1)
+    apart = jnp.where(known, jnp.linalg.norm(points - center[None], axis=-1), 0)
+    radius = jnp.max(apart)
+    x, y, z = matmul(center - camera.position, camera.rotation)
+    fx, fy, cx, cy = camera.intrinsics
+    planes = (
+        *(((fx, cx), x), ((-fx, camera.width - cx), x)),
+        *(((fy, cy), y), ((-fy, camera.height - cy), y)),
+    )
+    inside = z > -radius
+    for (slope, offset), across in planes:
+        inside &= slope * across + offset * z >= -radius * jnp.hypot(slope, offset)
+    return inside & (number > 0)
+
+
+def _angle(ours, theirs):
+    """Angle `[N]` between vectors `[N, 3]`, with a finite gradient where they are parallel."""
+    ours, theirs = (safe_divide(v, safe_norm(v, keepdims=True)) for v in (ours, theirs))
+    return 2 * jnp.arcsin(jnp.minimum(safe_norm(ours - theirs) / 2, 0.999))
+
+
+def _focal(intrinsics):
+    """Geometric mean of fx and fy, `[]` pixels."""
+    return jnp.sqrt(intrinsics[..., 0] * intrinsics[..., 1])

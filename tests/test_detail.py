@@ -1,0 +1,129 @@
+"""Detail: weights that evidence teaches, renders that come nearer to the truth, a kept file."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments.training import detail as training_detail
+from experiments.training.detail import detail_path, detailed, find_detail
+from experiments.training.stored_run import load_run_scene, read_run, restore
+from jaxcloseup.detail import Evidence, learn_weights, predict, reliability
+from jaxcloseup.photographs import camera_at, to_float
+from jaxcloseup.pyramids import scene_pyramid
+from jaxcloseup.scenes import load_scene
+
+
+def made_up(share, count=20_000, seed=0):
+    """Evidence whose true share of the gathered residual is `share(feature)`, plus noise."""
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(0, 1, count)
+    features = np.stack([np.ones(count), x, x**2], axis=-1).astype(np.float32)
+    gathered = rng.normal(0, 0.1, (count, 3))
+    residual = share(x)[:, None] * gathered + rng.normal(0, 0.02, (count, 3))
+    power, product = (gathered**2).sum(-1), (gathered * residual).sum(-1)
+    return Evidence(features, power.astype(np.float32), product.astype(np.float32)), x
+
+
+@pytest.mark.parametrize(
+    "share", [lambda x: 0.2 + 0.6 * x, lambda x: 1 / (1 + np.exp(12 * (x - 0.5)))]
+)
+def test_weights_are_the_share_that_is_there(share):
+    found, x = made_up(share)
+    weights = learn_weights([[found]])
+    predicted = np.asarray(predict(weights, jnp.asarray(found.features)))
+    assert np.abs(predicted - share(x)).mean() < 0.05
+    other, _ = made_up(share, seed=1)
+    for power, guessed, actual, count in reliability(weights, [other]):
+        if count > 300:
+            assert guessed / power == pytest.approx(actual / power, abs=0.05)
+
+
+def test_weights_stay_in_their_range_and_need_evidence():
+    found, _ = made_up(lambda x: 3 * x - 1)
+    predicted = predict(learn_weights([[found]]), jnp.asarray(found.features))
+    assert float(predicted.min()) == 0 and float(predicted.max()) == 1
+    none = found._replace(power=0 * found.power, product=0 * found.product)
+    assert not np.asarray(predict(learn_weights([[none]]), jnp.asarray(found.features))).any()
+
+
+@pytest.fixture(scope="module")
+def rendered(kept, tmp_path_factory):
+    """The run's programs, its state blurred, and where its detail is kept."""
+    with jax.numpy_dtype_promotion("standard"):
+        record = read_run(kept)
+        scene = load_run_scene(record)
+        programs, state = restore(record, scene, "closeup")
+    wide = state.params.replace(log_scales=state.params.log_scales + 0.4)
+    return (
+        programs,
+        state.replace(params=wide),
+        detail_path(tmp_path_factory.mktemp("run"), "closeup"),
+    )
+
+
+@pytest.fixture(scope="module")
+def found(rendered):
+    programs, state, path = rendered
+    return find_detail(programs, state, path)
+
+
+def test_renders_with_detail_come_nearer_to_the_truth(rendered, found):
+    programs, state, _ = rendered
+    detail, about = found
+    assert about["divisor"] == 1 and len(about["reliability"]) >= 1
+    for views in (programs.scene.test, programs.scene.test_far):
+        camera, truth = camera_at(views.cameras, 0), to_float(views.rgb[0])
+        seen = programs.render(state, camera)
+        sharper = detailed(programs, detail, camera, seen)
+        solid = np.asarray(seen.alpha) > 0.9
+        before, after = (
+            np.abs(np.asarray(rgb) - np.asarray(truth))[solid].mean()
+            for rgb in (seen.rgb, sharper.rgb)
+        )
+        assert after < 0.9 * before
+        weight = np.asarray(sharper.weight)
+        assert weight.min() >= 0 and weight.max() <= 1
+        # Nothing is added where nothing was rendered.
+        hole = seen._replace(alpha=jnp.zeros_like(seen.alpha), depth=jnp.zeros_like(seen.depth))
+        alone = detailed(programs, detail, camera, hole)
+        np.testing.assert_array_equal(alone.rgb, jnp.clip(seen.rgb, 0, 1))
+        assert not np.asarray(alone.weight).any()
+
+
+def test_detail_is_kept_with_its_state_and_made_again_for_another(rendered, found, monkeypatch):
+    programs, state, path = rendered
+    monkeypatch.setattr(training_detail, "make_detail", lambda *_: pytest.fail("made again"))
+    again, about = find_detail(programs, state, path)
+    assert about["reliability"] == found[1]["reliability"]
+    jax.tree.map(np.testing.assert_array_equal, again, found[0])
+
+    made = []
+    monkeypatch.setattr(training_detail, "make_detail", lambda *_: made.append(1) or found)
+    other = state.replace(params=state.params.replace(sh=0.9 * state.params.sh))
+    find_detail(programs, other, path)
+    find_detail(programs, other, path)
+    assert len(made) == 1
+    path.write_bytes(path.read_bytes()[:100])
+    find_detail(programs, other, path)
+    assert len(made) == 2
+
+
+def test_a_scene_is_read_at_the_finest_size_that_fits(capture_folder):
+    scene = load_scene(str(capture_folder), downscale=4)
+    assert scene.train.rgb.shape[1:3] == (6, 8)
+    pyramid, divisor = scene_pyramid(scene, finest=1)
+    assert divisor == 1 and pyramid.sizes == ((24, 32), (12, 16), (6, 8))
+    whole = load_scene(str(capture_folder))
+    np.testing.assert_array_equal(pyramid.level(0)[..., :3], whole.train.rgb)
+    np.testing.assert_array_equal(pyramid.intrinsics[:, 0], whole.train.cameras.intrinsics)
+    size = 5 * 24 * 32 * 4 * 4 / 3
+    assert scene_pyramid(scene, finest=1, budget=int(size) - 1)[1] == 2
+    assert scene_pyramid(scene, finest=1, budget=int(size / 4) - 1)[1] == 3
+    assert scene_pyramid(scene, finest=1, budget=1)[1] == 4  # what training reads anyway
+
+
+def test_held_out_parts_of_photographs_are_not_read(capture_folder):
+    scene = load_scene(str(capture_folder), split="zoom", zoom=2)
+    assert scene.photographs_at is None
+    assert scene_pyramid(scene, finest=1)[0].sizes[0] == scene.train.rgb.shape[1:3]
