@@ -19,7 +19,7 @@ from jaxcloseup.pyramids import Pyramid
 
 
 _CHUNK = 4096  # points that are culled together
-_WIDEST = 10  # angles in units of `angle_scale`, beyond which all weigh alike
+_WIDEST = 20  # angles in units of `angle_scale`, beyond which all weigh alike
 _COARSEST = 64  # footprints beyond which all weigh alike
 
 

@@ -225,7 +225,7 @@ def gather_view(
     angle = np.arccos(min(np.dot(*rays), 1))
     footprints = [z / np.sqrt(fx * fy) / side for fx, fy, _, _ in level_intrinsics]
     footprint = footprints[finest]
-    weight = seen * np.exp(-angle / settings.angle_scale) / max(footprint, 1) ** 2
+    weight = seen * np.exp(-min(angle / settings.angle_scale, 20)) / max(footprint, 1) ** 2
     level = min(max(-np.log2(footprints[0]) - settings.finer, finest), len(levels) - 1)
     value = 0
     for i, image in enumerate(levels):
