@@ -47,7 +47,7 @@ ROOMS = {
     "training": {"methods", "evaluation", "command_line"},
     "reporting": {"methods", "evaluation", "training"},
     "viewing": {"methods", "evaluation", "training"},
-    "benchmarks": {"methods", "evaluation", "training", "reporting"},
+    "benchmarks": {"methods", "evaluation", "training", "reporting", "viewing"},
     "command_line": set(),
 }
 LIBRARIES_OF_GEOMETRY = {"jax", "chex", "flax", "typing", "jaxcloseup"}

@@ -4,6 +4,7 @@ Everything is made from the state and its training photographs, so a run keeps i
 where they have changed.
 """
 
+import dataclasses
 import hashlib
 import io
 import json
@@ -42,6 +43,7 @@ from jaxcloseup.metrics import fit_colors
 from jaxcloseup.numerics import matmul
 from jaxcloseup.photographs import camera_at
 from jaxcloseup.pyramids import Pyramid, scene_pyramid
+from jaxcloseup.scene import SceneError
 from jaxcloseup.train import TrainState
 
 
@@ -121,7 +123,12 @@ def make_detail(programs: Programs, state: TrainState) -> tuple[Detail, dict[str
     """Render the residuals of all photographs, and learn from left-out ones how to weigh them."""
     scene = programs.scene
     finest = max(1, programs.preset.downscale // FINER)
-    pyramid, divisor = scene_pyramid(scene, finest=finest)
+    try:
+        pyramid, divisor = scene_pyramid(scene, finest=finest)
+    except SceneError as error:  # such as full-size photographs that were not kept
+        print(f"   detail has only the photographs that training reads: {error}")
+        alone = dataclasses.replace(scene, photographs_at=None)
+        pyramid, divisor = scene_pyramid(alone, finest=finest)
     (height, width), *_ = pyramid.sizes
     share = f"1 / {divisor} of their size" if divisor > 1 else "their own size"
     print(f"   detail of photographs of {width} x {height} pixels, {share}", flush=True)

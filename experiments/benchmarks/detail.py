@@ -1,0 +1,100 @@
+"""Detail of the newest run of surfels on `table` in `outputs`: flicker of a dolly, and seconds.
+
+*Flicker* is the mean absolute difference between neighboring frames, warped onto each other with
+the rendered depth. Frames with detail also differ by what the warp's interpolation takes from them;
+`floor` is what it takes from a still image, a frame moved by half a pixel and back.
+"""
+
+import itertools
+import pathlib
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.training.detail import detail_path, detailed, find_detail
+from experiments.training.stored_run import choose_stage, load_run_scene, read_run, restore
+from experiments.viewing.camera_paths import dolly, resized
+from jaxcloseup.geometry import backward_warp, pixel_grid, warp_to
+from jaxcloseup.label_rules import label_depth
+from jaxcloseup.photographs import camera_at
+
+
+FRAMES, WIDTH, REPEATS = 60, 240, 5
+VIEWS = (3, 25, 47)  # training photographs from which dollies start
+
+
+def run() -> None:
+    """Print flicker with and without detail, and the seconds of both halves of a view."""
+    runs = sorted(pathlib.Path("outputs/table/surfels").glob("*/manifest.json"))
+    if not runs:
+        sys.exit(
+            "experiments.bench: no run of table: run `python -m experiments.run --scene=table`"
+        )
+    record = read_run(runs[-1].parent)
+    stage = choose_stage(record, None)
+    scene = load_run_scene(record)
+    programs, state = restore(record, scene, stage)
+    detail, _ = find_detail(programs, state, detail_path(record.folder, stage))
+
+    def shoot(camera):
+        seen = programs.render(state, camera)
+        depth = label_depth(seen, near=0, far=scene.far)
+        return camera, depth, jnp.clip(seen.rgb, 0, 1), detailed(programs, detail, camera, seen).rgb
+
+    for view in VIEWS:
+        camera = camera_at(scene.train.cameras, view)
+        middle = camera.width / 2, camera.height / 2
+        seen = label_depth(programs.render(state, camera), near=0, far=scene.far)
+        depth = float(seen[camera.height // 2, camera.width // 2])
+        shots = dolly(camera, middle, depth, magnification=4, frames=FRAMES)
+        cameras = resized(shots.cameras, WIDTH, None)
+        frames = [shoot(camera_at(cameras, i)) for i in range(FRAMES)]
+        pairs = list(itertools.pairwise(frames))
+        (plain, plain_floor), (sharp, sharp_floor) = (
+            np.mean([_flicker(before, after, kind) for before, after in pairs], axis=0)
+            for kind in (2, 3)
+        )
+        print(
+            f"dolly from {scene.names['train'][view]}: without detail {plain:.5f} (floor "
+            f"{plain_floor:.5f}), with detail {sharp:.5f} (floor {sharp_floor:.5f}), "
+            f"ratio {sharp / plain:.2f}, beyond the floor {sharp - sharp_floor:.5f} and "
+            f"{plain - plain_floor:.5f}"
+        )
+    large = resized(cameras, 480, None)
+    camera = camera_at(large, FRAMES // 2)
+    seen = jax.block_until_ready(programs.render(state, camera))
+    works = {
+        "render": lambda: programs.render(state, camera),
+        "detail": lambda: detailed(programs, detail, camera, seen),
+    }
+    for work in works.values():
+        jax.block_until_ready(work())
+    seconds: dict[str, list[float]] = {name: [] for name in works}
+    for _ in range(REPEATS):
+        for name, work in works.items():
+            start = time.perf_counter()
+            jax.block_until_ready(work())
+            seconds[name].append(time.perf_counter() - start)
+    middle = {name: float(np.median(taken)) for name, taken in seconds.items()}
+    print(
+        f"{camera.width} x {camera.height}: "
+        + ", ".join(f"{n} {s:.2f} s" for n, s in middle.items())
+    )
+
+
+_warp = jax.jit(warp_to)
+_read = jax.jit(backward_warp)
+
+
+def _flicker(before, after, kind):
+    """Mean difference of two frames, and that of the second from itself, moved there and back."""
+    camera, depth = after[:2]
+    moved = _warp(before[kind], before[0], camera, depth, source_depth=before[1], tolerance=0.02)
+    valid = np.asarray(moved.valid)
+    grid = pixel_grid(camera.height, camera.width)
+    there = _read(_read(after[kind], grid + 0.25), grid - 0.25)
+    differences = (jnp.abs(image - after[kind]).mean(-1) for image in (moved.image, there))
+    return [float(np.asarray(difference)[valid].mean()) for difference in differences]
