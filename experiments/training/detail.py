@@ -48,6 +48,7 @@ from jaxcloseup.train import TrainState
 
 
 FINER = 4  # how many times finer than in training photographs are read, if they are so fine
+FINER_RAYS = 2  # the same for fields that render single rays, and so whole images slowly
 LEFT_OUT = 20  # photographs that teach the weights
 WINDOW = 64  # side in pixels of what is compared of such a photograph at once
 FOLDS = 5
@@ -122,7 +123,8 @@ def detail_path(folder: pathlib.Path, stage: str) -> pathlib.Path:
 def make_detail(programs: Programs, state: TrainState) -> tuple[Detail, dict[str, Any]]:
     """Render the residuals of all photographs, and learn from left-out ones how to weigh them."""
     scene = programs.scene
-    finest = max(1, programs.preset.downscale // FINER)
+    most = FINER_RAYS if programs.method.renders_pixels else FINER
+    finest = max(1, programs.preset.downscale // most)
     try:
         pyramid, divisor = scene_pyramid(scene, finest=finest)
     except SceneError as error:  # such as full-size photographs that were not kept
