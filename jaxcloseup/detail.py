@@ -28,7 +28,7 @@ TENTHS = 10
 _NEAREST, _FARTHEST = -1.0, 3.0  # log2 of how much finer views are than photographs can imitate
 _KNOTS = 20  # of the monotone curve, each with an equal share of the evidence
 _RIDGE = 1e-3
-_FOLDS = 5
+FOLDS = 5
 
 
 @struct.dataclass
@@ -181,7 +181,7 @@ def learn_weights(photographs: Sequence[Sequence[Evidence]]) -> DetailWeights:
     """
     sums = [_normal_equations(found) for found in photographs]
     total = [sum(parts) for parts in zip(*sums, strict=True)]
-    folds = min(_FOLDS, len(photographs))
+    folds = min(FOLDS, len(photographs))
     columns = []
     for fold in range(folds):
         others = [parts for i, parts in enumerate(sums) if i % folds != fold] or sums
@@ -236,8 +236,8 @@ def predict(weights: DetailWeights, features: jax.Array) -> jax.Array:
 def reliability(weights: DetailWeights, found: Sequence[Evidence]) -> np.ndarray:
     """Sums `[10, 4]` over the pixels of each tenth of the prediction.
 
-    Of the power; of the power times the predicted share; of the product, which is the power times
-    the actual share; and the number of pixels.
+    The columns sum the power, the power times the predicted share, and the product (the power times
+    the actual share); the last one counts pixels.
     """
     sums = np.zeros((TENTHS, 4))
     for one in found:

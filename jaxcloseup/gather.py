@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxcloseup.geometry.cameras import Camera, pixels_to_points, points_to_pixels
+from jaxcloseup.geometry.cameras import Camera, mean_focal, pixels_to_points, points_to_pixels
 from jaxcloseup.geometry.warp import backward_warp
 from jaxcloseup.numerics import matmul, safe_divide, safe_norm
-from jaxcloseup.photographs import camera_at
+from jaxcloseup.photographs import camera_at, to_float
 from jaxcloseup.pyramids import Pyramid
 
 
@@ -149,7 +149,7 @@ def gather(
     chex.assert_equal_shape_prefix([pixels, depth], depth.ndim)
     defined = (depth > 0) & jnp.isfinite(depth)
     points = pixels_to_points(camera, pixels, jnp.where(defined, depth, 1)).reshape(-1, 3)
-    side = jnp.where(defined, depth, 0).reshape(-1) / _focal(camera.intrinsics)
+    side = jnp.where(defined, depth, 0).reshape(-1) / mean_focal(camera.intrinsics)
     count = side.size
     chunk = min(_CHUNK, count)
     pad = -count % chunk
@@ -240,7 +240,7 @@ def _add_view(sums, points, side, view, reader, reference):
     alike = jnp.where((side > 0) & (depth > 0), depth, 1)
     own = jnp.where(side > 0, side, 1)
     # log2 of the footprint of the finest level's pixel, and of the finest that is read.
-    size = jnp.log2(alike / own) - jnp.log2(_focal(intrinsics[0]))
+    size = jnp.log2(alike / own) - jnp.log2(mean_focal(intrinsics[0]))
     sharpest = size + jnp.asarray(reader.finest, size.dtype)
     angle = _angle(points - reader.position[None], points - source.position[None])
     weight = seen * jnp.exp(-jnp.minimum(angle / settings.angle_scale, _WIDEST))
@@ -285,20 +285,13 @@ def _read(pyramid, view, ray, level):
 
         def tap(dx, dy):
             row, column = jnp.clip(y + dy, 0, height - 1), jnp.clip(x + dx, 0, width - 1)
-            return to_unit(pyramid.values[view, starts[index] + row * width + column])
+            return to_float(pyramid.values[view, starts[index] + row * width + column])
 
         top = (1 - wx)[:, None] * tap(0, 0) + wx[:, None] * tap(1, 0)
         bottom = (1 - wx)[:, None] * tap(0, 1) + wx[:, None] * tap(1, 1)
         return (1 - wy)[:, None] * top + wy[:, None] * bottom
 
     return (1 - share) * read(finer) + share * read(finer + 1)
-
-
-def to_unit(values: jax.Array) -> jax.Array:
-    """Values of a pyramid as floats: uint8 in [0, 1], int8 in [-1, 1], floats as they are."""
-    if jnp.issubdtype(values.dtype, jnp.floating):
-        return values
-    return values.astype(jnp.float32) / jnp.iinfo(values.dtype).max
 
 
 def _may_see(camera, points, side):
@@ -324,8 +317,3 @@ def _angle(ours, theirs):
     """Angle `[N]` between vectors `[N, 3]`, with a finite gradient where they are parallel."""
     ours, theirs = (safe_divide(v, safe_norm(v, keepdims=True)) for v in (ours, theirs))
     return 2 * jnp.arcsin(jnp.minimum(safe_norm(ours - theirs) / 2, 0.999))
-
-
-def _focal(intrinsics):
-    """Geometric mean of fx and fy, `[]` pixels."""
-    return jnp.sqrt(intrinsics[..., 0] * intrinsics[..., 1])

@@ -45,9 +45,9 @@ class Batch(NamedTuple):
 
 
 def to_float(rgb: jax.Array) -> jax.Array:
-    """Colors as float32 in [0, 1], from uint8 or from float."""
-    if rgb.dtype == jnp.uint8:
-        return rgb.astype(jnp.float32) / 255
+    """Colors as float32 in [0, 1] from uint8, or in [-1, 1] from int8; floats as they are."""
+    if rgb.dtype in (jnp.uint8, jnp.int8):
+        return rgb.astype(jnp.float32) / jnp.iinfo(rgb.dtype).max
     return rgb
 
 

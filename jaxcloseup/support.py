@@ -6,7 +6,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxcloseup.geometry.cameras import Camera, pixels_to_points
+from jaxcloseup.geometry.cameras import Camera, mean_focal, pixels_to_points
 from jaxcloseup.geometry.visibility import sample_where_visible
 from jaxcloseup.numerics import safe_divide
 from jaxcloseup.photographs import Views
@@ -59,7 +59,7 @@ def find_support(
     """
     chex.assert_equal_shape_prefix([pixels, depth], depth.ndim)
     points = pixels_to_points(camera, pixels, depth)
-    own_side = safe_divide(depth, _focal(camera))
+    own_side = safe_divide(depth, mean_focal(camera.intrinsics))
 
     def add_view(found, view):
         source, view_depth, weight = view
@@ -67,7 +67,7 @@ def find_support(
             source, view_depth, weight, points, tolerance
         )
         saw = (depth > 0) & (weight > 0)
-        footprint = safe_divide(landed_depth / _focal(source), own_side)
+        footprint = safe_divide(landed_depth / mean_focal(source.intrinsics), own_side)
         finest = jnp.where(saw, jnp.minimum(found.footprint, footprint), found.footprint)
         return Support(found.count + saw.astype(jnp.int32), finest), None
 
@@ -86,8 +86,3 @@ def count_seen(
 ) -> jax.Array:
     """The `count` of `find_support` alone, `[...]` int32."""
     return find_support(camera, pixels, depth, views, depths, tolerance=tolerance).count
-
-
-def _focal(camera):
-    """Geometric mean of fx and fy, `[]` pixels."""
-    return jnp.sqrt(camera.intrinsics[0] * camera.intrinsics[1])

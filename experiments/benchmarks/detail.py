@@ -2,7 +2,7 @@
 
 *Flicker* is the mean absolute difference between neighboring frames, warped onto each other with
 the rendered depth. Frames with detail also differ by what the warp's interpolation takes from them;
-`floor` is what it takes from a still image, a frame moved by half a pixel and back.
+`floor` is what it takes from a still image, a frame moved by a quarter of a pixel and back.
 """
 
 import itertools

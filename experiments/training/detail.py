@@ -23,6 +23,7 @@ import jaxcloseup
 from experiments.training.manifest import hash_data
 from experiments.training.programs import Programs
 from jaxcloseup.detail import (
+    FOLDS,
     TENTHS,
     Detail,
     Detailed,
@@ -36,12 +37,12 @@ from jaxcloseup.detail import (
 )
 from jaxcloseup.field import Rendering
 from jaxcloseup.files import write_file
-from jaxcloseup.gather import GatherSources, gather, gather_sources, to_unit
+from jaxcloseup.gather import GatherSources, gather, gather_sources
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.label_rules import label_depth
 from jaxcloseup.metrics import fit_colors
 from jaxcloseup.numerics import matmul
-from jaxcloseup.photographs import camera_at
+from jaxcloseup.photographs import camera_at, to_float
 from jaxcloseup.pyramids import Pyramid, scene_pyramid
 from jaxcloseup.scene import SceneError
 from jaxcloseup.train import TrainState
@@ -51,7 +52,6 @@ FINER = 4  # how many times finer than in training photographs are read, if they
 FINER_RAYS = 2  # the same for fields that render single rays, and so whole images slowly
 LEFT_OUT = 20  # photographs that teach the weights
 WINDOW = 64  # side in pixels of what is compared of such a photograph at once
-FOLDS = 5
 MISFIT = 4  # times the median error at which a photograph has a quarter of its trust
 COLOR_RIDGE = 0.01  # resistance to that map, see `fit_colors`
 WINDOWS = 3  # for each of them, level and imitated distance
@@ -214,7 +214,7 @@ def _match(photograph, rgb, alpha):
     It is the inverse of the best change of the render, because a blurred render tells a photograph
     without bias, and a photograph a blurred render with too little contrast.
     """
-    values = to_unit(photograph)
+    values = to_float(photograph)
     rgb = jnp.clip(rgb, 0, 1)
     # What the model lacks, or has too much, says nothing about exposure.
     error = jnp.mean(jnp.abs(values[..., :3] - rgb), axis=-1)
@@ -230,7 +230,7 @@ def _match(photograph, rgb, alpha):
 
 @jax.jit
 def _subtract(photograph, rgb, colors):
-    values, (matrix, offset) = to_unit(photograph), colors
+    values, (matrix, offset) = to_float(photograph), colors
     weight = values[..., 3]
     matched = matmul(values[..., :3], matrix[None]) + offset[None, None]
     residual = jnp.where(weight[..., None] > 0, matched - jnp.clip(rgb, 0, 1), 0)

@@ -13,6 +13,7 @@ Conventions of every module:
 
 from jaxcloseup.geometry.cameras import (
     Camera,
+    mean_focal,
     pixel_grid,
     pixels_to_points,
     pixels_to_rays,
@@ -49,6 +50,7 @@ __all__ = [
     "four_anchors",
     "in_bounds",
     "matrix_to_euler",
+    "mean_focal",
     "perturb_rotation",
     "pixel_grid",
     "pixels_to_points",

@@ -95,6 +95,11 @@ def points_to_pixels(camera: Camera, points: jax.Array) -> tuple[jax.Array, jax.
     return xy * _match(focal, xy) + _match(center, xy), depth
 
 
+def mean_focal(intrinsics: jax.Array) -> jax.Array:
+    """Geometric mean `[...]` of fx and fy in pixels, of intrinsics `[..., 4]`."""
+    return jnp.sqrt(intrinsics[..., 0] * intrinsics[..., 1])
+
+
 def _check_camera(camera: Camera) -> None:
     chex.assert_shape(camera.camtoworld, (3, 4))
     chex.assert_shape(camera.intrinsics, (4,))
