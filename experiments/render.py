@@ -154,7 +154,9 @@ def _render() -> None:
         start = start_labels(programs, state, record.identity["seed"], expected_depth=expected)
         sources = start.sources if FLAGS.support else None
     if fine_tuned:
-        state = fine_tune(programs, start, shots.cameras, most=FLAGS.target_steps)
+        kept = detail_path(record.folder, stage) if start.state is state else None
+        cameras, most = shots.cameras, FLAGS.target_steps
+        state = fine_tune(programs, start, cameras, most=most, kept=kept)
     detail = None
     if FLAGS.detail:
         # What was fine-tuned for these cameras is not kept, and its detail neither.

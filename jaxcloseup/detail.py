@@ -23,11 +23,11 @@ from jaxcloseup.pyramids import Pyramid
 
 # Interpolation and averaging take contrast: left-out photographs have up to twice the gathered
 # residual where everything else is sure.
-CONTRAST = 2.0
+CONTRAST = 2.5
 TENTHS = 10
 _NEAREST, _FARTHEST = -1.0, 3.0  # log2 of how much finer views are than photographs can imitate
-_KNOTS = 20  # of the monotone curve, each with an equal share of the evidence
-_RIDGE = 1e-3
+_KNOTS = 12  # of the monotone curve, each with an equal share of the evidence
+_RIDGE = 1e-2
 FOLDS = 5
 
 

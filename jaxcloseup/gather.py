@@ -4,6 +4,7 @@ Any field and any values: colors make a view from photographs alone, residuals (
 render) show what the photographs know beyond a model.
 """
 
+import itertools
 from typing import NamedTuple
 
 import chex
@@ -241,14 +242,15 @@ def _add_view(sums, points, side, view, reader, reference):
     own = jnp.where(side > 0, side, 1)
     # log2 of the footprint of the finest level's pixel, and of the finest that is read.
     size = jnp.log2(alike / own) - jnp.log2(mean_focal(intrinsics[0]))
-    sharpest = size + jnp.asarray(reader.finest, size.dtype)
+    coarseness = reader.pyramid.coarseness(view)
+    sharpest = size + coarseness[reader.finest]
     angle = _angle(points - reader.position[None], points - source.position[None])
     weight = seen * jnp.exp(-jnp.minimum(angle / settings.angle_scale, _WIDEST))
     footprint = jnp.exp2(sharpest)
     weight = weight / jnp.clip(footprint, 1, _COARSEST) ** 2
 
-    last = len(reader.pyramid.sizes) - 1
-    level = jnp.clip(-size - settings.finer, jnp.asarray(reader.finest, size.dtype), last)
+    level = _level(-size - settings.finer, coarseness)
+    level = jnp.maximum(level, jnp.asarray(reader.finest, size.dtype))
     ray = (landed - source.intrinsics[None, 2:]) / source.intrinsics[None, :2]
     value = _read(reader.pyramid, view, ray, level)
     if reference is not None:
@@ -265,6 +267,14 @@ def _add_view(sums, points, side, view, reader, reference):
         sums.detail - weight * sharpest,
         sums.angle + weight * angle,
     )
+
+
+def _level(wanted, coarseness):
+    """The fractional level `[N]` that is `wanted[N]` coarser than the finest of `[L]` levels."""
+    level = jnp.zeros_like(wanted)
+    for before, after in itertools.pairwise(coarseness):
+        level += jnp.clip((wanted - before) / (after - before), 0, 1)
+    return level
 
 
 def _read(pyramid, view, ray, level):

@@ -1,4 +1,4 @@
-"""Pyramids: images of several views at a fine size and at halves of it."""
+"""Pyramids: images of several views at a fine size, at halves of it, and as a model reads them."""
 
 import math
 
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.geometry.cameras import Camera, mean_focal
 from jaxcloseup.photographs import Views
 from jaxcloseup.scene import Scene
 
@@ -31,6 +31,11 @@ class Pyramid:
     values: jax.Array
     intrinsics: jax.Array
     sizes: tuple[tuple[int, int], ...] = struct.field(pytree_node=False)
+
+    def coarseness(self, view: int | jax.Array) -> jax.Array:
+        """log2 of how much larger each level's pixels are than the finest ones, `[L]`."""
+        focal = mean_focal(self.intrinsics[view])
+        return jnp.log2(focal[0] / focal)
 
     def pixels_of(self, index: int) -> slice:
         """The pixels of one level, among the P."""
@@ -55,12 +60,11 @@ class Pyramid:
         return camera.replace(intrinsics=intrinsics, height=height, width=width)
 
 
-def scene_pyramid(scene: Scene, *, finest: int, budget: int = BUDGET) -> tuple[Pyramid, int]:
-    """The training photographs of a scene at the finest size that fits, and at halves of it.
+def scene_pyramid(scene: Scene, *, budget: int = BUDGET) -> tuple[Pyramid, int]:
+    """The training photographs of a scene, from the finest size that fits to that of training.
 
     Args:
       scene: a scene whose photographs were divided by `metadata["downscale"]` for training.
-      finest: smallest divisor of the photographs' own size.
       budget: bytes that the pyramid may take; larger photographs are divided more.
 
     Returns:
@@ -68,44 +72,61 @@ def scene_pyramid(scene: Scene, *, finest: int, budget: int = BUDGET) -> tuple[P
     """
     train, coarse = scene.train, scene.metadata.get("downscale", 1)
     pixels = train.weight.size * coarse**2
-    fitting = math.ceil(math.sqrt(pixels * _BYTES_PER_PIXEL / budget))
-    factor = max(finest, fitting)
+    factor = max(1, math.ceil(math.sqrt(pixels * _BYTES_PER_PIXEL / budget)))
     if scene.photographs_at is None or factor >= coarse:
-        factor, views = coarse, train
-    else:
-        views = scene.photographs_at(factor)
-    return photograph_pyramid(views, coarsest=train.cameras.width), factor
+        return photograph_pyramid(train), coarse
+    return photograph_pyramid(scene.photographs_at(factor), train), factor
 
 
-def photograph_pyramid(views: Views, *, coarsest: int) -> Pyramid:
-    """Photographs and halves of them, with their weights: `[V, P, 4]` uint8.
+def photograph_pyramid(views: Views, coarsest: Views | None = None) -> Pyramid:
+    """Photographs, halves of them, and the same photographs as training reads them.
 
-    A half averages 2 x 2 pixels by their weights; a last odd row or column is dropped, so that the
-    intrinsics halve exactly. Pixels without weight are black.
+    The values are `[V, P, 4]` uint8, colors and weight. A half averages 2 x 2 pixels by their
+    weights; a last odd row or column is dropped, so that the intrinsics halve exactly. Pixels
+    without weight are black.
 
     Args:
       views: photographs at the finest size.
-      coarsest: the last level is the first whose width is below 1.5 times this one.
+      coarsest: the last level, after halves that are at least 1.5 times as wide; None makes only
+        one level.
     """
-    images, weight = np.asarray(views.rgb), np.asarray(views.weight)
-    if images.dtype != np.uint8:
-        images = np.rint(np.clip(images, 0, 1) * 255).astype(np.uint8)
-    sizes = [images.shape[1:3]]
-    while sizes[-1][1] >= 1.5 * coarsest and min(sizes[-1]) > 1:
-        sizes.append((sizes[-1][0] // 2, sizes[-1][1] // 2))
+    sizes = [views.rgb.shape[1:3]]
+    if coarsest is not None:
+        while sizes[-1][1] // 2 >= 1.5 * coarsest.cameras.width:
+            sizes.append((sizes[-1][0] // 2, sizes[-1][1] // 2))
+        sizes.append(coarsest.rgb.shape[1:3])
+    images, weight = _bytes(views), np.asarray(views.weight)
     values = np.empty((len(images), sum(h * w for h, w in sizes), 4), np.uint8)
+    halves = sizes if coarsest is None else sizes[:-1]
     for row, image, shares in zip(values, images, weight, strict=True):
-        level = image.astype(np.float32) * (shares > 0)[..., None], shares.astype(np.float32)
+        level = image.astype(np.float32), shares.astype(np.float32)
         start = 0
-        for height, width in sizes:
+        for height, width in halves:
             if level[1].shape != (height, width):
                 level = _halve(*level)
-            whole = np.dstack([level[0], 255 * level[1]])
-            row[start : start + height * width] = np.rint(whole).reshape(-1, 4)
+            row[start : start + height * width] = _pixels(*level)
             start += height * width
-    powers = 2.0 ** -np.arange(len(sizes), dtype=np.float32)
+    powers = 2.0 ** -np.arange(len(halves), dtype=np.float32)
     intrinsics = np.asarray(views.cameras.intrinsics)[:, None] * powers[:, None]
+    if coarsest is not None:
+        last = zip(_bytes(coarsest), np.asarray(coarsest.weight), strict=True)
+        values[:, start:] = [_pixels(*level) for level in last]
+        own = np.asarray(coarsest.cameras.intrinsics)[:, None]
+        intrinsics = np.concatenate([intrinsics, own], axis=1)
     return Pyramid(jnp.asarray(values), jnp.asarray(intrinsics), tuple(sizes))
+
+
+def _bytes(views):
+    images = np.asarray(views.rgb)
+    if images.dtype != np.uint8:
+        images = np.rint(np.clip(images, 0, 1) * 255).astype(np.uint8)
+    return images
+
+
+def _pixels(colors, weight):
+    """Colors and weight of one image as bytes `[H * W, 4]`."""
+    whole = np.dstack([colors * (weight > 0)[..., None], 255 * weight])
+    return np.rint(whole).astype(np.uint8).reshape(-1, 4)
 
 
 def _halve(image, weight):

@@ -226,7 +226,9 @@ def gather_view(
     footprints = [z / np.sqrt(fx * fy) / side for fx, fy, _, _ in level_intrinsics]
     footprint = footprints[finest]
     weight = seen * np.exp(-min(angle / settings.angle_scale, 20)) / max(footprint, 1) ** 2
-    level = min(max(-np.log2(footprints[0]) - settings.finer, finest), len(levels) - 1)
+    coarseness = [np.log2(other / footprints[0]) for other in footprints]
+    wanted = -np.log2(footprints[0]) - settings.finer
+    level = max(np.interp(wanted, coarseness, range(len(levels))), finest)
     value = 0
     for i, image in enumerate(levels):
         fx, fy, cx, cy = level_intrinsics[i]

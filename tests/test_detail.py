@@ -1,12 +1,19 @@
 """Detail: weights that evidence teaches, renders that come nearer to the truth, a kept file."""
 
+import dataclasses
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tiny_runs import KEPT
 
 from experiments.training import detail as training_detail
+from experiments.training import fine_tuning
 from experiments.training.detail import detail_path, detailed, find_detail
+from experiments.training.fine_tuning import fine_tune
+from experiments.training.setup import LabelStart, label_targets
 from experiments.training.stored_run import load_run_scene, read_run, restore
 from jaxcloseup.detail import Evidence, learn_weights, predict, reliability
 from jaxcloseup.photographs import camera_at, to_float
@@ -91,6 +98,32 @@ def test_renders_with_detail_come_nearer_to_the_truth(rendered, found):
         assert not np.asarray(alone.weight).any()
 
 
+def test_target_views_may_be_labeled_by_their_detail(rendered, found, monkeypatch):
+    programs, state, path = rendered
+    by_detail = dataclasses.replace(KEPT.labels, label="residual")
+    # Its weights replace the gate of warps.
+    gated = dataclasses.replace(programs.preset, gated=True, labels=by_detail)
+    monkeypatch.setattr(programs, "preset", gated)
+    monkeypatch.setattr(fine_tuning, "weigh_labels", lambda *_: pytest.fail("asked the gate"))
+    monkeypatch.setattr(training_detail, "make_detail", lambda *_: pytest.fail("made again"))
+    views, start = programs.scene.test, LabelStart(state, None)
+    labels = label_targets(programs, start, views.cameras, by_detail, None, path)
+    truth = np.asarray(to_float(views.rgb))
+    render = functools.partial(programs.render, state)
+
+    def error(rgb):
+        return np.average(np.abs(np.asarray(rgb) - truth).mean(-1), weights=labels.weight)
+
+    seen = [render(camera_at(views.cameras, i)).rgb for i in range(len(views))]
+    assert error(labels.rgb) < 0.9 * error(np.stack(seen))
+    monkeypatch.setattr(programs, "run", lambda *data, count: (data, {"skipped": 0}))
+    kind, begun, photographs, learned, _ = fine_tune(
+        programs, start, views.cameras, most=2, kept=path
+    )
+    assert (kind, begun, photographs) == ("target_views", state, programs.scene.train)
+    jax.tree.map(np.testing.assert_array_equal, learned, labels)
+
+
 def test_detail_is_kept_with_its_state_and_made_again_for_another(rendered, found, monkeypatch):
     programs, state, path = rendered
     monkeypatch.setattr(training_detail, "make_detail", lambda *_: pytest.fail("made again"))
@@ -112,18 +145,18 @@ def test_detail_is_kept_with_its_state_and_made_again_for_another(rendered, foun
 def test_a_scene_is_read_at_the_finest_size_that_fits(capture_folder):
     scene = load_scene(str(capture_folder), downscale=4)
     assert scene.train.rgb.shape[1:3] == (6, 8)
-    pyramid, divisor = scene_pyramid(scene, finest=1)
+    pyramid, divisor = scene_pyramid(scene)
     assert divisor == 1 and pyramid.sizes == ((24, 32), (12, 16), (6, 8))
     whole = load_scene(str(capture_folder))
     np.testing.assert_array_equal(pyramid.level(0)[..., :3], whole.train.rgb)
     np.testing.assert_array_equal(pyramid.intrinsics[:, 0], whole.train.cameras.intrinsics)
     size = 5 * 24 * 32 * 4 * 4 / 3
-    assert scene_pyramid(scene, finest=1, budget=int(size) - 1)[1] == 2
-    assert scene_pyramid(scene, finest=1, budget=int(size / 4) - 1)[1] == 3
-    assert scene_pyramid(scene, finest=1, budget=1)[1] == 4  # what training reads anyway
+    assert scene_pyramid(scene, budget=int(size) - 1)[1] == 2
+    assert scene_pyramid(scene, budget=int(size / 4) - 1)[1] == 3
+    assert scene_pyramid(scene, budget=1)[1] == 4  # what training reads anyway
 
 
 def test_held_out_parts_of_photographs_are_not_read(capture_folder):
     scene = load_scene(str(capture_folder), split="zoom", zoom=2)
     assert scene.photographs_at is None
-    assert scene_pyramid(scene, finest=1)[0].sizes[0] == scene.train.rgb.shape[1:3]
+    assert scene_pyramid(scene)[0].sizes[0] == scene.train.rgb.shape[1:3]

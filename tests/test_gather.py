@@ -15,7 +15,7 @@ from jaxcloseup.photographs import camera_at
 from jaxcloseup.pyramids import Pyramid, photograph_pyramid
 
 
-SIZES = ((48, 64), (24, 32), (12, 16))
+SIZES = ((48, 64), (24, 32), (10, 13))  # the last is not a half
 GRID = pixel_grid(plane.HEIGHT, plane.WIDTH)
 SETTINGS = GatherSettings(robust=1.0)
 # Compiled once: three photographs, three levels, one view.
@@ -38,7 +38,7 @@ def capture():
     sources = gather_sources(views.cameras, with_edge(depths), weight)
     rng = np.random.default_rng(0)
     values = rng.integers(-127, 128, (3, sum(h * w for h, w in SIZES), 3)).astype(np.int8)
-    scales = jnp.array([2.0, 1.0, 0.5])
+    scales = jnp.array([2.0, 1.0, 0.4])
     intrinsics = views.cameras.intrinsics[:, None] * scales[None, :, None]
     return sources, Pyramid(jnp.asarray(values), intrinsics, SIZES)
 
@@ -181,14 +181,23 @@ def test_gradients_follow_values_and_stay_finite(capture, closeup):
     np.testing.assert_allclose(jnp.sum(by_value * step), (ahead - behind) / 2, rtol=2e-2)
 
 
-def test_a_pyramid_halves_by_weight():
+def test_a_pyramid_halves_by_weight_and_ends_with_what_training_reads():
     rng = np.random.default_rng(1)
     rgb = rng.integers(0, 256, (2, 9, 13, 3)).astype(np.uint8)
     weight = rng.integers(0, 2, (2, 9, 13)).astype(np.float32)
     cameras = Camera(jnp.zeros((2, 3, 4)), jnp.tile(jnp.array([8.0, 8, 6.5, 4.5]), (2, 1)), 9, 13)
     views = plane.Views(cameras, jnp.asarray(rgb), jnp.asarray(weight))
-    pyramid = photograph_pyramid(views, coarsest=3)
-    assert pyramid.sizes == ((9, 13), (4, 6), (2, 3))
+    coarse = rng.integers(0, 256, (2, 3, 4, 3)).astype(np.uint8)
+    own = jnp.tile(jnp.array([2.5, 2.5, 2, 1.5]), (2, 1))
+    training = plane.Views(
+        Camera(jnp.zeros((2, 3, 4)), own, 3, 4), jnp.asarray(coarse), jnp.ones((2, 3, 4))
+    )
+    assert photograph_pyramid(views).sizes == ((9, 13),)
+    pyramid = photograph_pyramid(views, training)
+    assert pyramid.sizes == ((9, 13), (4, 6), (3, 4))
+    np.testing.assert_array_equal(pyramid.level(2)[..., :3], coarse)
+    np.testing.assert_array_equal(pyramid.intrinsics[:, 2], own)
+    np.testing.assert_allclose(pyramid.coarseness(1), np.log2([1, 2, 8 / 2.5]), rtol=1e-6)
     np.testing.assert_allclose(pyramid.intrinsics[0, 1], [4, 4, 3.25, 2.25])
     fine, half = np.asarray(pyramid.level(0), np.float64), np.asarray(pyramid.level(1))
     np.testing.assert_array_equal(fine[..., :3], rgb * (weight[..., None] > 0))

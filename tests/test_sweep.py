@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from absl import flags
 from absl.testing import flagsaver
+from conftest import QUICKLY
 from tiny_runs import TINY, TINY_SURFELS
 
 from experiments import sweep
@@ -325,7 +326,7 @@ def start(script, *arguments):
     tests = pathlib.Path(__file__).parent
     environment = os.environ | {
         "JAX_PLATFORMS": "cpu",
-        "XLA_FLAGS": "--xla_force_host_platform_device_count=1",
+        "XLA_FLAGS": f"{QUICKLY} --xla_force_host_platform_device_count=1",
         "PYTHONPATH": os.pathsep.join([str(tests.parent), str(tests)]),
         "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir,
     }

@@ -22,6 +22,8 @@ class LabelConfig:
     """How random close-ups are drawn and labeled; the defaults are the paper's text.
 
     Attributes:
+      label: what labels target views: "warp", the colors of photographs where warps agree, or
+        "residual", their own render with detail. Random close-ups always have the first.
       magnification: range of lambda, how many times nearer virtual cameras come.
       max_angle: epsilon, the largest change of each Euler angle, radians.
       anchor_tolerance: largest relative distance of an anchor from its view's mean depth.
@@ -42,6 +44,7 @@ class LabelConfig:
         the depth that the field renders.
     """
 
+    label: str = "warp"
     magnification: tuple[float, float] = (2.0, 8.0)
     max_angle: float = math.pi / 4
     anchor_tolerance: float = math.inf
@@ -68,8 +71,9 @@ def pseudo_settings(labels: LabelConfig) -> PseudoSettings:
 
 
 def _traced(labels):
-    """All values but `expected_depth`, which chooses what code runs before labels are made."""
-    return {name: value for name, value in vars(labels).items() if name != "expected_depth"}
+    """All values but those that choose what code makes labels."""
+    chosen = "label", "expected_depth"
+    return {name: value for name, value in vars(labels).items() if name not in chosen}
 
 
 @dataclasses.dataclass(frozen=True)

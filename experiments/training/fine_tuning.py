@@ -1,6 +1,7 @@
 """Fine-tuning a stored state for target views: the cameras that somebody wants rendered."""
 
 import functools
+import pathlib
 
 import jax.numpy as jnp
 
@@ -14,11 +15,16 @@ from jaxcloseup.train import TrainState
 
 
 def fine_tune(
-    programs: Programs, start: LabelStart, cameras: Camera, *, most: int | None
+    programs: Programs,
+    start: LabelStart,
+    cameras: Camera,
+    *,
+    most: int | None,
+    kept: pathlib.Path | None = None,
 ) -> TrainState:
     """Train a state for target views, with labels made once for them.
 
-    Where the preset has a gate, it weighs the labels again. Without labels the state stays as it
+    Where the preset has a gate, it weighs warped labels again. Without labels the state stays as it
     is.
 
     Args:
@@ -26,20 +32,21 @@ def fine_tune(
       start: the state, and the photographs with its depths.
       cameras: stacked `[Q]`, of the target views.
       most: the largest number of steps in all; by default the method's.
+      kept: file with the detail of the state, see `find_detail`.
 
     Raises:
       TrainingError: no step was finite.
     """
     preset, method, state = programs.preset, programs.method, start.state
     settings = pseudo_settings(preset.labels)
-    if preset.gated:
+    if preset.gated and preset.labels.label == "warp":
         render = functools.partial(programs.render, state)
         settings, found = weigh_labels(start.sources, render, settings)
         print_gate(found)
         if not found["weight"]:
             print("nothing is fine-tuned")
             return state
-    labels = label_targets(programs, start, cameras, settings)
+    labels = label_targets(programs, start, cameras, preset.labels, settings, kept)
     steps = method.target_steps(preset.field, cameras.intrinsics.shape[0])
     steps = min(steps, most or steps)
     coverage = float(jnp.mean(labels.weight))

@@ -26,6 +26,7 @@ BOUNDS = {
     **dict.fromkeys(("initial_opacity", "ssim_weight", "background"), (0, 1)),
 }
 _CHOICES = {
+    "label": ("warp", "residual"),
     "depth": ("median", "expected"),
     "compute_dtype": ("float32", "bfloat16"),
     "label_rule": tuple(LABEL_RULES),

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import functools
+import pathlib
 import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
@@ -12,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxcloseup
-from experiments.methods import Preset
+from experiments.methods import LabelConfig, Preset
+from experiments.training.detail import detailed_views, find_detail
 from experiments.training.logs import TrainLog
 from experiments.training.loop import run_stage
 from experiments.training.manifest import hash_data, hash_targets
@@ -193,9 +195,26 @@ def rendered_depths(
 
 
 def label_targets(
-    programs: Programs, start: LabelStart, cameras: Camera, settings: PseudoSettings
+    programs: Programs,
+    start: LabelStart,
+    cameras: Camera,
+    labels: LabelConfig,
+    settings: PseudoSettings,
+    kept: pathlib.Path | None = None,
 ) -> Views:
-    """Labels of target views, given by stacked cameras `[Q]`."""
+    """Labels of target views.
+
+    Args:
+      programs: the run's.
+      start: what fine-tuning begins with.
+      cameras: stacked `[Q]`.
+      labels: says what labels are.
+      settings: of warps, after the gate.
+      kept: file with the detail of the state that fine-tuning begins with, see `find_detail`.
+    """
+    if labels.label == "residual":
+        detail, _ = find_detail(programs, start.state, kept)
+        return detailed_views(programs, start.state, detail, cameras)
     render = functools.partial(programs.render, start.state)
     depths = rendered_depths(render, cameras, programs.scene)
     return jax.jit(label_views)(cameras, depths, start.sources, settings)

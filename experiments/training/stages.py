@@ -98,13 +98,13 @@ def run_stages(
             scorer.score(name, controls[steps])
         return controls[steps]
 
-    def fine_tune(stage, control_name, kind, *data, steps):
+    def fine_tune(stage, control_name, kind, *data, steps, labeled=use_labels):
         without = None
-        if "control" in to_run or not use_labels:
+        if "control" in to_run or not labeled:
             without = control(control_name, steps)
         # Without labels a stage is its control: the same steps on the same photographs.
         state = without
-        if use_labels:
+        if labeled:
             state = training.train(stage, kind, start.state, *data, steps=steps)
         scorer.score(stage, state)
         return state
@@ -118,11 +118,16 @@ def run_stages(
     if "test_time" in to_run and scene.test is None:
         print(f"no test_time: {scene.name} holds out no close-ups (--split=closest does)")
     elif "test_time" in to_run:
+        # Detail has weights of its own, so the gate of warps does not apply to it.
+        by_detail = preset.labels.label == "residual"
+        own = pseudo_settings(preset.labels) if by_detail else settings
         with timed(training.seconds, "test_time_labels"):
-            labels = label_targets(programs, start, scene.test.cameras, settings)
+            targets, kept = scene.test.cameras, detail_path(output_dir, "baseline")
+            labels = label_targets(programs, start, targets, preset.labels, own, kept)
         steps = method.target_steps(preset.field, len(scene.test))
-        control_name, kind = "test_time_control", "target_views"
-        fine_tune("test_time", control_name, kind, scene.train, labels, settings, steps=steps)
+        names, labeled = ("test_time", "test_time_control"), use_labels or by_detail
+        data = "target_views", scene.train, labels, own
+        fine_tune(*names, *data, steps=steps, labeled=labeled)
     detail = None
     if "detail" in to_run:
         detail = add_detail_stage(training, scorer, output_dir, *latest)

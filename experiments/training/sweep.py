@@ -262,7 +262,7 @@ def label_arm(
             share=arm.depth_error,
         )
     if arm.kind == "test_time":
-        return label_targets(programs, start, scene.test.cameras, arm.settings)
+        return label_targets(programs, start, scene.test.cameras, arm.labels, arm.settings)
     blurred = arm.kind == "resolved"
     return true_close_ups(key, scene, start.sources, exact, arm.settings, blurred=blurred)
 

@@ -264,7 +264,8 @@ class Viewer:
         start, state = self._label_start(), self._state
         if tuned:
             cameras = jax.tree.map(lambda leaf: leaf[None], camera)
-            state = fine_tune(self._programs, start, cameras, most=None)
+            kept = self._kept if start.state is self._state else None
+            state = fine_tune(self._programs, start, cameras, most=None, kept=kept)
         # A state tuned for one camera differs from the one whose detail is known.
         detail = self._find_detail() if self._sharpen.value and state is self._state else None
         images = render_pictures(
