@@ -89,6 +89,8 @@ def make_arm(name: str, preset: Preset) -> Arm:
     )
     if kind in ARMS_IN_TURN and changes_depth:
         raise ValueError(f"--arms={name}: {kind} takes no other depth than its own")
+    if labels.label != of_kind.labels.label and kind != "test_time":
+        raise ValueError(f"--arms={name}: label is for target views: change it of test_time alone")
     if None not in (labels.expected_depth, depth_error):
         raise ValueError(f"--arms={name}: expected_depth and depth_error do not go together")
     return Arm(name, kind, labels, depth_error)
