@@ -46,6 +46,7 @@ from jaxcloseup.train import TrainState
 
 
 LEFT_OUT = 20  # photographs that teach the weights
+_RECIPE = 2  # a change of how detail is made raises it, so that kept detail is made again
 _TEXTS = ("key", "about")
 
 _add = jax.jit(add_detail)
@@ -178,7 +179,8 @@ def _compare(detail, camera, pixels, window):
 
 def _hash(programs, state):
     """What the detail depends on: the state that is rendered, the photographs, this version."""
-    digest = hashlib.sha256(f"{jaxcloseup.__version__} {hash_data(programs.scene)}".encode())
+    made_by = f"{jaxcloseup.__version__} {_RECIPE} {hash_data(programs.scene)}"
+    digest = hashlib.sha256(made_by.encode())
     for leaf in jax.tree.leaves((state.params, state.buffers)):
         digest.update(np.ascontiguousarray(leaf).data)
     return digest.hexdigest()
