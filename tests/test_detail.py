@@ -13,9 +13,11 @@ from experiments.training import detail as training_detail
 from experiments.training import fine_tuning
 from experiments.training.detail import detail_path, detailed, find_detail
 from experiments.training.fine_tuning import fine_tune
+from experiments.training.residuals import _enlarge
 from experiments.training.setup import LabelStart, label_targets
 from experiments.training.stored_run import load_run_scene, read_run, restore
 from jaxcloseup.detail import Evidence, learn_weights, predict, reliability
+from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.photographs import camera_at, to_float
 from jaxcloseup.pyramids import scene_pyramid
 from jaxcloseup.scenes import load_scene
@@ -140,6 +142,26 @@ def test_detail_is_kept_with_its_state_and_made_again_for_another(rendered, foun
     path.write_bytes(path.read_bytes()[:100])
     find_detail(programs, other, path)
     assert len(made) == 2
+
+
+def test_an_enlarged_render_stays_in_its_place():
+    pose = jnp.eye(3, 4)
+    coarse = Camera(pose, jnp.array([20.0, 20.5, 15, 12]), 24, 30)
+    fine = Camera(pose, jnp.array([61.0, 59.5, 45.5, 36.2]), 72, 91)
+
+    def image(camera):
+        x, y = np.moveaxis(np.asarray(pixel_grid(camera.height, camera.width)), -1, 0)
+        fx, fy, cx, cy = np.asarray(camera.intrinsics)
+        wave = 0.5 + 0.4 * np.sin(4 * (x - cx) / fx) * np.cos(3 * (y - cy) / fy)
+        return np.stack([wave, wave**2, 1 - wave], axis=-1).astype(np.float32)
+
+    shown = image(coarse), image(coarse)[..., 0], image(coarse)[..., 1]
+    rgb, alpha, depth = _enlarge(shown, coarse, fine)
+    inner = np.s_[6:-6, 6:-6]
+    assert np.abs(rgb - image(fine))[inner].max() < 0.006  # a tenth of a coarse pixel
+    for nearest, index in ((alpha, 0), (depth, 1)):
+        assert set(nearest.ravel()) <= set(shown[0][..., index].ravel())
+        assert np.abs(nearest - image(fine)[..., index])[inner].max() < 0.12
 
 
 def test_a_scene_is_read_at_the_finest_size_that_fits(capture_folder):
