@@ -166,18 +166,15 @@ def test_gradients_follow_values_and_stay_finite(capture, closeup):
     floats = pyramid.replace(values=pyramid.values.astype(jnp.float32) / 127)
 
     def total(values, scale):
-        found = gather(
-            camera, GRID, scale * depth, sources, floats.replace(values=values), SETTINGS
-        )
+        found = gather(camera, GRID, scale * depth, sources, floats.replace(values=values))
         return jnp.sum(found.mean**2)
 
-    by_value, by_scale = jax.jit(jax.grad(total, (0, 1)))(floats.values, jnp.float32(1))
+    both = jax.jit(jax.value_and_grad(total, (0, 1)))
+    _, (by_value, by_scale) = both(floats.values, jnp.float32(1))
     assert np.isfinite(np.asarray(by_value)).all()
     assert np.isfinite(float(by_scale))
     step = 0.01 * jax.random.normal(jax.random.key(0), floats.values.shape)
-    ahead, behind = (
-        jax.jit(total)(floats.values + sign * step, jnp.float32(1)) for sign in (1, -1)
-    )
+    ahead, behind = (both(floats.values + sign * step, jnp.float32(1))[0] for sign in (1, -1))
     np.testing.assert_allclose(jnp.sum(by_value * step), (ahead - behind) / 2, rtol=2e-2)
 
 
