@@ -166,7 +166,9 @@ def test_gradients_follow_values_and_stay_finite(capture, closeup):
     floats = pyramid.replace(values=pyramid.values.astype(jnp.float32) / 127)
 
     def total(values, scale):
-        found = gather(camera, GRID, scale * depth, sources, floats.replace(values=values))
+        found = gather(
+            camera, GRID, scale * depth, sources, floats.replace(values=values), SETTINGS
+        )
         return jnp.sum(found.mean**2)
 
     both = jax.jit(jax.value_and_grad(total, (0, 1)))
