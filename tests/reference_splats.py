@@ -53,15 +53,23 @@ def depth_reach(surfels, camtoworld):
     return cutoff * np.array(reach)
 
 
-def intersect(surfels, camtoworld, intrinsics, pixels, *, near, reach=None):
+def intersect(surfels, camtoworld, intrinsics, pixels, *, near, reach=None, antialias=False):
     """Opacity and depth `[N, P]` of every surfel at `pixels[P, 2]`; opacity 0 is not drawn.
+
+    With `antialias`, a disc in front of the camera is convolved with a pixel's variance of 1/12,
+    carried onto the disc by the derivative at its center.
 
     Finite differences pass a fixed `reach`, because in the package a disc's range of depth has no
     derivative except that of its center.
     """
     rotation, position = np.asarray(camtoworld)[:, :3], np.asarray(camtoworld)[:, 3]
     fx, fy, cx, cy = intrinsics
-    rays = np.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(len(pixels))], -1)
+
+    def ray_through(pixels):
+        x, y = np.moveaxis(np.asarray(pixels), -1, 0)
+        return np.stack([(x - cx) / fx, (y - cy) / fy, np.ones_like(x)], -1)
+
+    rays = ray_through(pixels)
     reach = depth_reach(surfels, camtoworld) if reach is None else reach
     alphas, depths = [], []
     for i in range(len(surfels["means"])):
@@ -69,22 +77,32 @@ def intersect(surfels, camtoworld, intrinsics, pixels, *, near, reach=None):
         tangent_u, tangent_v, normal = (rotation.T @ rotation_of(surfels["quaternions"][i])).T
         with np.errstate(divide="ignore", invalid="ignore"):
             z = normal @ mu / (rays @ normal)
-            offset = z[:, None] * rays - mu
-            u, v = offset @ tangent_u, offset @ tangent_v
             scales = np.exp(surfels["log_scales"][i])
-            rho = (u / scales[0]) ** 2 + (v / scales[1]) ** 2
+
+            axes = np.stack([tangent_u, tangent_v], axis=1) / scales
+
+            def local(rays, mu=mu, normal=normal, axes=axes):
+                return ((normal @ mu / (rays @ normal))[:, None] * rays - mu) @ axes
+
+            rho = np.sum(local(rays) ** 2, axis=-1)
         behind = ~(z > 0)
         rho = np.where(behind, np.inf, rho)
-        if mu[2] > near:
-            center = np.array([fx * mu[0] / mu[2] + cx, fy * mu[1] / mu[2] + cy])
+        opacity = 1 / (1 + np.exp(-surfels["opacity_logits"][i]))
+        center = np.array([fx * mu[0] / mu[2] + cx, fy * mu[1] / mu[2] + cy])
+        depth = z
+        if antialias and mu[2] > near:
+            # The derivative by a step along the imaginary axis, which takes no difference.
+            slopes = local(ray_through(center + 1e-30j * np.eye(2))).imag / 1e-30
+            covariance = np.eye(2) + slopes.T @ slopes / 12
+            rho = np.einsum("pi,ij,pj->p", local(rays), np.linalg.inv(covariance), local(rays))
+            rho = np.where(behind, np.inf, rho)
+            opacity /= np.sqrt(np.linalg.det(covariance))
+        elif mu[2] > near:
             floor = LOW_PASS * np.sum((pixels - center) ** 2, axis=-1)
             low, high = max(mu[2] - reach[i], near), max(mu[2] + reach[i], near)
             clipped = np.clip(np.where(behind, np.inf, z), low, high)
             depth = np.where(floor < rho, clipped, z)
             rho = np.minimum(rho, floor)
-        else:
-            depth = z
-        opacity = 1 / (1 + np.exp(-surfels["opacity_logits"][i]))
         alpha = np.minimum(opacity * np.exp(-rho / 2), ALPHA_MAX)
         hidden = (alpha < ALPHA_MIN) | ((z > 0) & (z < near))
         hidden |= abs(normal @ mu) <= 1e-4 * np.linalg.norm(mu)
@@ -117,12 +135,15 @@ def blend(alphas, depths, payload):
     return weights.T @ payload, alpha, depth, median, distortion
 
 
-def render(surfels, camtoworld, intrinsics, height, width, *, near, background=None, reach=None):
-    """Images `[H, W, ...]` by name; `surfels` is a dictionary of float64 arrays."""
+def render(surfels, camtoworld, intrinsics, height, width, *, background=None, **options):
+    """Images `[H, W, ...]` by name; `surfels` is a dictionary of float64 arrays.
+
+    `options` are those of `intersect`.
+    """
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
     camtoworld = np.asarray(camtoworld, np.float64)
-    alphas, depths = intersect(surfels, camtoworld, intrinsics, pixels, near=near, reach=reach)
+    alphas, depths = intersect(surfels, camtoworld, intrinsics, pixels, **options)
     payload, order = [], []
     for mean, quaternion, sh in zip(
         surfels["means"], surfels["quaternions"], surfels["sh"], strict=True
@@ -131,7 +152,7 @@ def render(surfels, camtoworld, intrinsics, height, width, *, near, background=N
         normal = rotation_of(quaternion)[:, 2]
         normal = normal if normal @ offset < 0 else -normal
         payload.append([*sh_color(sh, offset / np.linalg.norm(offset)), *normal])
-        order.append(max(offset @ camtoworld[:, 2], near))
+        order.append(max(offset @ camtoworld[:, 2], options["near"]))
     by_depth = np.argsort(order, kind="stable")
     sums, alpha, depth, median, distortion = blend(
         alphas[by_depth], depths[by_depth], np.array(payload)[by_depth]

@@ -1,5 +1,7 @@
 """Boxes and homographies of discs against rays that meet them."""
 
+import functools
+
 import jax
 import numpy as np
 import pytest
@@ -14,11 +16,11 @@ SIZE, INTRINSICS = (48, 64), np.array([50.0, 56.0, 29.5, 27.0])
 DISCS = 500
 
 
-@jax.jit
-def project(surfels, camera):
+@functools.partial(jax.jit, static_argnums=2)
+def project(surfels, camera, antialias=False):
     discs, normals = to_camera(surfels, camera)
     opacity = jax.nn.sigmoid(surfels.opacity_logits)
-    found = project_discs(discs, opacity, normals, camera, near=NEAR)
+    found = project_discs(discs, opacity, normals, camera, near=NEAR, antialias=antialias)
     return found.box, found.opacity, found.anchor, found.homography, found.low_pass
 
 
@@ -101,6 +103,31 @@ def test_the_low_pass_of_discs_behind_the_camera_is_out_of_sight():
     pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
     rho = low_pass * np.sum((pixels[:, None] - anchor) ** 2, axis=-1).min(axis=0)
     assert np.sum(opacity > 0) > DISCS // 10 and np.all(rho > 100)
+
+
+@pytest.mark.parametrize("log_scale", [(-6.0, -3.0), (-4.0, -0.5)], ids=["small", "large"])
+def test_antialiased_discs_are_convolved_with_the_pixel(log_scale):
+    scene = random_scene(6, depth=(1.0, 3.0), log_scale=log_scale, count=DISCS)
+    x, y = np.meshgrid(np.arange(SIZE[1]) + 0.5, np.arange(SIZE[0]) + 0.5)
+    pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
+    expected, _ = reference.intersect(
+        scene, IDENTITY, INTRINSICS, pixels, near=NEAR, antialias=True
+    )
+    camera = make_camera(intrinsics=INTRINSICS, size=SIZE)
+    box, opacity, anchor, rows, low_pass = map(
+        lambda leaf: np.asarray(leaf, np.float64), project(to_surfels(scene), camera, True)
+    )
+    offset = pixels[None] - anchor[:, None]
+    d = np.concatenate([np.ones((*offset.shape[:2], 1)), offset], axis=-1)
+    u, v, inverse = np.einsum("nij,npj->inp", rows, d)
+    with np.errstate(divide="ignore", over="ignore"):
+        rho = np.where(inverse > 0, (u * u + v * v) / inverse**2, np.inf)
+    actual = np.minimum(opacity[:, None] * np.exp(-rho / 2), reference.ALPHA_MAX)
+    seen = expected > 1.01 * reference.ALPHA_MIN
+    assert seen.any(1).sum() > DISCS // 10 and np.all(low_pass >= 1e9)
+    np.testing.assert_allclose(actual[seen], expected[seen], rtol=2e-3)
+    inside = np.all((pixels >= box[:, None, :2]) & (pixels <= box[:, None, 2:]), axis=-1)
+    assert np.all(inside[seen])
 
 
 def test_near_must_be_positive():

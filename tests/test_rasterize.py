@@ -1,5 +1,8 @@
 """Images and derivatives of surfels against a NumPy splatter, and their invariances."""
 
+import dataclasses
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,9 +32,12 @@ OUTPUTS = ("rgb", "alpha", "depth", "normal", "median_depth", "distortion")
 VECTORS = ("rgb", "normal")
 
 
-def oracle(scene, camtoworld=IDENTITY, intrinsics=INTRINSICS, size=(HEIGHT, WIDTH), reach=None):
+ANTIALIASED = dataclasses.replace(CONFIG, antialias=True)
+
+
+def oracle(scene, camtoworld=IDENTITY, intrinsics=INTRINSICS, size=(HEIGHT, WIDTH), **options):
     return reference.render(
-        scene, camtoworld, intrinsics, *size, near=NEAR, background=BACKGROUND, reach=reach
+        scene, camtoworld, intrinsics, *size, near=NEAR, background=BACKGROUND, **options
     )
 
 
@@ -49,6 +55,29 @@ def test_images_agree_with_rays_that_meet_planes(name, precision):
         np.testing.assert_allclose(images[output], expected[output], atol=tolerance, rtol=0)
 
 
+def test_antialiased_images_agree_with_convolved_discs():
+    for name in ("in front", "far and small"):
+        expected = oracle(SCENES[name], antialias=True)
+        images = render(to_surfels(SCENES[name]), to_camera(), config=ANTIALIASED)
+        assert expected["alpha"].max() > 0.1
+        for output in OUTPUTS:
+            np.testing.assert_allclose(images[output], expected[output], atol=2e-5, rtol=0)
+
+
+def test_an_antialiased_image_is_the_mean_of_a_finer_one():
+    """Reduced pixels and the discs of a finer image show the same, which published discs do not."""
+    scene = random_scene(7, log_scale=(-5.0, -3.0))
+    surfels, fine = to_surfels(scene), to_camera(intrinsics=8 * INTRINSICS, size=(192, 256))
+    config = RasterizeConfig(capacity=2**15, near=NEAR)
+    sharp = np.asarray(render(surfels, fine, config=config)["rgb"])
+    expected = sharp.reshape(HEIGHT, 8, WIDTH, 8, 3).mean((1, 3))
+    ours, published = (
+        np.abs(np.asarray(render(surfels, to_camera(), config=c)["rgb"]) - expected).max()
+        for c in (ANTIALIASED, CONFIG)
+    )
+    assert ours < 0.03 and published > 5 * ours
+
+
 def pose(twist):
     """Camera-to-world matrix `[3, 4]` from Euler angles and a position `twist[6]`, in NumPy."""
     (cx, cy, cz), (sx, sy, sz) = np.cos(twist[:3]), np.sin(twist[:3])
@@ -58,21 +87,26 @@ def pose(twist):
     return np.concatenate([z @ y @ x, twist[3:, None]], axis=1)
 
 
-@jax.jit
-def pullback(surfels, twist, intrinsics, cotangents):
+@functools.partial(jax.jit, static_argnames="config")
+def pullback(surfels, twist, intrinsics, cotangents, config):
     def images(surfels, twist, intrinsics):
         camtoworld = jnp.concatenate([euler_to_matrix(twist[:3]), twist[3:, None]], axis=1)
         camera = to_camera().replace(camtoworld=camtoworld, intrinsics=intrinsics)
-        out = render(surfels, camera)
+        out = render(surfels, camera, config=config)
         return {name: out[name] for name in OUTPUTS}
 
     return jax.vjp(images, surfels, twist, intrinsics)[1](cotangents)
 
 
-@pytest.fixture(scope="module", params=["in front", "through the camera"])
+@pytest.fixture(
+    scope="module",
+    params=[("in front", False), ("through the camera", False), ("in front", True)],
+    ids=["in front", "through the camera", "antialiased"],
+)
 def jacobian(request):
     """Central differences of every image of the oracle in every parameter, by parameter name."""
-    scene = SCENES[request.param]
+    name, antialias = request.param
+    scene, config = SCENES[name], ANTIALIASED if antialias else CONFIG
     at = dict(scene, pose=np.zeros(6), intrinsics=INTRINSICS)
     reach, step = reference.depth_reach(scene, IDENTITY), 1e-7
     differences = {}
@@ -85,16 +119,18 @@ def jacobian(request):
                 moved.flat[i] += sign * step
                 moved = {**at, name: moved}
                 twist, intrinsics = moved.pop("pose"), moved.pop("intrinsics")
-                images.append(oracle(moved, pose(twist), intrinsics, reach=reach))
+                images.append(
+                    oracle(moved, pose(twist), intrinsics, reach=reach, antialias=antialias)
+                )
             plus, minus = images
             rows.append({out: (plus[out] - minus[out]) / (2 * step) for out in OUTPUTS})
         differences[name] = rows
-    return scene, differences
+    return scene, config, differences
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_derivatives_agree_with_finite_differences(jacobian, precision):
-    scene, differences = jacobian
+    scene, config, differences = jacobian
     rng = np.random.default_rng(3)
     weights = {name: rng.normal(size=(HEIGHT, WIDTH)) for name in OUTPUTS}
     weights |= {name: rng.normal(size=(HEIGHT, WIDTH, 3)) for name in VECTORS}
@@ -108,6 +144,7 @@ def test_derivatives_agree_with_finite_differences(jacobian, precision):
                 jnp.zeros(6, precision),
                 jnp.asarray(INTRINSICS, precision),
                 cotangents,
+                config,
             )
         computed = {name: getattr(surfels, name) for name in scene}
         computed |= dict(pose=twist, intrinsics=intrinsics)

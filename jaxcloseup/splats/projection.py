@@ -24,6 +24,7 @@ from jaxcloseup.splats.surfels import Surfels
 
 
 LOW_PASS = 2.0  # 1/px^2: no splat is drawn smaller than a Gaussian of sigma = sqrt(1/2) pixel
+PIXEL_VARIANCE = 1 / 12  # px^2, along each side of a square pixel
 EDGE_ON = 1e-4  # |cos| between normal and line of sight below which a disc is not drawn
 MAX_LOG_SCALE = 30.0  # beyond it, products of scales leave the range of float32
 
@@ -57,9 +58,21 @@ def to_camera(surfels: Surfels, camera: Camera) -> tuple[Discs, jax.Array]:
 
 
 def project_discs(
-    discs: Discs, opacity: jax.Array, payload: jax.Array, camera: Camera, *, near: float
+    discs: Discs,
+    opacity: jax.Array,
+    payload: jax.Array,
+    camera: Camera,
+    *,
+    near: float,
+    antialias: bool = False,
 ) -> Footprints:
     """Homographies and boxes of discs; invisible discs get opacity 0 and an empty box.
+
+    With `antialias`, each disc is convolved with the pixel, so that an image of fewer pixels is the
+    mean of one of more (the elliptical weighted average of Zwicker et al. 2001, as the 2-D filter
+    of Mip-Splatting): where J is the derivative of (u, v) by the pixel at the center, and s^2 a
+    pixel's variance, rho becomes (u, v) (I + s^2 J J^T)^-1 (u, v)^T, and the opacity falls as the
+    disc's area grows. Without it, small discs are drawn larger than they are, as published.
 
     Args:
       discs: `N` discs in the frame of `camera`.
@@ -67,6 +80,7 @@ def project_discs(
       payload: `[N, F]` values to blend.
       camera: one camera; only its intrinsics and image size are used.
       near: positive z-depth; nothing nearer is drawn, and a disc may reach through it.
+      antialias: see above.
 
     Raises:
       ValueError: `near` is not positive.
@@ -106,20 +120,26 @@ def project_discs(
     homography = jnp.concatenate(
         [constants[..., None], covectors[..., :2] / focal[:, None]], axis=-1
     )
+    vectors = discs.axes[..., :2] * discs.scales[:, None]
+    if antialias:
+        spread = _pixel_spread(homography, depth, centered[:, 0] & ~edge_on)
+        homography, vectors = _widen(homography, vectors, spread)
+        opacity = opacity / (spread[0] * spread[2])
 
     # Neither the box nor the disc's range of depth has a derivative.
-    discs, opacity_now, center = lax.stop_gradient((discs, opacity, center))
+    vectors, opacity_now, center = lax.stop_gradient((vectors, opacity, center))
     cutoff = jnp.sqrt(2 * jnp.log(jnp.maximum(opacity_now / ALPHA_MIN, 1)))
-    reach = cutoff * safe_norm(discs.axes[:, 2, :2] * discs.scales)
+    reach = cutoff * safe_norm(vectors[:, 2])
     drawn = ~edge_on & (opacity_now >= ALPHA_MIN) & (depth + reach >= near)
     nearest, farthest = (jnp.maximum(limit, near) for limit in (depth - reach, depth + reach))
-    box = _disc_box(discs, cutoff, camera, near)
-    box = jnp.where(ahead[:, None], _unite(box, _low_pass_box(center, cutoff)), box)
+    box = _disc_box(lax.stop_gradient(mu), vectors, cutoff, camera, near)
+    if not antialias:
+        box = jnp.where(ahead[:, None], _unite(box, _low_pass_box(center, cutoff)), box)
     return Footprints(
         anchor=anchor,
         homography=homography,
         opacity=jnp.where(drawn, opacity, 0),
-        low_pass=jnp.where(ahead, LOW_PASS, 1e9),
+        low_pass=jnp.where(ahead & (not antialias), LOW_PASS, 1e9),
         inverse_depth=jnp.stack([1 / farthest, 1 / nearest], axis=-1),
         payload=payload,
         order=lax.stop_gradient(jnp.maximum(depth, near)),
@@ -127,19 +147,48 @@ def project_discs(
     )
 
 
-def _disc_box(discs: Discs, cutoff: jax.Array, camera: Camera, near: float) -> jax.Array:
+def _pixel_spread(homography, depth, known):
+    """Cholesky factor (l11, l21, l22) of I + s^2 J J^T of each disc; the identity if not known."""
+    across, down = (
+        jnp.where(known[:, None], depth[:, None] * homography[:, :2, i], 0) for i in (1, 2)
+    )
+    uu, uv, vv = (
+        PIXEL_VARIANCE * (across[:, i] * across[:, j] + down[:, i] * down[:, j])
+        for i, j in ((0, 0), (0, 1), (1, 1))
+    )
+    first = jnp.sqrt(1 + uu)
+    below = uv / first
+    # 1 + vv - below^2, without taking large numbers from each other.
+    cross = PIXEL_VARIANCE * (across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0])
+    second = jnp.sqrt((1 + uu + vv + cross * cross) / (1 + uu))
+    return first, below, second
+
+
+def _widen(homography, vectors, spread):
+    """Homography and vectors of discs `[N, 3, 2]` whose covariance (u, v) is L L^T."""
+    first, below, second = (factor[:, None] for factor in spread)
+    u = homography[:, 0] / first
+    v = (homography[:, 1] - below * u) / second
+    homography = jnp.stack([u, v, homography[:, 2]], axis=1)
+    one, other = vectors[..., 0], vectors[..., 1]
+    return homography, jnp.stack([first * one + below * other, second * other], axis=-1)
+
+
+def _disc_box(
+    center: jax.Array, vectors: jax.Array, cutoff: jax.Array, camera: Camera, near: float
+) -> jax.Array:
     """Exact bounds `[N, 4]` in pixels of discs of radius `cutoff[N]`, cut off at z = near.
+
+    The rim is center + cutoff (cos t, sin t) . vectors, for `[N, 3]` centers and `[N, 3, 2]`
+    vectors.
 
     The visible part is convex, so points of its rim bound its image: those where a coordinate is
     stationary along the circle, and the ends of the chord at z = near.
     """
     # The margin keeps pixels that only just reach the cutoff in spite of rounding.
-    radii = (1.001 * cutoff)[:, None] * discs.scales
+    radii = (1.001 * cutoff)[:, None, None] * vectors
     # Each coordinate x, y, z of the rim is a cos + b sin + c, a triple of [N].
-    circle = [
-        (axes[:, 0] * radii[:, 0], axes[:, 1] * radii[:, 1], discs.center[:, i])
-        for i, axes in enumerate(jnp.moveaxis(discs.axes, 1, 0))
-    ]
+    circle = [(radii[:, i, 0], radii[:, i, 1], center[:, i]) for i in range(3)]
     depth = circle[2]
     chord, has_chord = _meet_circle(depth[0], depth[1], depth[2] - near)
     low, high = [], []

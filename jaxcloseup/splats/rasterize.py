@@ -21,12 +21,13 @@ from jaxcloseup.splats.tiling import tile_lists
 
 @dataclasses.dataclass(frozen=True)
 class RasterizeConfig:
-    """Static sizes of the rasterizer; except for `near`, none changes an image whose pairs fit.
+    """Static settings of the rasterizer; the sizes change no image whose pairs fit.
 
     Attributes:
       capacity: largest number of (tile, splat) pairs. `overflow` counts the pairs beyond it, which
         are those of the farthest splats; render again with a larger capacity.
       near: positive z-depth in world units; nothing nearer is drawn.
+      antialias: convolve surfels with the pixel, see `project_discs`.
       tile: side of a tile in pixels.
       chunk: number of a tile's splats that the kernel evaluates at once.
       block: number of tiles that the kernel evaluates at once.
@@ -34,6 +35,7 @@ class RasterizeConfig:
 
     capacity: int = 2**18
     near: float = 0.01
+    antialias: bool = False
     tile: int = 8
     chunk: int = 8
     block: int = 128

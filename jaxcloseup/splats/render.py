@@ -75,7 +75,9 @@ def render_surfels(
     colors = sh_to_rgb(surfels.sh, offset / jnp.where(distance == 0, 1, distance))
     opacity = jnp.where(alive, jax.nn.sigmoid(surfels.opacity_logits), 0)
     payload = jnp.concatenate([colors, normals], axis=-1)
-    footprints = project_discs(discs, opacity, payload, camera, near=config.near)
+    footprints = project_discs(
+        discs, opacity, payload, camera, near=config.near, antialias=config.antialias
+    )
     image = rasterize(footprints, config, height=camera.height, width=camera.width)
     rgb, normal = image.payload[..., :3], image.payload[..., 3:]
     if background is not None:
