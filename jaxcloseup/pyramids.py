@@ -60,11 +60,12 @@ class Pyramid:
         return camera.replace(intrinsics=intrinsics, height=height, width=width)
 
 
-def scene_pyramid(scene: Scene, *, budget: int = BUDGET) -> tuple[Pyramid, int]:
+def scene_pyramid(scene: Scene, *, finest: int = 1, budget: int = BUDGET) -> tuple[Pyramid, int]:
     """The training photographs of a scene, from the finest size that fits to that of training.
 
     Args:
       scene: a scene whose photographs were divided by `metadata["downscale"]` for training.
+      finest: smallest divisor of the photographs' own size.
       budget: bytes that the pyramid may take; larger photographs are divided more.
 
     Returns:
@@ -72,7 +73,7 @@ def scene_pyramid(scene: Scene, *, budget: int = BUDGET) -> tuple[Pyramid, int]:
     """
     train, coarse = scene.train, scene.metadata.get("downscale", 1)
     pixels = train.weight.size * coarse**2
-    factor = max(1, math.ceil(math.sqrt(pixels * _BYTES_PER_PIXEL / budget)))
+    factor = max(finest, math.ceil(math.sqrt(pixels * _BYTES_PER_PIXEL / budget)))
     if scene.photographs_at is None or factor >= coarse:
         return photograph_pyramid(train), coarse
     return photograph_pyramid(scene.photographs_at(factor), train), factor

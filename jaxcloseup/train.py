@@ -26,6 +26,7 @@ from jaxcloseup.pseudo import (
     sample_virtual_camera,
 )
 from jaxcloseup.rendered_loss import judge, rendered_loss
+from jaxcloseup.windows import Windows, sample_window
 
 
 Metrics = dict[str, jax.Array]
@@ -89,7 +90,7 @@ def init_state(
 
 def train_step(
     state: TrainState,
-    views: Views,
+    views: Views | Windows,
     *,
     field: RadianceField,
     optimizer: optax.GradientTransformation,
@@ -127,11 +128,13 @@ def pseudo_step(
     The blocks of `label_sources` are made anew in every step: make them once in a long training.
     """
     sources = label_sources(views, depths)
-    return closeup_step(state, sources, settings, field=field, optimizer=optimizer, config=config)
+    bound = {"field": field, "optimizer": optimizer, "config": config}
+    return closeup_step(state, views, sources, settings, **bound)
 
 
 def closeup_step(
     state: TrainState,
+    views: Views | Windows,
     sources: LabelSources,
     settings: PseudoSettings,
     *,
@@ -160,7 +163,7 @@ def closeup_step(
     key_step = jax.random.fold_in(state.key, state.step)
     key_batch, key_render, key_adapt, key_label = jax.random.split(key_step, 4)
     key_virtual, key_pixels, key_depth, key_virtual_render = jax.random.split(key_label, 4)
-    batch = _sample_batch(key_batch, sources.views, config)
+    batch = _sample_batch(key_batch, views, config)
     camera, source_index = sample_virtual_camera(key_virtual, sources, settings)
     pixels = _sample_virtual_pixels(key_pixels, camera, config.num_label_rays)
     rule = LABEL_RULES[config.label_rule]
@@ -213,7 +216,7 @@ def closeup_step(
 
 def labeled_step(
     state: TrainState,
-    views: Views,
+    views: Views | Windows,
     labels: Views,
     settings: PseudoSettings,
     *,
@@ -313,6 +316,8 @@ def render_depths(
 
 
 def _sample_batch(key, views, config):
+    if isinstance(views, Windows):
+        return sample_window(key, views)
     if config.num_rays is None:
         return sample_image(key, views)
     return sample_pixels(key, views, config.num_rays)

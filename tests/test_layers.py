@@ -29,11 +29,12 @@ MAY_IMPORT = {
     "pseudo": {"numerics", "geometry", "field", "photographs"},
     "support": {"numerics", "geometry", "photographs"},
     "pyramids": {"geometry", "photographs", "scene"},
+    "windows": {"geometry", "photographs", "pyramids"},
     "gather": {"numerics", "geometry", "photographs", "pyramids"},
     "detail": {"numerics", "geometry", "gather", "pyramids"},
     "train": {
         *("numerics", "geometry", "field", "photographs"),
-        *("pseudo", "label_rules", "rendered_loss"),
+        *("pseudo", "label_rules", "rendered_loss", "pyramids", "windows"),
     },
     "captures": {"files", "ply", "numerics", "geometry", "photographs", "scene"},
     "procedural": {"files", "numerics", "geometry", "photographs", "scene"},

@@ -2,6 +2,7 @@ import dataclasses
 import json
 import re
 
+import chex
 import cv2
 import jax
 import jax.numpy as jnp
@@ -13,13 +14,13 @@ from tiny_runs import TINY, TINY_SURFELS
 from experiments.evaluate import evaluate_folders
 from experiments.evaluation.audit import blur_to_footprint
 from experiments.evaluation.scores import NO_PERCEPTUAL, Target, score, summarize
-from experiments.methods import pseudo_settings
-from experiments.methods.surfels import QUICK as QUICK_SURFELS
+from experiments.methods import CoarseConfig, WindowConfig, pseudo_settings
+from experiments.methods.surfels import REDUCED
 from experiments.run import run
 from experiments.training.gate import AGREEMENT, verdict, weigh_labels
 from experiments.training.loop import TrainingError, run_stage
 from experiments.training.programs import Programs
-from experiments.training.setup import initial_points
+from experiments.training.setup import Training, initial_points, initial_state
 from experiments.training.stored_run import choose_stage, load_run_scene, read_run, restore
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.artifacts.images import to_uint8
@@ -123,6 +124,44 @@ def test_surfels_run_through_all_stages_from_random_points(capture_folder, tmp_p
         assert len(splats.means) == 600  # no more points were there
 
 
+def test_a_coarse_model_becomes_finer_and_learns_from_windows(capture_folder, tmp_path, capsys):
+    fine = dataclasses.replace(TINY_SURFELS.field, capacity=800, selective_adam=True)
+    coarse = CoarseConfig(dataclasses.replace(TINY_SURFELS.field, capacity=500), steps=20)
+    steps = {"baseline_steps": 20, "downscale": 2, "coarse": coarse, "windows": WindowConfig()}
+    preset = dataclasses.replace(TINY_SURFELS, field=fine, **steps)
+    with jax.numpy_dtype_promotion("standard"):
+        scene = load_scene(str(capture_folder), downscale=2)
+        programs = Programs(preset, scene)
+        training = Training(programs, Checkpoints(tmp_path, {}))
+        state = training.train_baseline("baseline", 0)
+    assert "windows of photographs of 32 x 24 pixels, their own size" in capsys.readouterr().out
+    assert programs.photographs.pyramid.sizes == ((24, 32), (12, 16))
+    assert (programs.finest_width, int(state.step)) == (32, 20)
+    # The new surfels have filled all rows, and the coarse model's steps are over.
+    assert int(state.buffers.alive.sum()) == 800
+    assert [entry["step"] for entry in training.history["coarse_baseline"]][-1] == 20
+
+    def error(programs, state):
+        camera = camera_at(load_scene(str(capture_folder)).train.cameras, 2)
+        return np.abs(np.asarray(programs.render(state, camera).rgb) - plane.photograph(camera)[0])
+
+    first = dataclasses.replace(preset, field=coarse.field, windows=None, coarse=None)
+    before = Programs(first, scene)
+    kept = training.checkpoints.load("coarse_baseline", initial_state(before, 0))[1]
+    assert error(programs, state).mean() < 0.9 * error(before, kept).mean()
+    assert int(kept.buffers.alive.sum()) == 500
+    with jax.numpy_dtype_promotion("standard"):
+        again = training.train_baseline("baseline", 0)
+    assert "resumed" in capsys.readouterr().out
+    chex.assert_trees_all_equal(again.params, state.params)
+
+
+def test_windows_of_reduced_photographs_are_these(capture_folder):
+    scene = load_scene(str(capture_folder), downscale=2)
+    preset = dataclasses.replace(TINY_SURFELS, windows=WindowConfig(finest=2), downscale=2)
+    assert Programs(preset, scene).photographs is scene.train
+
+
 def test_no_step_is_taken_on_a_truncated_image(capture_folder, capsys):
     """The same steps with too little room and with plenty end alike."""
     states = []
@@ -156,7 +195,7 @@ def test_labels_weigh_what_they_deserve(off):
         depth = jnp.asarray(off * depth, jnp.float32)
         return Rendering(jnp.full(rgb.shape, 0.5), depth, jnp.ones(depth.shape))
 
-    settings = pseudo_settings(QUICK_SURFELS.labels)
+    settings = pseudo_settings(REDUCED.labels)
     changed, found = weigh_labels(label_sources(views, off * depths), render, settings)
     low, high = AGREEMENT
     expected = np.clip((found["agreement"] - low) / (high - low), 0, 1)

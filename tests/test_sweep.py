@@ -85,13 +85,14 @@ def test_an_arm_is_the_run_alone(preset, capture_folder):
     with jax.numpy_dtype_promotion("standard"):
         programs, start, arms = begin(preset, capture_folder)
         state, sources = start
-        stacked = stack_arms(arms, [start] * len(arms), len(jax.devices()))
-        together, metrics = programs.run("arms", *stacked, count=1)
+        states, *data = stack_arms(arms, [start] * len(arms), len(jax.devices()))
+        together, metrics = programs.run("arms", states, sources.views, *data, count=1)
         for i, settings in enumerate(arms):
             if ARMS[i] == "control":
                 alone, _ = programs.run("photographs", state, sources.views, count=1)
             else:
-                alone, _ = programs.run("random_closeups", state, sources, settings, count=1)
+                data = sources.views, sources, settings
+                alone, _ = programs.run("random_closeups", state, *data, count=1)
             arm = jax.tree.map(lambda leaf, i=i: leaf[i], together.replace(step=alone.step[None]))
             assert_same_step(arm.replace(step=alone.step), alone, state)
             assert int(together.step) == int(alone.step)
@@ -110,8 +111,8 @@ def test_an_arm_that_diverges_takes_no_other_down(capture_folder, capsys):
         both = []
         for second in (arms[1], broken):
             settings = [arms[0], second, arms[2]]
-            stacked = stack_arms(settings, [start] * 3, len(jax.devices()))
-            both.append(programs.run("arms", *stacked, count=2))
+            states, *data = stack_arms(settings, [start] * 3, len(jax.devices()))
+            both.append(programs.run("arms", states, start.sources.views, *data, count=2))
     (healthy, _), (after, metrics) = both
     assert metrics["skipped"][:3] == [0, 2, 0]  # then copies of the last, one a device
     assert "skipped, not finite" in capsys.readouterr().out

@@ -10,7 +10,7 @@ import numpy as np
 import plane
 
 from experiments.methods.nerf import QUICK
-from experiments.methods.surfels import QUICK as QUICK_SURFELS
+from experiments.methods.surfels import REDUCED
 from experiments.training.manifest import about_scene, write_manifest
 from experiments.training.programs import Programs
 from experiments.training.settings import plain_config
@@ -38,15 +38,16 @@ TINY = dataclasses.replace(
     downscale=1,
 )
 TINY_SURFELS = dataclasses.replace(
-    QUICK_SURFELS,
+    REDUCED,
     field=dataclasses.replace(
-        QUICK_SURFELS.field,
+        REDUCED.field,
         capacity=600,
         means_lr_steps=20,
         density=None,
         steps_per_target=2,
         raster=RasterizeConfig(capacity=2**14, tile=8, chunk=4, block=12),
     ),
+    labels=dataclasses.replace(REDUCED.labels, label="warp"),  # detail takes seconds
     baseline_steps=20,
     closeup_steps=2,
     downscale=1,

@@ -24,12 +24,14 @@ def run() -> None:
         scene = load_scene("table", downscale=preset.downscale)
         programs = Programs(preset, scene)
         state = initial_state(programs, seed=0)
-        state, _ = programs.run("photographs", state, jax.device_put(scene.train), count=WARMUP)
+        views = jax.device_put(scene.train)
+        state, _ = programs.run("photographs", state, views, count=WARMUP)
         start = start_labels(programs, state, seed=0)
         arms = [make_arm(arm, preset) for arm in ARMS + GRID]
         arms = [arm.settings for arm in sorted(arms, key=lambda arm: arm.outlook)]
-        stacked = stack_arms(arms, [start] * len(arms), len(jax.devices()))
-        alone = start.state, start.sources, pseudo_settings(preset.labels)
+        states, *data = stack_arms(arms, [start] * len(arms), len(jax.devices()))
+        stacked = states, views, *data
+        alone = start.state, views, start.sources, pseudo_settings(preset.labels)
         programs.make_room(4)  # virtual cameras need more than photographs; both calls get the same
         calls = {
             "alone": lambda p=programs, a=alone: p.run("random_closeups", *a, count=STEPS)[0],

@@ -1,9 +1,24 @@
 """The methods: one module each, and the table of them, written by hand."""
 
 from experiments.methods import nerf, surfels
-from experiments.methods.method import LabelConfig, Method, Preset, pseudo_settings
+from experiments.methods.method import (
+    CoarseConfig,
+    LabelConfig,
+    Method,
+    Preset,
+    WindowConfig,
+    pseudo_settings,
+)
 
 
 METHODS: dict[str, Method] = {"nerf": nerf.METHOD, "surfels": surfels.METHOD}
 
-__all__ = ["METHODS", "LabelConfig", "Method", "Preset", "pseudo_settings"]
+__all__ = [
+    "METHODS",
+    "CoarseConfig",
+    "LabelConfig",
+    "Method",
+    "Preset",
+    "WindowConfig",
+    "pseudo_settings",
+]

@@ -77,6 +77,32 @@ def _traced(labels):
 
 
 @dataclasses.dataclass(frozen=True)
+class WindowConfig:
+    """How steps read photographs finer than they are reduced: in windows as large as reduced ones.
+
+    Attributes:
+      finest: divisor of the finest size that is read; one that fits into memory is taken.
+      whole_share: share of the steps that read a whole reduced photograph.
+    """
+
+    finest: int = 1
+    whole_share: float = 0.25
+
+
+@dataclasses.dataclass(frozen=True)
+class CoarseConfig:
+    """A first training, on whole reduced photographs, whose result becomes finer.
+
+    Attributes:
+      field: the field's configuration in it.
+      steps: how many.
+    """
+
+    field: Any
+    steps: int
+
+
+@dataclasses.dataclass(frozen=True)
 class Preset:
     """One experiment with one method.
 
@@ -89,6 +115,8 @@ class Preset:
       closeup_steps: steps of stage 2 with labels, and of its control without.
       downscale: divisor of the photographs' size.
       gated: let left-out photographs decide how much labels weigh, which may be nothing.
+      windows: how steps read finer photographs; None: they read reduced photographs alone.
+      coarse: what trains before stage 1; None: stage 1 begins with the initial points.
     """
 
     method: str
@@ -99,6 +127,8 @@ class Preset:
     closeup_steps: int
     downscale: int = 1
     gated: bool = False
+    windows: WindowConfig | None = None
+    coarse: CoarseConfig | None = None
 
 
 class Method(NamedTuple):
@@ -120,6 +150,9 @@ class Method(NamedTuple):
       gaussians: `(params, buffers) -> Gaussians`, what viewers draw; None: they draw the scene's
         points.
       background: `(config) -> float`, gray level in [0, 1] behind the scene.
+      refine: `(key, config, params, buffers, render, cameras, pyramid) -> (params, buffers)` gives
+        what `CoarseConfig` trained the room and the detail of `config`; `render` renders a camera,
+        `cameras` are those of the photographs in `pyramid`. None for methods without `coarse`.
     """
 
     presets: Mapping[str, Preset]
@@ -132,3 +165,4 @@ class Method(NamedTuple):
     export: Callable[[pathlib.Path, str, Any, Any], None] = lambda *state: None
     gaussians: Callable[[Any, Any], Gaussians] | None = None
     background: Callable[[Any], float] = lambda config: 0.0
+    refine: Callable[..., tuple[Any, Any]] | None = None

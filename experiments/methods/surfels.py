@@ -1,14 +1,23 @@
 """Surfels (2D Gaussian splatting): presets, field, optimizer and exports."""
 
 import dataclasses
+import functools
 import pathlib
+from collections.abc import Callable
 
+import jax
+import jax.numpy as jnp
 import optax
+from rich.progress import track
 
-from experiments.methods.method import LabelConfig, Method, Preset
+from experiments.methods.method import CoarseConfig, LabelConfig, Method, Preset, WindowConfig
 from jaxcloseup.artifacts.gaussians import as_gaussians
 from jaxcloseup.artifacts.surfel_ply import write_surfels
-from jaxcloseup.field import RadianceField
+from jaxcloseup.field import RadianceField, Rendering
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.label_rules import label_depth
+from jaxcloseup.photographs import camera_at, to_float
+from jaxcloseup.pyramids import Pyramid
 from jaxcloseup.scene import Scene
 from jaxcloseup.splats.adaptive import AdaptiveConfig
 from jaxcloseup.splats.field import (
@@ -21,6 +30,7 @@ from jaxcloseup.splats.field import (
 )
 from jaxcloseup.splats.mcmc import McmcConfig
 from jaxcloseup.splats.rasterize import RasterizeConfig
+from jaxcloseup.splats.refinement import join_surfels, surfels_where_wrong
 from jaxcloseup.splats.surfels import Surfels
 from jaxcloseup.train import TrainConfig
 
@@ -36,6 +46,7 @@ class SurfelTrainingConfig(SurfelConfig):
     steps_per_target: int = 5
 
 
+_REFINED_AT = 4  # times the photographs' training size, at which new surfels are looked for
 WHOLE_IMAGES = TrainConfig(num_rays=None, num_label_rays=None)
 
 PAPER = Preset(
@@ -47,7 +58,8 @@ PAPER = Preset(
     closeup_steps=500,
 )
 
-QUICK = Preset(
+# Photographs reduced eightfold alone.
+REDUCED = Preset(
     method="surfels",
     field=SurfelTrainingConfig(
         capacity=10_000,
@@ -64,6 +76,7 @@ QUICK = Preset(
     ),
     train=WHOLE_IMAGES,
     labels=LabelConfig(
+        label="residual",
         magnification=(1.5, 3.0),
         leave_out_source=True,
         source_tolerance=0.05,
@@ -73,6 +86,33 @@ QUICK = Preset(
     closeup_steps=200,
     downscale=8,
     gated=True,
+)
+
+# First a coarse model, fast; then small surfels where photographs show more, taught by windows.
+QUICK = dataclasses.replace(
+    REDUCED,
+    field=dataclasses.replace(
+        REDUCED.field,
+        capacity=60_000,
+        sh_every=1,
+        regularize_from=1,
+        means_lr=(4e-4, 1.6e-5),
+        means_lr_steps=700,
+        selective_adam=True,
+        density=McmcConfig(start=0, stop=700, growth=1.0, noise=0.0),
+        raster=RasterizeConfig(capacity=2**17, block=32, antialias=True),
+    ),
+    coarse=CoarseConfig(
+        field=dataclasses.replace(
+            REDUCED.field,
+            means_lr_steps=1500,
+            raster=dataclasses.replace(REDUCED.field.raster, antialias=True),
+        ),
+        steps=1500,
+    ),
+    windows=WindowConfig(),
+    labels=dataclasses.replace(REDUCED.labels, label="warp"),
+    baseline_steps=1000,
 )
 
 
@@ -89,7 +129,7 @@ def with_adaptive_density(preset: Preset, density: AdaptiveConfig) -> Preset:
 
 
 # The quick training is too short for a reset of opacities.
-QUICK_ADAPTIVE = with_adaptive_density(QUICK, AdaptiveConfig(start=200, stop=1200))
+QUICK_ADAPTIVE = with_adaptive_density(REDUCED, AdaptiveConfig(start=200, stop=1200))
 PAPER_ADAPTIVE = with_adaptive_density(PAPER, AdaptiveConfig())
 
 
@@ -119,10 +159,36 @@ def export(folder: pathlib.Path, stage: str, surfels: Surfels, buffers: SurfelBu
     write_surfels(folder / "splats" / f"{stage}.ply", surfels, buffers.alive)
 
 
+def refine(
+    key: jax.Array,
+    config: SurfelTrainingConfig,
+    surfels: Surfels,
+    buffers: SurfelBuffers,
+    render: Callable[[Camera], Rendering],
+    cameras: Camera,
+    pyramid: Pyramid,
+) -> tuple[Surfels, SurfelBuffers]:
+    """Fill the rows that `config` has beyond `surfels` where photographs show more than these."""
+    count = pyramid.values.shape[0]
+    each = max(0, config.capacity - int(buffers.alive.sum())) // count
+    level = [width < 1.5 * _REFINED_AT * cameras.width for _, width in pyramid.sizes].index(True)
+    sample = jax.jit(functools.partial(surfels_where_wrong, count=each, sh_degree=config.sh_degree))
+    new = []
+    for view in track(range(count), description="   new surfels"):
+        camera = pyramid.camera(camera_at(cameras, view), view, level)
+        photograph, seen = to_float(pyramid.image(view, level)), render(camera)
+        data = photograph[..., :3], photograph[..., 3], seen.rgb, label_depth(seen)
+        new.append(sample(jax.random.fold_in(key, view), camera, *data))
+    new = jax.tree.map(lambda *rows: jnp.concatenate(rows), *new)
+    surfels, alive = join_surfels((surfels, buffers.alive), new, config.capacity)
+    return surfels, buffers.replace(alive=alive)
+
+
 METHOD = Method(
     presets={
         "quick": QUICK,
         "paper": PAPER,
+        "reduced": REDUCED,
         "quick_adaptive": QUICK_ADAPTIVE,
         "paper_adaptive": PAPER_ADAPTIVE,
     },
@@ -135,4 +201,5 @@ METHOD = Method(
     export=export,
     gaussians=lambda surfels, buffers: as_gaussians(surfels, buffers.alive),
     background=lambda config: config.background or 0.0,
+    refine=refine,
 )

@@ -4,7 +4,6 @@ Everything is made from the state and its training photographs, so a run keeps i
 where they have changed.
 """
 
-import dataclasses
 import hashlib
 import io
 import json
@@ -40,8 +39,7 @@ from jaxcloseup.gather import GatherSources, gather, gather_sources
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.label_rules import label_depth
 from jaxcloseup.photographs import Views, camera_at
-from jaxcloseup.pyramids import Pyramid, scene_pyramid
-from jaxcloseup.scene import SceneError
+from jaxcloseup.pyramids import Pyramid
 from jaxcloseup.train import TrainState
 
 
@@ -104,11 +102,7 @@ def detail_path(folder: pathlib.Path, stage: str) -> pathlib.Path:
 def make_detail(programs: Programs, state: TrainState) -> tuple[Detail, dict[str, Any]]:
     """Render the residuals of all photographs, and learn from left-out ones how to weigh them."""
     scene = programs.scene
-    try:
-        pyramid, divisor = scene_pyramid(scene)
-    except SceneError as error:  # such as full-size photographs that were not kept
-        print(f"   detail has only the photographs that training reads: {error}")
-        pyramid, divisor = scene_pyramid(dataclasses.replace(scene, photographs_at=None))
+    pyramid, divisor = programs.pyramid()
     (height, width), *_ = pyramid.sizes
     share = f"1 / {divisor} of their size" if divisor > 1 else "their own size"
     print(f"   detail of photographs of {width} x {height} pixels, {share}", flush=True)

@@ -54,7 +54,7 @@ def fine_tune(
     if coverage == 0:
         print("nothing is fine-tuned")
         return state
-    views = programs.scene.train
+    views = programs.photographs
     state, values = programs.run("target_views", state, views, labels, settings, count=steps)
     if values["skipped"] == steps:
         raise TrainingError(f"loss or gradient was not finite in each of {steps} steps for them")

@@ -1,5 +1,6 @@
 """Compiled programs of one preset on one scene: kinds of steps, and rendering."""
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable
@@ -15,9 +16,12 @@ from orbax.checkpoint.multihost import sync_global_processes
 from experiments.methods import METHODS, Preset
 from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.photographs import Views
 from jaxcloseup.pseudo import LabelSources, PseudoSettings
-from jaxcloseup.scene import Scene
+from jaxcloseup.pyramids import Pyramid, scene_pyramid
+from jaxcloseup.scene import Scene, SceneError
 from jaxcloseup.train import TrainState, closeup_step, labeled_step, run_steps, train_step
+from jaxcloseup.windows import Windows, photograph_windows
 
 
 HOSTS_WAIT = 24 * 3600  # seconds
@@ -37,6 +41,7 @@ class Programs:
         self.optimizer = self.method.make_optimizer(preset.field, scene)
         self.growth = 1
         self._meetings = 0
+        self._pyramids: dict[int, tuple[Pyramid, int]] = {}
         self._compile()
 
     def _compile(self) -> None:
@@ -66,7 +71,7 @@ class Programs:
         arms_states = TrainState(step=None, params=0, buffers=0, opt_state=0, key=0)
         arms_sources = LabelSources(views=None, depths=0, blocks=0)
         arms_step = jax.vmap(
-            step, in_axes=(arms_states, arms_sources, 0), out_axes=(arms_states, 0)
+            step, in_axes=(arms_states, None, arms_sources, 0), out_axes=(arms_states, 0)
         )
         shared, split = PartitionSpec(), PartitionSpec("arms")
         states = TrainState(step=shared, params=split, buffers=split, opt_state=split, key=split)
@@ -74,12 +79,13 @@ class Programs:
         mesh = Mesh(np.array(jax.devices()), ("arms",))
         self._on_devices = jax.tree.map(
             lambda spec: NamedSharding(mesh, spec),
-            (states, sources, split),
+            (states, shared, sources, split),
             is_leaf=lambda leaf: isinstance(leaf, PartitionSpec),
         )
 
         def run_arms(
             states_now: TrainState,
+            views: Views | Windows,
             sources_now: LabelSources,
             settings: PseudoSettings,
             count: jax.Array | int,
@@ -87,12 +93,50 @@ class Programs:
             return jax.shard_map(
                 lambda *data: run_steps(arms_step, *data[:-1], count=data[-1]),
                 mesh=mesh,
-                in_specs=(states, sources, split, shared),
+                in_specs=(states, shared, sources, split, shared),
                 out_specs=(states, split),
                 check_vma=False,
-            )(states_now, sources_now, settings, count)
+            )(states_now, views, sources_now, settings, count)
 
         return run_arms
+
+    def pyramid(self, finest: int = 1) -> tuple[Pyramid, int]:
+        """The training photographs from the finest size that fits, and its divisor; made once.
+
+        Args:
+          finest: smallest divisor of their own size.
+        """
+        if finest not in self._pyramids:
+            scene = self.scene
+            try:
+                found = scene_pyramid(scene, finest=finest)
+            except SceneError as error:  # such as full-size photographs that were not kept
+                print(f"only the photographs reduced for training are read: {error}")
+                found = scene_pyramid(dataclasses.replace(scene, photographs_at=None))
+            self._pyramids[finest] = found
+        return self._pyramids[finest]
+
+    @functools.cached_property
+    def photographs(self) -> Views | Windows:
+        """What steps learn from: reduced photographs, or windows of finer ones."""
+        views, windows = self.scene.train, self.preset.windows
+        if windows is None or windows.finest >= self.preset.downscale:
+            return views
+        pyramid, divisor = self.pyramid(windows.finest)
+        (height, width), *coarser = pyramid.sizes
+        if not coarser:
+            return views
+        share = f"1 / {divisor} of their size" if divisor > 1 else "their own size"
+        print(f"learning from windows of photographs of {width} x {height} pixels, {share}")
+        return photograph_windows(views.cameras, pyramid, whole_share=windows.whole_share)
+
+    @property
+    def finest_width(self) -> int:
+        """Width in pixels of the finest photographs that steps learn from."""
+        learned = self.photographs
+        if isinstance(learned, Windows):
+            return learned.pyramid.sizes[0][1]
+        return learned.cameras.width
 
     def make_room(self, growth: int) -> None:
         """Grow the room to at least `growth` times the preset's."""

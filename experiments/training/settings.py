@@ -1,7 +1,7 @@
 """Settings by name: `--set name=value` in programs, `name=value` in the arms of a sweep.
 
-A setting is a number, a word or a range in a preset. Its name is its path without the group that
-holds it (`field`, `train` or `labels`): `capacity`, `density.growth`, `rgb_tolerance`.
+A setting is a number, a word or a range in a preset. Its name is its path without the groups that
+hold it (`field`, `train` or `labels`): `capacity`, `density.growth`, `rgb_tolerance`.
 """
 
 import dataclasses
@@ -22,8 +22,9 @@ BOUNDS = {
     "magnification": (1, math.inf),
     **dict.fromkeys(("num_sources", "baseline_steps", "closeup_steps", "downscale"), (1, math.inf)),
     **dict.fromkeys(("num_rays", "num_label_rays", "chunk", "capacity"), (1, math.inf)),
+    **dict.fromkeys(("finest", "steps"), (1, math.inf)),
     **dict.fromkeys(("width", "num_coarse", "num_fine"), (1, math.inf)),
-    **dict.fromkeys(("initial_opacity", "ssim_weight", "background"), (0, 1)),
+    **dict.fromkeys(("whole_share", "initial_opacity", "ssim_weight", "background"), (0, 1)),
 }
 _CHOICES = {
     "label": ("warp", "residual"),
@@ -64,7 +65,7 @@ def settings_of(preset: Preset, method: Method | None = None) -> dict[str, Setti
             continue
         if path == ("labels", "expected_depth") and method.with_expected_depth is None:
             continue
-        name = ".".join(path[1:] if path[0] in _GROUPS else path)
+        name = ".".join(part for part in path if part not in _GROUPS)
         found[name] = Setting(path, kind, value)
     return found
 

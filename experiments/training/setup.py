@@ -84,9 +84,35 @@ class Training:
 
     def train_baseline(self, stage: str, seed: int) -> TrainState:
         """Stage 1 of a seed: photographs alone."""
-        preset, views = self.programs.preset, self.programs.scene.train
-        start = initial_state(self.programs, seed)
-        return self.train(stage, "photographs", start, views, steps=preset.baseline_steps)
+        programs, preset = self.programs, self.programs.preset
+        if preset.coarse is None:
+            start = initial_state(programs, seed)
+        else:
+            start = self._train_coarse(stage, seed)
+        return self.train(
+            stage, "photographs", start, programs.photographs, steps=preset.baseline_steps
+        )
+
+    def _train_coarse(self, stage: str, seed: int) -> TrainState:
+        """The state of `preset.coarse`, with the room and the detail of the preset itself."""
+        programs, preset = self.programs, self.programs.preset
+        first = dataclasses.replace(preset, field=preset.coarse.field, coarse=None, windows=None)
+        coarse = dataclasses.replace(self, programs=Programs(first, programs.scene))
+        start = initial_state(coarse.programs, seed)
+        views, steps = coarse.programs.photographs, preset.coarse.steps
+        state = coarse.train(f"coarse_{stage}", "photographs", start, views, steps=steps)
+        pyramid, _ = programs.pyramid(preset.windows.finest)
+        # Large images need more room than training does.
+        large = Programs(first, programs.scene)
+        large.make_room(8 * coarse.programs.growth)
+        key_fine, key_refine = jax.random.split(jax.random.fold_in(state.key, state.step))
+        with timed(self.seconds, f"refine_{stage}"):
+            params, buffers = programs.method.refine(
+                *(key_refine, preset.field, state.params, state.buffers),
+                *(functools.partial(large.render, state), programs.scene.train.cameras, pyramid),
+            )
+        none = jnp.zeros_like(state.step)
+        return TrainState(none, params, buffers, programs.optimizer.init(params), key_fine)
 
 
 def identity_of(scene: Scene, preset: Preset, names: Mapping[str, str]) -> dict[str, Any]:

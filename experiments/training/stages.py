@@ -76,7 +76,7 @@ def run_stages(
       perceptual: networks of LPIPS.
     """
     programs = training.programs
-    preset, scene, method = programs.preset, programs.scene, programs.method
+    preset, scene, photographs = programs.preset, programs.scene, programs.photographs
     say_which_points_fit(programs)
     baseline = training.train_baseline("baseline", seed)
     with timed(training.seconds, "depths"):
@@ -93,8 +93,9 @@ def run_stages(
 
     def control(name, steps):
         if steps not in controls:
-            views = scene.train
-            controls[steps] = training.train(name, "photographs", baseline, views, steps=steps)
+            controls[steps] = training.train(
+                name, "photographs", baseline, photographs, steps=steps
+            )
             scorer.score(name, controls[steps])
         return controls[steps]
 
@@ -105,7 +106,7 @@ def run_stages(
         # Without labels a stage is its control: the same steps on the same photographs.
         state = without
         if labeled:
-            state = training.train(stage, kind, start.state, *data, steps=steps)
+            state = training.train(stage, kind, start.state, photographs, *data, steps=steps)
         scorer.score(stage, state)
         return state
 
@@ -124,10 +125,9 @@ def run_stages(
         with timed(training.seconds, "test_time_labels"):
             targets, kept = scene.test.cameras, detail_path(output_dir, "baseline")
             labels = label_targets(programs, start, targets, preset.labels, own, kept)
-        steps = method.target_steps(preset.field, len(scene.test))
+        steps = programs.method.target_steps(preset.field, len(scene.test))
         names, labeled = ("test_time", "test_time_control"), use_labels or by_detail
-        data = "target_views", scene.train, labels, own
-        fine_tune(*names, *data, steps=steps, labeled=labeled)
+        fine_tune(*names, "target_views", labels, own, steps=steps, labeled=labeled)
     detail = None
     if "detail" in to_run:
         detail = add_detail_stage(training, scorer, output_dir, *latest)

@@ -194,7 +194,8 @@ def train_together(
         [arm.settings for arm, _ in group], begun, len(jax.devices())
     )
     steps = training.programs.preset.closeup_steps
-    states = training.train(name, "arms", state, sources, settings, steps=steps)
+    views = training.programs.photographs
+    states = training.train(name, "arms", state, views, sources, settings, steps=steps)
     for i, (arm, seed) in enumerate(group):
         alone = jax.tree.map(lambda leaf, i=i: leaf[i], states.replace(step=None))
         skipped = sum(chunk["skipped"][i] for chunk in training.history[name])
@@ -237,7 +238,9 @@ def train_in_turn(
         steps = programs.method.target_steps(preset.field, len(scene.test))
     try:
         state = training.train(
-            name, "target_views", start.state, scene.train, labels, arm.settings, steps=steps
+            *(name, "target_views", start.state),
+            *(programs.photographs, labels, arm.settings),
+            steps=steps,
         )
     except TrainingError as error:
         print(f"{name} is left out: {error}")

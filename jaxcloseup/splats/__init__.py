@@ -14,12 +14,14 @@ from jaxcloseup.splats.field import (
 from jaxcloseup.splats.mcmc import McmcConfig
 from jaxcloseup.splats.projection import Discs, project_discs, to_camera
 from jaxcloseup.splats.rasterize import Footprints, RasterizeConfig, SplatImage, rasterize
+from jaxcloseup.splats.refinement import join_surfels, surfels_where_wrong
 from jaxcloseup.splats.regularizers import (
     depth_to_normal,
     normal_inconsistency,
     scale_free_distortion,
 )
 from jaxcloseup.splats.render import SurfelAux, render_surfels
+from jaxcloseup.splats.selective_adam import scale_by_selective_adam
 from jaxcloseup.splats.spherical_harmonics import rgb_to_sh, sh_basis, sh_to_rgb
 from jaxcloseup.splats.surfels import Surfels, random_points, surfels_from_points
 
@@ -41,18 +43,21 @@ __all__ = [
     "camera_extent",
     "density_control",
     "depth_to_normal",
+    "join_surfels",
     "normal_inconsistency",
     "project_discs",
     "random_points",
     "rasterize",
     "render_surfels",
     "rgb_to_sh",
+    "scale_by_selective_adam",
     "scale_free_distortion",
     "sh_basis",
     "sh_to_rgb",
     "surfel_field",
     "surfel_optimizer",
     "surfels_from_points",
+    "surfels_where_wrong",
     "to_camera",
     "with_expected_depth",
 ]

@@ -28,6 +28,7 @@ from jaxcloseup.splats.regularizers import (
     scale_free_distortion,
 )
 from jaxcloseup.splats.render import SurfelAux, render_surfels
+from jaxcloseup.splats.selective_adam import scale_by_selective_adam
 from jaxcloseup.splats.surfels import Surfels, surfels_from_points
 
 
@@ -63,6 +64,7 @@ class SurfelConfig:
       opacity_lr: Adam's learning rate of the opacity logits.
       scale_lr: Adam's learning rate of the log scales.
       rotation_lr: Adam's learning rate of the quaternions.
+      selective_adam: leave surfels that a step does not see alone, see `scale_by_selective_adam`.
       density: config of a density control, which moves, adds and removes surfels, see
         `density_control`; None has none.
       raster: static sizes of the rasterizer.
@@ -88,6 +90,7 @@ class SurfelConfig:
     opacity_lr: float = 5e-2
     scale_lr: float = 5e-3
     rotation_lr: float = 1e-3
+    selective_adam: bool = False
     density: Hashable | None = dataclasses.field(default_factory=McmcConfig)
     raster: RasterizeConfig = dataclasses.field(default_factory=RasterizeConfig)
 
@@ -215,7 +218,8 @@ def surfel_optimizer(config: SurfelConfig, *, extent: float) -> optax.GradientTr
       config: static.
       extent: size of the capture in world units.
     """
-    adam = optax.chain(optax.scale_by_adam(eps=1e-15), _scale_by_learning_rates(config, extent))
+    moments = scale_by_selective_adam if config.selective_adam else optax.scale_by_adam
+    adam = optax.chain(moments(eps=1e-15), _scale_by_learning_rates(config, extent))
     return _density_control(config, extent).wrap_optimizer(adam)
 
 

@@ -56,6 +56,8 @@ def mcmc_control(
 
         due = is_due(state.step, every=config.every, start=config.start, stop=config.stop)
         state = jax.lax.cond(due, move, lambda state: state, state)
+        if not config.noise:
+            return state
         learning_rate = means_lr(state.step)
         surfels = add_position_noise(
             key_noise, state.params, state.buffers.alive, learning_rate, config

@@ -1,0 +1,61 @@
+"""Adam that leaves surfels out of sight alone, as gsplat's selective Adam does.
+
+A window shows a small part of a scene. Adam would move the other surfels on, by what it remembers
+of older gradients, and forget how large these were.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+
+class SelectiveAdamState(NamedTuple):
+    """Moments of the gradients of N surfels.
+
+    Attributes:
+      count: `[N]` int32 steps in which each was seen.
+      mu: mean of its gradients.
+      nu: mean of their squares.
+    """
+
+    count: jax.Array
+    mu: optax.Updates
+    nu: optax.Updates
+
+
+def scale_by_selective_adam(
+    b1: float = 0.9, b2: float = 0.999, eps: float = 1e-15
+) -> optax.GradientTransformation:
+    """Adam (Kingma and Ba 2015) of each surfel in the steps alone that see it.
+
+    A surfel is seen where its color has a gradient. Each counts its own steps, which correct the
+    bias of its moments, so that surfels may be added at any time.
+    """
+
+    def init(params):
+        zeros = jax.tree.map(jnp.zeros_like, params)
+        return SelectiveAdamState(jnp.zeros(params.means.shape[0], jnp.int32), zeros, zeros)
+
+    def update(gradients, state, params=None):
+        del params
+        seen = jnp.any(gradients.sh != 0, axis=(1, 2))
+        count = state.count + seen.astype(jnp.int32)
+
+        def rows(values, like):
+            return values.reshape(-1, *(1,) * (like.ndim - 1))
+
+        def moment(old, new, decay):
+            return jnp.where(rows(seen, old), decay * old + (1 - decay) * new, old)
+
+        def step(mu, nu):
+            times = rows(jnp.maximum(count, 1), mu).astype(mu.dtype)
+            mean, square = mu / (1 - b1**times), nu / (1 - b2**times)
+            return jnp.where(rows(seen, mu), mean / (jnp.sqrt(square) + eps), 0)
+
+        mu = jax.tree.map(lambda old, g: moment(old, g, b1), state.mu, gradients)
+        nu = jax.tree.map(lambda old, g: moment(old, g * g, b2), state.nu, gradients)
+        return jax.tree.map(step, mu, nu), SelectiveAdamState(count, mu, nu)
+
+    return optax.GradientTransformation(init, update)

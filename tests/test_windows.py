@@ -1,0 +1,97 @@
+"""Windows against the photographs that they are cut out of, and against renders of whole images."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import plane
+import pytest
+from splat_scenes import CONFIG, random_scene, to_surfels
+
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.pyramids import photograph_pyramid
+from jaxcloseup.splats import render_surfels
+from jaxcloseup.windows import cut_window, photograph_windows, sample_window
+
+
+WHOLE_SHARE = 0.25
+
+
+@pytest.fixture(scope="module")
+def windows():
+    """Photographs of 4, 2 and 1 times 12 x 16 pixels."""
+    rng = np.random.default_rng(0)
+    views, _ = plane.make_views([plane.camera_above(x, 0, 4.0) for x in (-1.0, 0.0, 1.0)])
+
+    def photographs(scale):
+        height, width = 12 * scale, 16 * scale
+        rgb = rng.integers(0, 256, (3, height, width, 3)).astype(np.uint8)
+        intrinsics = scale * np.array([[20.0, 21.0, 8.5, 6.2]] * 3, np.float32)
+        cameras = Camera(views.cameras.camtoworld, jnp.asarray(intrinsics), height, width)
+        return views.replace(cameras=cameras, rgb=rgb, weight=np.ones(rgb.shape[:3], np.float32))
+
+    coarsest = photographs(1)
+    pyramid = photograph_pyramid(photographs(4), coarsest)
+    assert pyramid.sizes == ((48, 64), (24, 32), (12, 16))
+    return photograph_windows(coarsest.cameras, pyramid, whole_share=WHOLE_SHARE)
+
+
+def test_a_window_is_a_part_of_its_level(windows):
+    for view, level, row, column in ((0, 0, 36, 48), (2, 1, 5, 7), (1, 2, 0, 0)):
+        window = cut_window(windows, view, level, jnp.array([row, column]))
+        whole = np.asarray(windows.pyramid.image(view, level)) / np.float32(255)
+        part = whole[row : row + 12, column : column + 16]
+        np.testing.assert_allclose(window.rgb, part[..., :3], rtol=1e-6)
+        np.testing.assert_allclose(window.weight, part[..., 3], rtol=1e-6)
+
+
+def test_windows_cover_all_pixels_of_all_levels_with_the_stated_shares(windows, key):
+    count = 20_000
+
+    @jax.jit
+    @jax.vmap
+    def draw(key):
+        camera = sample_window(key, windows).cameras
+        return camera.position[0], camera.intrinsics
+
+    position, intrinsics = map(np.asarray, draw(jax.random.split(key, count)))
+    view = np.searchsorted([-0.5, 0.5], position)
+    level = 2 - np.rint(np.log2(intrinsics[:, 0] / 20)).astype(int)
+    own = np.asarray(windows.pyramid.intrinsics)[view, level]
+    corner = np.rint(own[:, 2:] - intrinsics[:, 2:]).astype(int)
+    np.testing.assert_allclose(np.bincount(view) / count, 1 / 3, atol=0.015)
+    np.testing.assert_allclose(np.bincount(level) / count, [0.375, 0.375, WHOLE_SHARE], atol=0.015)
+    for index, (height, width) in enumerate(windows.pyramid.sizes):
+        x, y = corner[level == index].T
+        assert x.min() == 0 and x.max() == width - 16
+        assert y.min() == 0 and y.max() == height - 12
+        for places, last in ((x, width - 16), (y, height - 12)):
+            seen = np.bincount(places, minlength=last + 1) / len(places)
+            np.testing.assert_allclose(seen, 1 / (last + 1), atol=0.015)
+
+
+def test_a_window_learns_as_that_part_of_a_whole_image():
+    """The gradient of a window's error is that of the same pixels of the whole render."""
+    surfels, alive = to_surfels(random_scene(0, count=40)), jnp.ones(40, bool)
+    whole = Camera(jnp.eye(3, 4), jnp.array([60.0, 68.0, 29.0, 26.0]), 48, 64)
+    row, column, height, width = 13, 21, 24, 32
+    shifted = whole.intrinsics - jnp.array([0.0, 0.0, column, row])
+    window = whole.replace(intrinsics=shifted, height=height, width=width)
+    target = jax.random.uniform(jax.random.key(1), (height, width, 3))
+    config = dataclasses.replace(CONFIG, antialias=True)
+
+    @functools.partial(jax.jit, static_argnums=(2, 3))
+    @functools.partial(jax.value_and_grad, has_aux=True)
+    def error(surfels, camera, row, column):
+        seen = render_surfels(surfels, alive, camera, config)
+        rgb = seen.rgb[row : row + height, column : column + width]
+        return jnp.sum((rgb - target) ** 2), seen.overflow
+
+    (expected, overflow), theirs = error(surfels, whole, row, column)
+    assert not overflow
+    (value, _), ours = error(surfels, window, 0, 0)
+    np.testing.assert_allclose(value, expected, rtol=1e-5)
+    for one, other in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5 * np.abs(other).max())
