@@ -9,7 +9,7 @@ import importlib
 from absl import app, flags
 
 
-SUITES = ("nerf", "warp", "labels", "splats", "sweep", "resume", "detail")
+SUITES = ("nerf", "warp", "labels", "splats", "sweep", "resume", "detail", "scales")
 
 _SUITE = flags.DEFINE_list("suite", ["nerf", "warp"], f"suites to run: {', '.join(SUITES)}")
 

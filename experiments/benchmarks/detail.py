@@ -7,16 +7,14 @@ what a viewer sees change that does not change in the scene.
 """
 
 import itertools
-import pathlib
-import sys
 import time
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.benchmarks.newest_run import newest_run
 from experiments.training.detail import detail_path, detailed, find_detail
-from experiments.training.stored_run import choose_stage, load_run_scene, read_run, restore
 from experiments.viewing.camera_paths import dolly, resized
 from jaxcloseup.geometry import warp_to
 from jaxcloseup.label_rules import label_depth
@@ -29,16 +27,8 @@ VIEWS = (3, 25, 47)  # training photographs from which dollies start
 
 def run() -> None:
     """Print flicker with and without detail, and the seconds of both halves of a view."""
-    runs = sorted(pathlib.Path("outputs/table/surfels").glob("*/manifest.json"))
-    if not runs:
-        sys.exit(
-            "experiments.bench: no run of table: run `python -m experiments.run --scene=table`"
-        )
-    record = read_run(runs[-1].parent)
-    stage = choose_stage(record, None)
-    scene = load_run_scene(record)
-    programs, state = restore(record, scene, stage)
-    detail, _ = find_detail(programs, state, detail_path(record.folder, stage))
+    folder, stage, scene, programs, state = newest_run()
+    detail, _ = find_detail(programs, state, detail_path(folder, stage))
 
     def shoot(camera):
         seen = programs.render(state, camera)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 import pathlib
 from collections.abc import Callable
 
@@ -169,12 +170,13 @@ def refine(
     pyramid: Pyramid,
 ) -> tuple[Surfels, SurfelBuffers]:
     """Fill the rows that `config` has beyond `surfels` where photographs show more than these."""
-    count = pyramid.values.shape[0]
-    each = max(0, config.capacity - int(buffers.alive.sum())) // count
+    views = pyramid.values.shape[0]
     level = [width < 1.5 * _REFINED_AT * cameras.width for _, width in pyramid.sizes].index(True)
+    free = config.capacity - int(buffers.alive.sum())
+    each = min(max(0, free) // views, math.prod(pyramid.sizes[level]))
     sample = jax.jit(functools.partial(surfels_where_wrong, count=each, sh_degree=config.sh_degree))
     new = []
-    for view in track(range(count), description="   new surfels"):
+    for view in track(range(views), description="   new surfels"):
         camera = pyramid.camera(camera_at(cameras, view), view, level)
         photograph, seen = to_float(pyramid.image(view, level)), render(camera)
         data = photograph[..., :3], photograph[..., 3], seen.rgb, label_depth(seen)
