@@ -130,14 +130,6 @@ class Programs:
         print(f"learning from windows of photographs of {width} x {height} pixels, {share}")
         return photograph_windows(views.cameras, pyramid, whole_share=windows.whole_share)
 
-    @property
-    def finest_width(self) -> int:
-        """Width in pixels of the finest photographs that steps learn from."""
-        learned = self.photographs
-        if isinstance(learned, Windows):
-            return learned.pyramid.sizes[0][1]
-        return learned.cameras.width
-
     def make_room(self, growth: int) -> None:
         """Grow the room to at least `growth` times the preset's."""
         if growth > self.growth:

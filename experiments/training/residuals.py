@@ -18,7 +18,7 @@ from jaxcloseup.pyramids import Pyramid
 from jaxcloseup.train import TrainState
 
 
-# How many times finer than reduced photographs a state is rendered at least; then it is enlarged.
+# How many times finer than reduced photographs a state is rendered; for finer ones it is enlarged.
 FINER = 4
 FINER_RAYS = 1  # the same for fields that render single rays, and so whole images slowly
 MISFIT = 4  # times the median error at which a photograph has a quarter of its trust
@@ -57,8 +57,8 @@ def render_residuals(
     """Render every photograph's own view, and subtract it from the photograph at every level.
 
     The state is rendered at levels up to `FINER` (or `FINER_RAYS`) times the reduced photographs'
-    size, or up to the finest that it learned from, and enlarged for finer ones. Exposure is not
-    detail: an affine map first brings each photograph's colors to its render's.
+    size, and enlarged for finer ones. Exposure is not detail: an affine map first brings each
+    photograph's colors to its render's.
 
     Args:
       programs: the run's.
@@ -73,8 +73,7 @@ def render_residuals(
     scene = programs.scene
     cameras, last = scene.train.cameras, len(pyramid.sizes) - 1
     most = FINER_RAYS if programs.method.renders_pixels else FINER
-    finest = max(most * cameras.width, programs.finest_width)
-    rendered = [width < 1.5 * finest for _, width in pyramid.sizes].index(True)
+    rendered = [width < 1.5 * most * cameras.width for _, width in pyramid.sizes].index(True)
     # Large images need more room than training does, which must not slow it down.
     large = Programs(programs.preset, scene)
     larger = pyramid.sizes[rendered][1] / cameras.width
