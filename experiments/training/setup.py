@@ -162,11 +162,13 @@ def initial_points(key: jax.Array, scene: Scene, count: int = 5000) -> tuple[Any
 
 def say_which_points_fit(programs: Programs) -> None:
     """Print how many of the initial points a field begins with, if not with all."""
-    most, count = programs.method.max_points(programs.preset.field), len(programs.scene.points)
+    preset, count = programs.preset, len(programs.scene.points)
+    first, name = (
+        (preset, "capacity") if preset.coarse is None else (preset.coarse, "coarse.capacity")
+    )
+    most = programs.method.max_points(first.field)
     if most is not None and count > most:
-        print(
-            f"training begins with {most} of {count} points: --set capacity=N makes room for more"
-        )
+        print(f"training begins with {most} of {count} points: --set {name}=N makes room for more")
 
 
 def start_labels(
