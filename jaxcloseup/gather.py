@@ -279,8 +279,7 @@ def _level(wanted, coarseness):
 
 def _read(pyramid, view, ray, level):
     """Values `[N, C]` of one view at rays (x / z, y / z) `[N, 2]` and fractional levels `[N]`."""
-    sizes = jnp.asarray(pyramid.sizes, jnp.int32)
-    starts = jnp.cumsum(sizes[:, 0] * sizes[:, 1]) - sizes[:, 0] * sizes[:, 1]
+    sizes, starts = (jnp.asarray(x, jnp.int32) for x in (pyramid.sizes, pyramid.starts))
     finer = jnp.floor(jax.lax.stop_gradient(level)).astype(jnp.int32)
     share = (level - finer.astype(level.dtype))[:, None]
 

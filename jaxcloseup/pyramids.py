@@ -1,5 +1,6 @@
 """Pyramids: images of several views at a fine size, at halves of it, and as a model reads them."""
 
+import itertools
 import math
 
 import cv2
@@ -37,11 +38,20 @@ class Pyramid:
         focal = mean_focal(self.intrinsics[view])
         return jnp.log2(focal[0] / focal)
 
+    @property
+    def starts(self) -> tuple[int, ...]:
+        """Index of each level's first pixel, among the P."""
+        counts = [height * width for height, width in self.sizes]
+        return tuple(itertools.accumulate(counts[:-1], initial=0))
+
     def pixels_of(self, index: int) -> slice:
         """The pixels of one level, among the P."""
-        start = sum(height * width for height, width in self.sizes[:index])
-        height, width = self.sizes[index]
+        start, (height, width) = self.starts[index], self.sizes[index]
         return slice(start, start + height * width)
+
+    def level_near(self, width: int) -> int:
+        """The finest level that is not 1.5 times as wide as `width`; there must be one."""
+        return [own < 1.5 * width for _, own in self.sizes].index(True)
 
     def level(self, index: int) -> jax.Array:
         """Images `[V, H, W, C]` of one level."""

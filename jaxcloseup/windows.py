@@ -63,8 +63,7 @@ def cut_window(
     """The window of one view at one level whose first pixel is in row and column `corner[2]`."""
     pyramid = windows.pyramid
     height, width = pyramid.sizes[-1]
-    sizes = jnp.asarray(pyramid.sizes, jnp.int32)
-    starts = jnp.cumsum(sizes[:, 0] * sizes[:, 1]) - sizes[:, 0] * sizes[:, 1]
+    sizes, starts = (jnp.asarray(x, jnp.int32) for x in (pyramid.sizes, pyramid.starts))
     rows = corner[0] + jnp.arange(height)[:, None]
     columns = corner[1] + jnp.arange(width)[None]
     values = to_float(pyramid.values[view, starts[level] + rows * sizes[level, 1] + columns])

@@ -1,10 +1,12 @@
 """Small random splat scenes, and one renderer that all tests share so that it compiles once."""
 
+import dataclasses
 import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import reference_splats as reference
 
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.splats import RasterizeConfig, Surfels, render_surfels
@@ -15,6 +17,8 @@ INTRINSICS = np.array([30.0, 34.0, 14.5, 13.0])  # fx != fy, principal point off
 IDENTITY = np.eye(4)[:3]
 BACKGROUND = np.array([0.2, 0.4, 0.6])
 CONFIG = RasterizeConfig(capacity=1024, near=NEAR, tile=8, chunk=4, block=4)
+ANTIALIASED = dataclasses.replace(CONFIG, antialias=True)
+OUTPUTS = ("rgb", "alpha", "depth", "normal", "median_depth", "distortion")
 
 
 def random_scene(seed, *, depth=(1.0, 3.0), log_scale=(-4.0, -0.7), count=COUNT):
@@ -60,3 +64,9 @@ def _render(surfels, camera, alive, config):
     image = render_surfels(surfels, alive, camera, config, background=background)
     aux = image.aux._asdict()
     return dict(rgb=image.rgb, alpha=image.alpha, depth=image.depth, **aux)
+
+
+def oracle(scene, camtoworld=IDENTITY, intrinsics=INTRINSICS, size=(HEIGHT, WIDTH), **options):
+    return reference.render(
+        scene, camtoworld, intrinsics, *size, near=NEAR, background=BACKGROUND, **options
+    )

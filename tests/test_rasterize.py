@@ -1,6 +1,5 @@
 """Images and derivatives of surfels against a NumPy splatter, and their invariances."""
 
-import dataclasses
 import functools
 
 import jax
@@ -9,15 +8,17 @@ import numpy as np
 import pytest
 import reference_splats as reference
 from splat_scenes import (
-    BACKGROUND,
+    ANTIALIASED,
     CONFIG,
     COUNT,
     HEIGHT,
     IDENTITY,
     INTRINSICS,
     NEAR,
+    OUTPUTS,
     SCENES,
     WIDTH,
+    oracle,
     random_scene,
     render,
     to_camera,
@@ -28,17 +29,7 @@ from jaxcloseup.geometry.rotations import euler_to_matrix
 from jaxcloseup.splats.rasterize import Footprints, RasterizeConfig, rasterize
 
 
-OUTPUTS = ("rgb", "alpha", "depth", "normal", "median_depth", "distortion")
 VECTORS = ("rgb", "normal")
-
-
-ANTIALIASED = dataclasses.replace(CONFIG, antialias=True)
-
-
-def oracle(scene, camtoworld=IDENTITY, intrinsics=INTRINSICS, size=(HEIGHT, WIDTH), **options):
-    return reference.render(
-        scene, camtoworld, intrinsics, *size, near=NEAR, background=BACKGROUND, **options
-    )
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -53,29 +44,6 @@ def test_images_agree_with_rays_that_meet_planes(name, precision):
         tolerance = 2e-5 if precision == "float32" else 1e-9
         assert images[output].dtype == precision
         np.testing.assert_allclose(images[output], expected[output], atol=tolerance, rtol=0)
-
-
-def test_antialiased_images_agree_with_convolved_discs():
-    for name in ("in front", "far and small"):
-        expected = oracle(SCENES[name], antialias=True)
-        images = render(to_surfels(SCENES[name]), to_camera(), config=ANTIALIASED)
-        assert expected["alpha"].max() > 0.1
-        for output in OUTPUTS:
-            np.testing.assert_allclose(images[output], expected[output], atol=2e-5, rtol=0)
-
-
-def test_an_antialiased_image_is_the_mean_of_a_finer_one():
-    """Reduced pixels and the discs of a finer image show the same, which published discs do not."""
-    scene = random_scene(7, log_scale=(-5.0, -3.0))
-    surfels, fine = to_surfels(scene), to_camera(intrinsics=8 * INTRINSICS, size=(192, 256))
-    config = RasterizeConfig(capacity=2**15, near=NEAR)
-    sharp = np.asarray(render(surfels, fine, config=config)["rgb"])
-    expected = sharp.reshape(HEIGHT, 8, WIDTH, 8, 3).mean((1, 3))
-    ours, published = (
-        np.abs(np.asarray(render(surfels, to_camera(), config=c)["rgb"]) - expected).max()
-        for c in (ANTIALIASED, CONFIG)
-    )
-    assert ours < 0.03 and published > 5 * ours
 
 
 def pose(twist):

@@ -171,7 +171,7 @@ def refine(
 ) -> tuple[Surfels, SurfelBuffers]:
     """Fill the rows that `config` has beyond `surfels` where photographs show more than these."""
     views = pyramid.values.shape[0]
-    level = [width < 1.5 * _REFINED_AT * cameras.width for _, width in pyramid.sizes].index(True)
+    level = pyramid.level_near(_REFINED_AT * cameras.width)
     free = config.capacity - int(buffers.alive.sum())
     each = min(max(0, free) // views, math.prod(pyramid.sizes[level]))
     sample = jax.jit(functools.partial(surfels_where_wrong, count=each, sh_degree=config.sh_degree))

@@ -18,7 +18,7 @@ import numpy as np
 
 import jaxcloseup
 from experiments.training.manifest import hash_data
-from experiments.training.programs import Programs
+from experiments.training.programs import Programs, describe_photographs
 from experiments.training.residuals import Window, render_residuals, reproduced
 from jaxcloseup.detail import (
     FOLDS,
@@ -103,15 +103,13 @@ def make_detail(programs: Programs, state: TrainState) -> tuple[Detail, dict[str
     """Render the residuals of all photographs, and learn from left-out ones how to weigh them."""
     scene = programs.scene
     pyramid, divisor = programs.pyramid()
-    (height, width), *_ = pyramid.sizes
-    share = f"1 / {divisor} of their size" if divisor > 1 else "their own size"
-    print(f"   detail of photographs of {width} x {height} pixels, {share}", flush=True)
+    print(f"   detail of {describe_photographs(pyramid, divisor)}", flush=True)
     count = len(scene.train)
     left_out = np.unique(np.linspace(0, count - 1, LEFT_OUT).round().astype(int)).tolist()
     residuals, windows, depths = render_residuals(programs, state, pyramid, left_out)
     trust = scene.train.weight * reproduced(residuals)
     sources = jax.jit(gather_sources)(scene.train.cameras, depths, trust)
-    finer = jnp.float32(np.log2(width / scene.train.cameras.width))
+    finer = jnp.float32(np.log2(pyramid.sizes[0][1] / scene.train.cameras.width))
     detail = Detail(residuals, sources, None, finer)
     weights, table = calibrate(detail, windows)
     about = {"divisor": divisor, "sizes": list(map(list, pyramid.sizes)), "reliability": table}

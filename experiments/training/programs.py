@@ -123,11 +123,9 @@ class Programs:
         if windows is None or windows.finest >= self.preset.downscale:
             return views
         pyramid, divisor = self.pyramid(windows.finest)
-        (height, width), *coarser = pyramid.sizes
-        if not coarser:
+        if len(pyramid.sizes) == 1:
             return views
-        share = f"1 / {divisor} of their size" if divisor > 1 else "their own size"
-        print(f"learning from windows of photographs of {width} x {height} pixels, {share}")
+        print(f"learning from windows of {describe_photographs(pyramid, divisor)}")
         return photograph_windows(views.cameras, pyramid, whole_share=windows.whole_share)
 
     def make_room(self, growth: int) -> None:
@@ -135,6 +133,12 @@ class Programs:
         if growth > self.growth:
             self.growth = growth
             self._compile()
+
+    def enlarged(self, times: float) -> "Programs":
+        """Programs of their own for images `times` as wide: their room must not slow training."""
+        large = Programs(self.preset, self.scene)
+        large.make_room(self.growth * max(1, round(times**2 / 2)))
+        return large
 
     def _grow(self) -> None:
         self.make_room(2 * self.growth)
@@ -193,6 +197,13 @@ class Programs:
             if rendering.overflow is None or not int(rendering.overflow):
                 return rendering
             self._grow()
+
+
+def describe_photographs(pyramid: Pyramid, divisor: int) -> str:
+    """What the finest level of `Programs.pyramid` is, in words."""
+    height, width = pyramid.sizes[0]
+    share = f"1 / {divisor} of their size" if divisor > 1 else "their own size"
+    return f"photographs of {width} x {height} pixels, {share}"
 
 
 def _checked(metrics, kind, count):

@@ -73,11 +73,8 @@ def render_residuals(
     scene = programs.scene
     cameras, last = scene.train.cameras, len(pyramid.sizes) - 1
     most = FINER_RAYS if programs.method.renders_pixels else FINER
-    rendered = [width < 1.5 * most * cameras.width for _, width in pyramid.sizes].index(True)
-    # Large images need more room than training does, which must not slow it down.
-    large = Programs(programs.preset, scene)
-    larger = pyramid.sizes[rendered][1] / cameras.width
-    large.make_room(programs.growth * max(1, round(larger**2 / 2)))
+    rendered = pyramid.level_near(most * cameras.width)
+    large = programs.enlarged(pyramid.sizes[rendered][1] / cameras.width)
     values = np.empty((*pyramid.values.shape[:2], 3), np.int8)
     windows, depths, rng = [], [], np.random.default_rng(0)
     for view in track(range(len(scene.train)), description="   residuals"):

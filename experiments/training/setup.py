@@ -102,14 +102,12 @@ class Training:
         views, steps = coarse.programs.photographs, preset.coarse.steps
         state = coarse.train(f"coarse_{stage}", "photographs", start, views, steps=steps)
         pyramid, _ = programs.pyramid(preset.windows.finest)
-        # Large images need more room than training does.
-        large = Programs(first, programs.scene)
-        large.make_room(8 * coarse.programs.growth)
+        render = functools.partial(coarse.programs.enlarged(4).render, state)
         key_fine, key_refine = jax.random.split(jax.random.fold_in(state.key, state.step))
         with timed(self.seconds, f"refine_{stage}"):
             params, buffers = programs.method.refine(
                 *(key_refine, preset.field, state.params, state.buffers),
-                *(functools.partial(large.render, state), programs.scene.train.cameras, pyramid),
+                *(render, programs.scene.train.cameras, pyramid),
             )
         none = jnp.zeros_like(state.step)
         return TrainState(none, params, buffers, programs.optimizer.init(params), key_fine)

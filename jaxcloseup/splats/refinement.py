@@ -13,7 +13,7 @@ from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points
 from jaxcloseup.numerics import safe_divide, safe_norm
 from jaxcloseup.splats.regularizers import depth_to_normal
 from jaxcloseup.splats.spherical_harmonics import rgb_to_sh
-from jaxcloseup.splats.surfels import Surfels
+from jaxcloseup.splats.surfels import Surfels, pad_rows
 
 
 SIZE = 0.7  # standard deviation of a new surfel, in pixels
@@ -97,9 +97,4 @@ def join_surfels(
     """
     surfels, alive = jax.tree.map(lambda *rows: jnp.concatenate(rows), old, new)
     order = jnp.argsort(~alive, stable=True)[:capacity]
-
-    def rows(leaf):
-        leaf = leaf[order]
-        return jnp.pad(leaf, ((0, capacity - len(leaf)), *((0, 0) for _ in leaf.shape[1:])))
-
-    return jax.tree.map(rows, (surfels, alive))
+    return jax.tree.map(lambda leaf: pad_rows(leaf[order], capacity), (surfels, alive))

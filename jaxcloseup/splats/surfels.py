@@ -79,7 +79,7 @@ def surfels_from_points(
         opacity_logits=jnp.full(points.shape[0], math.log(opacity / (1 - opacity)), points.dtype),
         sh=jnp.concatenate([constant, higher], axis=1),
     )
-    return jax.tree.map(lambda leaf: _pad_rows(leaf, capacity), (surfels, alive))
+    return jax.tree.map(lambda leaf: pad_rows(leaf, capacity), (surfels, alive))
 
 
 def random_points(
@@ -114,7 +114,8 @@ def random_points(
     return points[jnp.argsort(-seen, stable=True)[:count]]
 
 
-def _pad_rows(array: jax.Array, rows: int) -> jax.Array:
+def pad_rows(array: jax.Array, rows: int) -> jax.Array:
+    """The array with rows of zeros appended, `rows` in all."""
     return jnp.pad(array, ((0, rows - array.shape[0]), *((0, 0) for _ in array.shape[1:])))
 
 
