@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxcloseup.geometry.cameras import Camera, mean_focal, pixels_to_points, points_to_pixels
+from jaxcloseup.geometry.visibility import sphere_in_view
 from jaxcloseup.geometry.warp import backward_warp
 from jaxcloseup.numerics import matmul, safe_divide, safe_norm
 from jaxcloseup.photographs import camera_at, to_float
@@ -310,16 +311,8 @@ def _may_see(camera, points, side):
     center = jnp.sum(jnp.where(known[:, None], points, 0), axis=0) / jnp.maximum(number, 1)
     apart = jnp.where(known, jnp.linalg.norm(points - center[None], axis=-1), 0)
     radius = jnp.max(apart)
-    x, y, z = matmul(center - camera.position, camera.rotation)
-    fx, fy, cx, cy = camera.intrinsics
-    planes = (
-        *(((fx, cx), x), ((-fx, camera.width - cx), x)),
-        *(((fy, cy), y), ((-fy, camera.height - cy), y)),
-    )
-    inside = z > -radius
-    for (slope, offset), across in planes:
-        inside &= slope * across + offset * z >= -radius * jnp.hypot(slope, offset)
-    return inside & (number > 0)
+    center = matmul(center - camera.position, camera.rotation)
+    return sphere_in_view(camera, center, radius) & (number > 0)
 
 
 def _angle(ours, theirs):

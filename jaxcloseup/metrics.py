@@ -9,11 +9,13 @@ import chex
 import dm_pix
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 
 from jaxcloseup.numerics import matmul, safe_divide
 
 
-SSIM_TAPS = 11
+SSIM_TAPS, SSIM_SIGMA = 11, 1.5
 
 
 def quantize(image: jax.Array) -> jax.Array:
@@ -53,11 +55,23 @@ def ssim(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = None
     if min(image.shape[:2]) < SSIM_TAPS:
         raise ValueError(f"SSIM needs {SSIM_TAPS} pixels a side: the image is {image.shape[:2]}.")
     with jax.numpy_dtype_promotion("standard"):  # dm_pix mixes integers and floats
-        similarity = dm_pix.ssim(
-            image, target, max_val=1.0, filter_size=SSIM_TAPS, filter_sigma=1.5, return_map=True
-        )
+        similarity = dm_pix.ssim(image, target, max_val=1.0, filter_fn=_blur, return_map=True)
     border = SSIM_TAPS // 2
     return _weighted_mean(similarity, weight[border:-border, border:-border])
+
+
+def _blur(image: jax.Array) -> jax.Array:
+    """Gaussian windows of `ssim`, as matrices: XLA's CPU backend convolves ten times slower."""
+    rows, columns = (jnp.asarray(_window_sums(size), image.dtype) for size in image.shape[:2])
+    image = jnp.einsum("ih,hwc->iwc", rows, image, precision=lax.Precision.HIGHEST)
+    return jnp.einsum("jw,iwc->ijc", columns, image, precision=lax.Precision.HIGHEST)
+
+
+def _window_sums(size: int) -> np.ndarray:
+    """Matrix `[size - 10, size]` whose rows are the window at all places along a side."""
+    taps = np.exp(-0.5 * ((np.arange(SSIM_TAPS) - SSIM_TAPS // 2) / SSIM_SIGMA) ** 2)
+    places = range(size - SSIM_TAPS + 1)
+    return np.stack([np.pad(taps / taps.sum(), (k, len(places) - 1 - k)) for k in places])
 
 
 def cc_psnr(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = None) -> jax.Array:

@@ -70,8 +70,8 @@ class Scene:
       names: for each split present, the names of its photographs in order.
       metadata: extra facts from the loader, such as source paths and downscale.
       surface: renders a `Camera` to its exact `Surface`; None for photographed scenes.
-      photographs_at: reads the photographs of `train` again at 1 / n of their own size, given n;
-        None where they have no finer size to be read at.
+      photographs_at: reads the photographs of a split again at 1 / n of their own size, given n
+        and the split, "train" by default; None where they have no finer size to be read at.
     """
 
     name: str
@@ -85,4 +85,4 @@ class Scene:
     names: dict[str, list[str]]
     metadata: dict[str, Any] = dataclasses.field(default_factory=dict)
     surface: Callable[[Camera], Surface] | None = None
-    photographs_at: Callable[[int], Views] | None = None
+    photographs_at: Callable[..., Views] | None = None

@@ -10,11 +10,11 @@ import pytest
 from tiny_runs import KEPT
 
 from experiments.training import detail as training_detail
-from experiments.training import fine_tuning
+from experiments.training import gate
 from experiments.training.detail import detail_path, detailed, find_detail
 from experiments.training.fine_tuning import fine_tune
 from experiments.training.residuals import _enlarge
-from experiments.training.setup import LabelStart, label_targets
+from experiments.training.setup import label_closeups, label_targets, start_labels
 from experiments.training.stored_run import load_run_scene, read_run, restore
 from jaxcloseup.detail import Evidence, learn_weights, predict, reliability
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
@@ -106,9 +106,9 @@ def test_target_views_may_be_labeled_by_their_detail(rendered, found, monkeypatc
     # Its weights replace the gate of warps.
     gated = dataclasses.replace(programs.preset, gated=True, labels=by_detail)
     monkeypatch.setattr(programs, "preset", gated)
-    monkeypatch.setattr(fine_tuning, "weigh_labels", lambda *_: pytest.fail("asked the gate"))
+    monkeypatch.setattr(gate, "weigh_labels", lambda *_: pytest.fail("asked the gate"))
     monkeypatch.setattr(training_detail, "make_detail", lambda *_: pytest.fail("made again"))
-    views, start = programs.scene.test, LabelStart(state, None)
+    views, start = programs.scene.test, start_labels(programs, state, seed=0)
     labels = label_targets(programs, start, views.cameras, by_detail, None, path)
     truth = np.asarray(to_float(views.rgb))
     render = functools.partial(programs.render, state)
@@ -124,6 +124,15 @@ def test_target_views_may_be_labeled_by_their_detail(rendered, found, monkeypatc
     )
     assert (kind, begun, photographs) == ("target_views", state, programs.scene.train)
     jax.tree.map(np.testing.assert_array_equal, learned, labels)
+
+    near = label_closeups(programs, start, by_detail, 0, path)
+    assert len(near) == gated.closeup_steps and 0.1 < near.weight.mean() < 1
+    far = np.asarray(programs.scene.train.cameras.position)
+
+    others = label_closeups(programs, start, by_detail, 1, path)
+    drawn = [np.asarray(views.cameras.position)[:, None] for views in (near, others)]
+    assert all(np.linalg.norm(far - one, axis=-1).min() > 0 for one in drawn)
+    assert not np.any(drawn[0] == drawn[1])
 
 
 def test_detail_is_kept_with_its_state_and_made_again_for_another(rendered, found, monkeypatch):

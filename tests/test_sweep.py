@@ -239,7 +239,8 @@ def test_the_interval_is_that_of_the_mean():
         ("mask+", "is neither an arm"),
         ("baseline+lr_scale=2", "baseline has no fine-tuning"),
         ("oracle+depth_error=0.5", "oracle takes no other depth"),
-        ("diverse+label=residual", "change it of test_time alone"),
+        ("mask+label=residual", "mask has labels of its own"),
+        ("label=residual+depth_error=0.5", "label=residual takes no other depth"),
         ("test_time+label=exact", "label must be warp or residual"),
     ],
 )

@@ -4,7 +4,13 @@ from collections.abc import Mapping
 from typing import Any
 
 
-SPLIT_TITLES = {"test": "Close-ups", "test_far": "Ordinary views"}
+FINER = "_finer"  # of the name of a split that is scored at a finer size
+SPLIT_TITLES = {
+    "test": "Close-ups",
+    "test_far": "Ordinary views",
+    f"test{FINER}": "Close-ups, finer",
+    f"test_far{FINER}": "Ordinary views, finer",
+}
 COLUMNS = {
     "psnr": "PSNR (dB)",
     "ssim": "SSIM",

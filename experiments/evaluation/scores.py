@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.evaluation.metrics_text import FINER
 from experiments.evaluation.surface_error import (
     Landmarks,
     find_landmarks,
@@ -86,7 +87,11 @@ def exact_depths(scene: Scene, cameras: Camera) -> jax.Array:
 
 
 def make_targets(
-    scene: Scene, split: str, train_depths: jax.Array, render: Callable[[Camera], Rendering]
+    scene: Scene,
+    split: str,
+    train_depths: jax.Array,
+    render: Callable[[Camera], Rendering],
+    views: Views | None = None,
 ) -> list[Target]:
     """Return the held-out views of a split, with the number of photographs that saw each pixel.
 
@@ -98,8 +103,9 @@ def make_targets(
       split: name of the split.
       train_depths: `[V, H, W]` depths of the training views.
       render: `camera -> Rendering` of the baseline.
+      views: the split's photographs of another size; by default those of the scene.
     """
-    views: Views = getattr(scene, split)
+    views = getattr(scene, split) if views is None else views
     surface = jax.jit(scene.surface) if scene.surface else None
     count = jax.jit(count_seen)
     targets = []
@@ -121,6 +127,8 @@ def targets_by_split(
     train_depths: jax.Array,
     exact: jax.Array | None,
     render: Callable[[Camera], Rendering],
+    *,
+    finer: int | None = None,
 ) -> dict[str, list[Target]]:
     """Return `make_targets` for every split except the training views.
 
@@ -129,13 +137,16 @@ def targets_by_split(
       train_depths: `[V, H, W]` rendered depths of the training views.
       exact: `[V, H, W]` exact depths to use instead, or None on captures.
       render: `camera -> Rendering` of the baseline.
+      finer: divisor of the photographs' size, if the views count at that size too, as splits of
+        their own, named with `FINER`.
     """
     seen_from = train_depths if exact is None else exact
-    return {
-        split: make_targets(scene, split, seen_from, render)
-        for split in scene.names
-        if split != "train"
-    }
+    splits = [split for split in scene.names if split != "train"]
+    targets = {split: make_targets(scene, split, seen_from, render) for split in splits}
+    for split in splits if finer is not None and scene.photographs_at else ():
+        views = scene.photographs_at(finer, split)
+        targets[split + FINER] = make_targets(scene, split, seen_from, render, views)
+    return targets
 
 
 def score(

@@ -22,8 +22,8 @@ class LabelConfig:
     """How random close-ups are drawn and labeled; the defaults are the paper's text.
 
     Attributes:
-      label: what labels target views: "warp", the colors of photographs where warps agree, or
-        "residual", their own render with detail. Random close-ups always have the first.
+      label: what labels close-ups: "warp", the colors of photographs where warps agree, or
+        "residual", their own render with detail, all made before the first step.
       magnification: range of lambda, how many times nearer virtual cameras come.
       max_angle: epsilon, the largest change of each Euler angle, radians.
       anchor_tolerance: largest relative distance of an anchor from its view's mean depth.
@@ -86,7 +86,7 @@ class WindowConfig:
     """
 
     finest: int = 1
-    whole_share: float = 0.25
+    whole_share: float = 0.4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,6 +114,8 @@ class Preset:
       baseline_steps: steps of stage 1, on photographs alone.
       closeup_steps: steps of stage 2 with labels, and of its control without.
       downscale: divisor of the photographs' size.
+      score_downscale: divisor of the photographs' size at which held-out views are scored too,
+        if it is finer; None: at none.
       gated: let left-out photographs decide how much labels weigh, which may be nothing.
       windows: how steps read finer photographs; None: they read reduced photographs alone.
       coarse: what trains before stage 1; None: stage 1 begins with the initial points.
@@ -126,6 +128,7 @@ class Preset:
     baseline_steps: int
     closeup_steps: int
     downscale: int = 1
+    score_downscale: int | None = None
     gated: bool = False
     windows: WindowConfig | None = None
     coarse: CoarseConfig | None = None

@@ -77,7 +77,6 @@ REDUCED = Preset(
     ),
     train=WHOLE_IMAGES,
     labels=LabelConfig(
-        label="residual",
         magnification=(1.5, 3.0),
         leave_out_source=True,
         source_tolerance=0.05,
@@ -98,10 +97,11 @@ QUICK = dataclasses.replace(
         sh_every=1,
         regularize_from=1,
         means_lr=(4e-4, 1.6e-5),
-        means_lr_steps=700,
+        means_lr_steps=1800,
+        color_ridge=0.1,
         selective_adam=True,
         density=McmcConfig(start=0, stop=700, growth=1.0, noise=0.0),
-        raster=RasterizeConfig(capacity=2**17, block=32, antialias=True),
+        raster=RasterizeConfig(capacity=2**17, block=48, chunk=16, antialias=True),
     ),
     coarse=CoarseConfig(
         field=dataclasses.replace(
@@ -112,8 +112,11 @@ QUICK = dataclasses.replace(
         steps=1500,
     ),
     windows=WindowConfig(),
-    labels=dataclasses.replace(REDUCED.labels, label="warp"),
-    baseline_steps=1000,
+    score_downscale=4,
+    labels=dataclasses.replace(
+        REDUCED.labels, label="residual", magnification=(1.5, 8.0), label_loss_weight=0.25
+    ),
+    baseline_steps=2500,
 )
 
 

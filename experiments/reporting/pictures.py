@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from experiments.evaluation.metrics_text import SPLIT_TITLES
+from experiments.evaluation.metrics_text import FINER, SPLIT_TITLES
 from experiments.evaluation.scores import Target
 from experiments.reporting.report import Picture
 from jaxcloseup.artifacts.images import colorize_depth, colorize_error, side_by_side, write_png
@@ -45,7 +45,9 @@ def comparisons(
       The pictures, for the report.
     """
     pictures, written = [], set()
-    for split, views in targets.items():
+    # Finer views show the same, larger.
+    shown = {split: views for split, views in targets.items() if split + FINER not in targets}
+    for split, views in shown.items():
         stages = [stage for stage, rendered in renderings if rendered == split]
         for target in views if stages else ():
             images = [renderings[stage, split][target.name].rgb for stage in stages]

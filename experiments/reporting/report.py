@@ -72,14 +72,17 @@ def write_report(
       pictures: pictures to embed, grouped by section.
     """
     title = f"{results['scene']}: {results['method']}, preset {results['preset']}"
-    width, height = results["resolution"]
+    size, finer = (results[key] for key in ("resolution", "finer_resolution"))
+    sizes = f"{size[0]} x {size[1]} pixels"
+    if finer is not None:
+        sizes += f", finer ones {finer[0]} x {finer[1]}"
     header, *body = rows(results)
     parts = [
         "<!doctype html><html lang=en><meta charset=utf-8>",
         "<meta name=viewport content='width=device-width'>",
         f"<title>{html.escape(title)}</title><style>{STYLE}</style>",
         f"<h1>{html.escape(title)}</h1>",
-        f"<p>{width} x {height} pixels, seed {results['seed']}. The table shows the mean of each "
+        f"<p>{sizes}, seed {results['seed']}. The table shows the mean of each "
         "metric over the held-out views, on 8-bit images. Higher PSNR and SSIM are better; lower "
         "LPIPS and errors are better. <i>Seen by 3+ photographs</i> means the pixels whose surface "
         "at least 3 training photographs saw.</p>",

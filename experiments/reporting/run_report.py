@@ -1,11 +1,13 @@
 """Write everything that reports a run: results.json, pictures and the page."""
 
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
 
+from experiments.evaluation.metrics_text import FINER
+from experiments.evaluation.scores import Target
 from experiments.reporting.pictures import comparisons, label_pictures
 from experiments.reporting.report import write_report
 from experiments.training.setup import Training, timed
@@ -44,6 +46,7 @@ def report_run(
         "scene": scene.name,
         **about,
         "resolution": [size.width, size.height],
+        "finer_resolution": _finer_resolution(targets),
         "stages": outcome.scores,
         "labels": outcome.audit,
         "left_out": outcome.left_out,
@@ -55,3 +58,11 @@ def report_run(
     write_json(output_dir / "results.json", results)
     write_report(output_dir / "report.html", results, pictures)
     return results
+
+
+def _finer_resolution(targets: Mapping[str, Sequence[Target]]) -> list[int] | None:
+    """Width and height of the views that are scored at a finer size, or None."""
+    for split, views in targets.items():
+        if split.endswith(FINER) and views:
+            return [views[0].camera.width, views[0].camera.height]
+    return None

@@ -11,9 +11,10 @@ from jaxcloseup.scene import Scene
 
 
 # The paper's Table 1, its two test-time rows, and the control that all are compared with.
-_FIXED_POSES = ("fixed_anchors=true", "magnification=4:4", "max_angle=0")
+_WARPS = ("label=warp",)
+_FIXED_POSES = (*_WARPS, "fixed_anchors=true", "magnification=4:4", "max_angle=0")
 NAMED_ARMS: dict[str, tuple[str, ...]] = {
-    "control": ("label_loss_weight=0",),
+    "control": (*_WARPS, "label_loss_weight=0"),
     "labels": ("use_mask=false", *_FIXED_POSES),
     "mask": _FIXED_POSES,
     "diverse": (),
@@ -47,7 +48,8 @@ class Arm(NamedTuple):
     @property
     def in_turn(self) -> bool:
         """Whether it trains alone, on views that are labeled before its first step."""
-        return self.kind in ARMS_IN_TURN or self.depth_error is not None
+        by_detail = self.labels.label == "residual"
+        return self.kind in ARMS_IN_TURN or self.depth_error is not None or by_detail
 
     @property
     def outlook(self) -> str:
@@ -87,10 +89,11 @@ def make_arm(name: str, preset: Preset) -> Arm:
     changes_depth = (
         depth_error is not None or labels.expected_depth != of_kind.labels.expected_depth
     )
-    if kind in ARMS_IN_TURN and changes_depth:
-        raise ValueError(f"--arms={name}: {kind} takes no other depth than its own")
-    if labels.label != of_kind.labels.label and kind != "test_time":
-        raise ValueError(f"--arms={name}: label is for target views: change it of test_time alone")
+    own_depth = kind if kind in ARMS_IN_TURN else f"label={labels.label}"
+    if (kind in ARMS_IN_TURN or labels.label == "residual") and changes_depth:
+        raise ValueError(f"--arms={name}: {own_depth} takes no other depth than its own")
+    if labels.label != of_kind.labels.label and kind not in ("diverse", "test_time"):
+        raise ValueError(f"--arms={name}: {kind} has labels of its own: change label of others")
     if None not in (labels.expected_depth, depth_error):
         raise ValueError(f"--arms={name}: expected_depth and depth_error do not go together")
     return Arm(name, kind, labels, depth_error)

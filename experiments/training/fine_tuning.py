@@ -1,12 +1,10 @@
 """Fine-tuning a stored state for target views: the cameras that somebody wants rendered."""
 
-import functools
 import pathlib
 
 import jax.numpy as jnp
 
-from experiments.methods import pseudo_settings
-from experiments.training.gate import print_gate, weigh_labels
+from experiments.training.gate import weigh
 from experiments.training.loop import TrainingError
 from experiments.training.programs import Programs
 from experiments.training.setup import LabelStart, label_targets
@@ -38,14 +36,10 @@ def fine_tune(
       TrainingError: no step was finite.
     """
     preset, method, state = programs.preset, programs.method, start.state
-    settings = pseudo_settings(preset.labels)
-    if preset.gated and preset.labels.label == "warp":
-        render = functools.partial(programs.render, state)
-        settings, found = weigh_labels(start.sources, render, settings)
-        print_gate(found)
-        if not found["weight"]:
-            print("nothing is fine-tuned")
-            return state
+    settings, gate = weigh(programs, start)
+    if gate is not None and not gate["weight"]:
+        print("nothing is fine-tuned")
+        return state
     labels = label_targets(programs, start, cameras, preset.labels, settings, kept)
     steps = method.target_steps(preset.field, cameras.intrinsics.shape[0])
     steps = min(steps, most or steps)

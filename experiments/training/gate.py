@@ -7,12 +7,16 @@ harm: it is about a tenth where colors or depth are poor, and a fifth to a third
 (docs/results.md has the figures).
 """
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax.numpy as jnp
 
 from experiments.evaluation.audit import audit_left_out
+from experiments.methods import pseudo_settings
+from experiments.training.programs import Programs
+from experiments.training.setup import LabelStart
 from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.pseudo import LabelSources, PseudoSettings
@@ -24,11 +28,6 @@ TOLERANCES = [(rgb, depth) for rgb in (0.02, 0.04, 0.08) for depth in (0.005, 0.
 AGREEMENT = (0.1, 0.2)
 
 
-def print_gate(found: Mapping[str, Any]) -> None:
-    """Print what the gate decided and why."""
-    print(f"     gate: {verdict(found)}")
-
-
 def verdict(found: Mapping[str, Any]) -> str:
     """Return in one sentence what the gate decided and why, without a final period."""
     weight = found["weight"]
@@ -38,6 +37,21 @@ def verdict(found: Mapping[str, Any]) -> str:
         f"{used}, because they agree closely on {found['agreement']:.0%} of the pixels of left-out "
         f"photographs (no weight up to {AGREEMENT[0]:.0%}, full weight from {AGREEMENT[1]:.0%})"
     )
+
+
+def weigh(programs: Programs, start: LabelStart) -> tuple[PseudoSettings, dict[str, Any] | None]:
+    """The preset's settings of labels after its gate, and the gate's record, if it has one.
+
+    Labels with detail have weights of their own, and no gate.
+    """
+    preset = programs.preset
+    settings = pseudo_settings(preset.labels)
+    if not preset.gated or preset.labels.label == "residual":
+        return settings, None
+    render = functools.partial(programs.render, start.state)
+    settings, found = weigh_labels(start.sources, render, settings)
+    print(f"     gate: {verdict(found)}")
+    return settings, found
 
 
 def weigh_labels(

@@ -35,12 +35,14 @@ class Programs:
     truncated image, and no render shows one.
     """
 
-    def __init__(self, preset: Preset, scene: Scene) -> None:
-        """Compile for a preset on a scene."""
+    def __init__(self, preset: Preset, scene: Scene, *, width: int | None = None) -> None:
+        """Compile for a preset on a scene, for images as large as its photographs or `width`."""
         self.preset, self.scene, self.method = preset, scene, METHODS[preset.method]
         self.optimizer = self.method.make_optimizer(preset.field, scene)
         self.growth = 1
         self._meetings = 0
+        self._width = width or scene.train.cameras.width
+        self._larger: dict[int, Programs] = {}
         self._pyramids: dict[int, tuple[Pyramid, int]] = {}
         self._compile()
 
@@ -134,11 +136,16 @@ class Programs:
             self.growth = growth
             self._compile()
 
-    def enlarged(self, times: float) -> "Programs":
-        """Programs of their own for images `times` as wide: their room must not slow training."""
-        large = Programs(self.preset, self.scene)
-        large.make_room(self.growth * max(1, round(times**2 / 2)))
-        return large
+    def _for_width(self, width: int) -> "Programs":
+        """Larger images have programs of their own: their room must not slow training."""
+        doublings = math.floor(math.log2(width / self._width) + 0.4)
+        if doublings <= 0:
+            return self
+        if doublings not in self._larger:
+            large = Programs(self.preset, self.scene, width=self._width * 2**doublings)
+            large.make_room(self.growth * 4**doublings // 2)
+            self._larger[doublings] = large
+        return self._larger[doublings]
 
     def _grow(self) -> None:
         self.make_room(2 * self.growth)
@@ -192,11 +199,12 @@ class Programs:
 
     def render(self, state: TrainState, camera: Camera, key: jax.Array | None = None) -> Rendering:
         """Render a whole image; without a key, deterministically."""
+        programs = self._for_width(camera.width)
         while True:
-            rendering = self._render(state, camera, key)
+            rendering = programs._render(state, camera, key)
             if rendering.overflow is None or not int(rendering.overflow):
                 return rendering
-            self._grow()
+            programs._grow()
 
 
 def describe_photographs(pyramid: Pyramid, divisor: int) -> str:

@@ -74,7 +74,6 @@ def render_residuals(
     cameras, last = scene.train.cameras, len(pyramid.sizes) - 1
     most = FINER_RAYS if programs.method.renders_pixels else FINER
     rendered = pyramid.level_near(most * cameras.width)
-    large = programs.enlarged(pyramid.sizes[rendered][1] / cameras.width)
     values = np.empty((*pyramid.values.shape[:2], 3), np.int8)
     windows, depths, rng = [], [], np.random.default_rng(0)
     for view in track(range(len(scene.train)), description="   residuals"):
@@ -82,7 +81,7 @@ def render_residuals(
             camera = pyramid.camera(camera_at(cameras, view), view, level)
             photograph = pyramid.image(view, level)
             if level >= rendered:
-                seen = (programs if level == last else large).render(state, camera)
+                seen = programs.render(state, camera)
                 depth = label_depth(seen, near=scene.near, far=scene.far)
                 shown, shown_by = (seen.rgb, seen.alpha, depth), camera
             else:

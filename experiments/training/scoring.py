@@ -47,7 +47,9 @@ def hold_out(programs: Programs, start: LabelStart) -> HeldOut:
     """The views to score on. Their coverage is that of `start`, so that all are scored alike."""
     scene, render = programs.scene, functools.partial(programs.render, start.state)
     exact = exact_depths(scene, scene.train.cameras) if scene.surface else None
-    targets = targets_by_split(scene, start.sources.depths, exact, render)
+    finer = programs.preset.score_downscale
+    finer = finer if finer and finer < programs.preset.downscale else None
+    targets = targets_by_split(scene, start.sources.depths, exact, render, finer=finer)
     return HeldOut(targets, {} if exact is None else ladder_targets(scene, exact), exact)
 
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxcloseup
-from experiments.methods import LabelConfig, Preset
+from experiments.methods import LabelConfig, Preset, pseudo_settings
 from experiments.training.detail import detailed_views, find_detail
 from experiments.training.logs import TrainLog
 from experiments.training.loop import run_stage
@@ -25,13 +25,21 @@ from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.label_rules import LABEL_RULES, label_depth
 from jaxcloseup.photographs import Views, camera_at
-from jaxcloseup.pseudo import LabelSources, PseudoSettings, label_sources, label_views
+from jaxcloseup.pseudo import (
+    LabelSources,
+    PseudoSettings,
+    label_sources,
+    label_views,
+    sample_virtual_camera,
+)
 from jaxcloseup.scene import Scene
 from jaxcloseup.splats.surfels import random_points
 from jaxcloseup.train import TrainState, init_state
 
 
 FEWEST_POINTS = 100  # a capture with fewer gets random points too
+_MOST_CLOSEUPS = 200  # that are labeled before the first step
+_CLOSEUPS = 3  # folded into a run's key
 
 
 class LabelStart(NamedTuple):
@@ -102,7 +110,7 @@ class Training:
         views, steps = coarse.programs.photographs, preset.coarse.steps
         state = coarse.train(f"coarse_{stage}", "photographs", start, views, steps=steps)
         pyramid, _ = programs.pyramid(preset.windows.finest)
-        render = functools.partial(coarse.programs.enlarged(4).render, state)
+        render = functools.partial(coarse.programs.render, state)
         key_fine, key_refine = jax.random.split(jax.random.fold_in(state.key, state.step))
         with timed(self.seconds, f"refine_{stage}"):
             params, buffers = programs.method.refine(
@@ -244,6 +252,29 @@ def label_targets(
     render = functools.partial(programs.render, start.state)
     depths = rendered_depths(render, cameras, programs.scene)
     return jax.jit(label_views)(cameras, depths, start.sources, settings)
+
+
+def label_closeups(
+    programs: Programs,
+    start: LabelStart,
+    labels: LabelConfig,
+    seed: int,
+    kept: pathlib.Path | None = None,
+) -> Views:
+    """Labels of random close-ups with detail, made before the first step: each costs a render.
+
+    Args:
+      programs: the run's.
+      start: what fine-tuning begins with.
+      labels: says how close-ups are drawn.
+      seed: the run's.
+      kept: as in `label_targets`.
+    """
+    settings = pseudo_settings(labels)
+    count = min(programs.preset.closeup_steps, _MOST_CLOSEUPS)
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), _CLOSEUPS), count)
+    draw = jax.vmap(lambda key: sample_virtual_camera(key, start.sources, settings)[0])
+    return label_targets(programs, start, jax.jit(draw)(keys), labels, settings, kept)
 
 
 @contextlib.contextmanager

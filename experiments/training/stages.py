@@ -10,14 +10,14 @@ import jax
 from experiments.evaluation.audit import audit_labels, left_out_curve
 from experiments.evaluation.renders import write_truth
 from experiments.evaluation.scores import NO_PERCEPTUAL, Perceptual
-from experiments.methods import pseudo_settings
 from experiments.training.detail import detail_path, detailed, find_detail
-from experiments.training.gate import print_gate, weigh_labels
+from experiments.training.gate import weigh
 from experiments.training.programs import Programs
 from experiments.training.scoring import HeldOut, Scorer, hold_out
 from experiments.training.setup import (
     LabelStart,
     Training,
+    label_closeups,
     label_targets,
     say_which_points_fit,
     start_labels,
@@ -25,7 +25,8 @@ from experiments.training.setup import (
 )
 from jaxcloseup.field import Rendering
 from jaxcloseup.label_rules import label_depth
-from jaxcloseup.pseudo import PseudoSettings, label_sources
+from jaxcloseup.photographs import Views
+from jaxcloseup.pseudo import LabelSources, PseudoSettings, label_sources
 from jaxcloseup.train import TrainState
 
 
@@ -86,7 +87,9 @@ def run_stages(
     write_truth(output_dir / "renders" / "truth", held_out.all)
     scorer = Scorer(training, held_out, output_dir, perceptual)
     scorer.score("baseline", baseline)
-    settings, gate = weigh(training, start)
+    with timed(training.seconds, "gate"):
+        settings, gate = weigh(programs, start)
+    kept = detail_path(output_dir, "baseline")
     use_labels = gate is None or gate["weight"] > 0
     controls: dict[int, TrainState] = {}
     latest = "baseline", baseline
@@ -99,13 +102,13 @@ def run_stages(
             scorer.score(name, controls[steps])
         return controls[steps]
 
-    def fine_tune(stage, control_name, kind, *data, steps, labeled=use_labels):
+    def fine_tune(stage, control_name, kind, *data, steps):
         without = None
-        if "control" in to_run or not labeled:
+        if "control" in to_run or not use_labels:
             without = control(control_name, steps)
         # Without labels a stage is its control: the same steps on the same photographs.
         state = without
-        if labeled:
+        if use_labels:
             state = training.train(stage, kind, start.state, photographs, *data, steps=steps)
         scorer.score(stage, state)
         return state
@@ -113,21 +116,19 @@ def run_stages(
     if "control" in to_run:
         latest = "control", control("control", preset.closeup_steps)
     if "closeup" in to_run:
-        kind, steps = "random_closeups", preset.closeup_steps
-        state = fine_tune("closeup", "control", kind, start.sources, settings, steps=steps)
+        kind, labels = closeup_labels(training, start, seed, kept)
+        steps = preset.closeup_steps
+        state = fine_tune("closeup", "control", kind, labels, settings, steps=steps)
         latest = ("closeup" if use_labels else "control"), state
     if "test_time" in to_run and scene.test is None:
         print(f"no test_time: {scene.name} holds out no close-ups (--split=closest does)")
     elif "test_time" in to_run:
-        # Detail has weights of its own, so the gate of warps does not apply to it.
-        by_detail = preset.labels.label == "residual"
-        own = pseudo_settings(preset.labels) if by_detail else settings
         with timed(training.seconds, "test_time_labels"):
-            targets, kept = scene.test.cameras, detail_path(output_dir, "baseline")
-            labels = label_targets(programs, start, targets, preset.labels, own, kept)
+            targets = scene.test.cameras
+            labels = label_targets(programs, start, targets, preset.labels, settings, kept)
         steps = programs.method.target_steps(preset.field, len(scene.test))
-        names, labeled = ("test_time", "test_time_control"), use_labels or by_detail
-        fine_tune(*names, "target_views", labels, own, steps=steps, labeled=labeled)
+        names = "test_time", "test_time_control"
+        fine_tune(*names, "target_views", labels, settings, steps=steps)
     detail = None
     if "detail" in to_run:
         detail = add_detail_stage(training, scorer, output_dir, *latest)
@@ -155,17 +156,16 @@ def add_detail_stage(
     return {"stage": stage, **about}
 
 
-def weigh(training: Training, start: LabelStart) -> tuple[PseudoSettings, Mapping[str, Any] | None]:
-    """The preset's settings of labels after its gate, and the gate's evidence, if it has one."""
+def closeup_labels(
+    training: Training, start: LabelStart, seed: int, kept: pathlib.Path
+) -> tuple[str, LabelSources | Views]:
+    """The kind of steps of `closeup`, and its labels, or what each step makes them from."""
     programs = training.programs
-    settings = pseudo_settings(programs.preset.labels)
-    if not programs.preset.gated:
-        return settings, None
-    with timed(training.seconds, "gate"):
-        render = functools.partial(programs.render, start.state)
-        settings, gate = weigh_labels(start.sources, render, settings)
-        print_gate(gate)
-    return settings, gate
+    if programs.preset.labels.label == "warp":
+        return "random_closeups", start.sources
+    with timed(training.seconds, "closeup_labels"):
+        labels = label_closeups(programs, start, programs.preset.labels, seed, kept)
+    return "target_views", labels
 
 
 def audit_all(

@@ -22,6 +22,7 @@ from experiments.training.setup import (
     LabelStart,
     Training,
     identity_of,
+    label_closeups,
     label_targets,
     rendered_depths,
     say_which_points_fit,
@@ -266,6 +267,8 @@ def label_arm(
         )
     if arm.kind == "test_time":
         return label_targets(programs, start, scene.test.cameras, arm.labels, arm.settings)
+    if arm.labels.label == "residual":
+        return label_closeups(programs, start, arm.labels, seed)
     blurred = arm.kind == "resolved"
     return true_close_ups(key, scene, start.sources, exact, arm.settings, blurred=blurred)
 

@@ -110,14 +110,14 @@ def _load(listing: Listing, reading: Reading) -> Scene:
         names=names,
         metadata=metadata,
         # With a zoom, finer photographs would show the very crops that are held out.
-        photographs_at=None if reading.zoom > 1 else functools.partial(_train_at, listing, reading),
+        photographs_at=None if reading.zoom > 1 else functools.partial(_read_at, listing, reading),
     )
 
 
-def _train_at(listing: Listing, reading: Reading, factor: int) -> Views:
-    """Read the training photographs again, at 1 / `factor` of their own size."""
-    frames = [frame._replace(reduced=None) for frame in listing.frames["train"]]
-    photos = read_photos({"train": frames}, reading._replace(downscale=factor))["train"]
+def _read_at(listing: Listing, reading: Reading, factor: int, split: str = "train") -> Views:
+    """Read the photographs of a split again, at 1 / `factor` of their own size."""
+    frames = [frame._replace(reduced=None) for frame in listing.frames[split]]
+    photos = read_photos({split: frames}, reading._replace(downscale=factor))[split]
     intrinsics = np.stack([photo.intrinsics(reading.half_pixel) for photo in photos])
     width, height = np.array([photo.size for photo in photos]).max(0).tolist()
     return _padded(photos, intrinsics, height, width)

@@ -97,3 +97,30 @@ def warp_to(
         valid &= depth_consistent(observed, landed_depth, tolerance)
     image = jnp.where(valid[..., None], backward_warp(source_image, pixels), 0)
     return WarpedImage(image, valid, pixels)
+
+
+def sphere_in_view(
+    camera: Camera,
+    center: jax.Array,
+    radius: jax.Array,
+    *,
+    margin: jax.Array | float = 0.0,
+    near: jax.Array | float = 0.0,
+) -> jax.Array:
+    """Whether spheres meet the part of space that a camera sees: `[...]`, never wrongly no.
+
+    Args:
+      camera: one camera.
+      center: `[..., 3]` centers in the camera's frame.
+      radius: `[...]` radii in world units.
+      margin: `[...]` or a number; pixels by which the image is larger on each side.
+      near: z-depth before which nothing is seen.
+    """
+    x, y, z = jnp.moveaxis(center, -1, 0)
+    fx, fy, cx, cy = camera.intrinsics
+    inside = z > near - radius
+    for slope, first, last, across in ((fx, cx, camera.width, x), (fy, cy, camera.height, y)):
+        for sign, offset in ((1, first + margin), (-1, last - first + margin)):
+            # Signed distance to the plane through an edge of the image, times the normal's length.
+            inside &= sign * slope * across + offset * z >= -radius * jnp.hypot(slope, offset)
+    return inside

@@ -93,8 +93,8 @@ def procedural_scene(
     def surface(camera: Camera) -> Surface:
         return _render_surface(_world(name), camera)
 
-    def photographs_at(factor: int) -> Views:
-        return procedural_scene(name, downscale=factor).train
+    def photographs_at(factor: int, split: str = "train") -> Views:
+        return getattr(procedural_scene(name, downscale=factor), split)
 
     return Scene(
         name=name,

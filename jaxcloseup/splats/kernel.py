@@ -192,7 +192,7 @@ def _forward(config, table, lists):
             sums = _add_chunk(sums, weights, rows, shade, reference=pixels[2])
             return position + config.chunk, product, *pixels, sums
 
-        shape = (config.block, config.tile**2)
+        shape = (len(counts), config.tile**2)
         ones, zeros = jnp.ones(shape, table.dtype), jnp.zeros(shape, table.dtype)
         stop = jnp.zeros(shape, jnp.int32)
         state = (jnp.int32(0), ones, ones, stop, zeros, zeros, (zeros,) * (features + 4))

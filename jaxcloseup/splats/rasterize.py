@@ -30,7 +30,7 @@ class RasterizeConfig:
       antialias: convolve surfels with the pixel, see `project_discs`.
       tile: side of a tile in pixels.
       chunk: number of a tile's splats that the kernel evaluates at once.
-      block: number of tiles that the kernel evaluates at once.
+      block: largest number of tiles that the kernel evaluates at once.
     """
 
     capacity: int = 2**18
@@ -103,25 +103,38 @@ def rasterize(
     Differentiable in anchor, homography, opacity and payload. Deterministic; of two splats with the
     same `order`, the one with the lower index is in front.
     """
-    count, features = footprints.payload.shape
+    count = footprints.opacity.shape[0]
+    chex.assert_shape(footprints.payload, (count, None))
     chex.assert_shape(footprints.anchor, (count, 2))
     chex.assert_shape(footprints.homography, (count, 3, 3))
     chex.assert_shape([footprints.opacity, footprints.low_pass, footprints.order], (count,))
     chex.assert_shape(footprints.inverse_depth, (count, 2))
-    chex.assert_shape(footprints.box, (count, 4))
+    box, order = footprints.box, footprints.order
+    return blend(pack(footprints), box, order, config, height=height, width=width)
 
+
+def blend(
+    table: jax.Array,
+    box: jax.Array,
+    order: jax.Array,
+    config: RasterizeConfig,
+    *,
+    height: int,
+    width: int,
+) -> SplatImage:
+    """`rasterize` of splats whose footprints are a table `[N, C]` from `pack`, boxes and order."""
     lists = tile_lists(
-        lax.stop_gradient(footprints.box),
-        lax.stop_gradient(footprints.order),
+        lax.stop_gradient(box),
+        lax.stop_gradient(order),
         height=height,
         width=width,
         tile=config.tile,
         block=config.block,
         capacity=config.capacity,
     )
-    table = pack(footprints)
     sums, median = blend_tiles(config, table, lists)
     image = functools.partial(_untile, height=height, width=width, tile=config.tile)
+    features = sums.shape[1] - 4
     payload = jnp.moveaxis(jax.vmap(image, in_axes=1)(sums[:, :features]), 0, -1)
     depth, alpha, first, second = (image(sums[:, features + i]) for i in range(4))
     return SplatImage(

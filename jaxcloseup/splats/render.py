@@ -1,5 +1,6 @@
 """Renders surfels by 2-D Gaussian splatting."""
 
+import functools
 from typing import NamedTuple
 
 import chex
@@ -9,8 +10,10 @@ import jax.numpy as jnp
 from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.numerics import safe_norm
+from jaxcloseup.splats.culling import map_shown, may_show
+from jaxcloseup.splats.kernel import pack
 from jaxcloseup.splats.projection import project_discs, to_camera
-from jaxcloseup.splats.rasterize import RasterizeConfig, rasterize
+from jaxcloseup.splats.rasterize import RasterizeConfig, blend
 from jaxcloseup.splats.spherical_harmonics import sh_to_rgb
 from jaxcloseup.splats.surfels import Surfels
 
@@ -69,19 +72,26 @@ def render_surfels(
     chex.assert_shape(camera.camtoworld, (3, 4))
     chex.assert_shape(camera.intrinsics, (4,))
 
-    discs, normals = to_camera(surfels, camera)
-    offset = surfels.means - camera.position[None]
-    distance = safe_norm(offset, keepdims=True)
-    colors = sh_to_rgb(surfels.sh, offset / jnp.where(distance == 0, 1, distance))
     opacity = jnp.where(alive, jax.nn.sigmoid(surfels.opacity_logits), 0)
-    payload = jnp.concatenate([colors, normals], axis=-1)
-    footprints = project_discs(
-        discs, opacity, payload, camera, near=config.near, antialias=config.antialias
-    )
-    image = rasterize(footprints, config, height=camera.height, width=camera.width)
+    shown = may_show(surfels, opacity, camera, near=config.near, antialias=config.antialias)
+    project = functools.partial(_project, near=config.near, antialias=config.antialias)
+    table, box, order = map_shown(project, (surfels, opacity), camera, shown)
+    image = blend(table, box, order, config, height=camera.height, width=camera.width)
     rgb, normal = image.payload[..., :3], image.payload[..., 3:]
     if background is not None:
         chex.assert_shape(background, (3,))
         rgb = rgb + (1 - image.alpha)[..., None] * background[None, None]
     aux = SurfelAux(normal, image.median_depth, image.distortion, image.overflow)
     return Rendering(rgb, image.depth, image.alpha, aux, normal=aux.normal, overflow=aux.overflow)
+
+
+def _project(surfels, camera, *, near, antialias):
+    """Table, boxes and order of surfels, for `blend`."""
+    surfels, opacity = surfels
+    discs, normals = to_camera(surfels, camera)
+    offset = surfels.means - camera.position[None]
+    distance = safe_norm(offset, keepdims=True)
+    colors = sh_to_rgb(surfels.sh, offset / jnp.where(distance == 0, 1, distance))
+    payload = jnp.concatenate([colors, normals], axis=-1)
+    footprints = project_discs(discs, opacity, payload, camera, near=near, antialias=antialias)
+    return pack(footprints), footprints.box, footprints.order

@@ -4,6 +4,8 @@ Tiles are squares of pixels in row-major order. The number of pairs is static; p
 are left out and counted.
 """
 
+import functools
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -12,6 +14,7 @@ from jax import lax
 
 
 LARGEST = 2**31 - 1
+_LARGE, _PART = 2**16, 4  # room that is worth a shortcut, and the part of it that often suffices
 
 
 @struct.dataclass
@@ -57,7 +60,7 @@ def tile_lists(
       height: image height in pixels; static.
       width: image width in pixels; static.
       tile: side of a tile in pixels; static.
-      block: number of tiles in a block; static.
+      block: largest number `B` of tiles in a block; static.
       capacity: largest number of pairs; static.
     """
     chex.assert_shape(box, (order.shape[0], 4))
@@ -67,31 +70,36 @@ def tile_lists(
     extent = jnp.maximum(last - first + 1, 0)
     pairs = extent[:, 0] * extent[:, 1]
 
-    # Pairs are laid out by depth rank, so those of the farthest splats overflow.
-    by_depth = _nearest_first(order)
-    pairs, first, columns = pairs[by_depth], first[by_depth], jnp.maximum(extent[by_depth, 0], 1)
-    ends = jnp.cumsum(pairs)
-    total = ends[-1]
+    total = jnp.sum(pairs)
     too_many = jnp.sum(pairs.astype(jnp.float32)) > LARGEST / 2  # int32 may have wrapped
-    place = jnp.arange(capacity, dtype=jnp.int32)
-    rank = jnp.repeat(jnp.arange(count, dtype=jnp.int32), pairs, total_repeat_length=capacity)
-    within = place - (ends - pairs)[rank]
-    row = within // columns[rank]
-    tile_of = (first[rank, 1] + row) * across + first[rank, 0] + within - row * columns[rank]
-    tile_of = jnp.where(place < total, tile_of, across * down)
-    tile_of, rank = _sort_pairs(tile_of, rank, across * down + 1, count)
-
+    sort = functools.partial(_sort, first, extent, order, across=across, tiles=across * down)
+    if capacity < _LARGE:
+        tile_of, splats = sort(rows=count, capacity=capacity)
+    else:
+        # Sorting costs what there is room for, and windows show few splats in few pairs.
+        rows, room = count // _PART, capacity // _PART
+        after = jnp.max(jnp.where(pairs > 0, jnp.arange(count), -1), initial=-1)
+        tile_of, splats = lax.cond(
+            (after < rows) & (total <= room) & ~too_many,
+            lambda: tuple(
+                jnp.pad(part, (0, capacity - room), constant_values=across * down)
+                for part in sort(rows=rows, capacity=room)
+            ),
+            lambda: sort(rows=count, capacity=capacity),
+        )
     starts = jnp.searchsorted(tile_of, jnp.arange(across * down + 1, dtype=jnp.int32))
     starts = starts.astype(jnp.int32)
     counts = starts[1:] - starts[:-1]
-    # A block runs as long as its longest list, so lists of similar length share a block.
+    # A block runs as long as its longest list, so lists of similar length share a block, and blocks
+    # share the tiles evenly.
+    block = -(-across * down // -(-across * down // block))
     padding = -(across * down) % block
     longest_first = jnp.argsort(-counts, stable=True).astype(jnp.int32)
     slot = jnp.argsort(longest_first).astype(jnp.int32)
     longest_first = jnp.pad(longest_first, (0, padding)).reshape(-1, block)
     real = jnp.pad(jnp.ones(across * down, bool), (0, padding)).reshape(-1, block)
     return TileLists(
-        splats=by_depth[rank],
+        splats=splats,
         starts=starts[longest_first],
         counts=jnp.where(real, counts[longest_first], 0),
         origins=tile * jnp.stack([longest_first % across, longest_first // across], axis=-1),
@@ -99,6 +107,26 @@ def tile_lists(
         slot=slot,
         overflow=jnp.where(too_many, LARGEST, jnp.maximum(total - capacity, 0)),
     )
+
+
+def _sort(first, extent, order, *, across, tiles, rows, capacity):
+    """Sorted pairs `[capacity]` of the first `rows` splats: tiles, or `tiles` for none, and splats.
+
+    Pairs are laid out by depth rank, so those of the farthest splats overflow.
+    """
+    by_depth = _nearest_first(order[:rows])
+    first, extent = first[by_depth], extent[by_depth]
+    pairs, columns = extent[:, 0] * extent[:, 1], jnp.maximum(extent[:, 0], 1)
+    ends = jnp.cumsum(pairs)
+    place = jnp.arange(capacity, dtype=jnp.int32)
+    ranks = jnp.arange(rows, dtype=jnp.int32)
+    rank = jnp.repeat(ranks, pairs, total_repeat_length=capacity)
+    within = place - (ends - pairs)[rank]
+    row = within // columns[rank]
+    tile_of = (first[rank, 1] + row) * across + first[rank, 0] + within - row * columns[rank]
+    tile_of = jnp.where(place < ends[-1], tile_of, tiles)
+    tile_of, rank = _sort_pairs(tile_of, rank, tiles + 1, rows)
+    return tile_of, by_depth[rank]
 
 
 def _tile_range(box: jax.Array, size: jax.Array, tile: int) -> tuple[jax.Array, jax.Array]:
