@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxcloseup.splats import tiling
 from jaxcloseup.splats.tiling import _sort_pairs, tile_lists
 
 
@@ -38,15 +39,19 @@ def expected_lists(box, order):
     return lists
 
 
-@pytest.mark.parametrize("capacity", [512, 60])
-def test_lists_hold_the_splats_of_a_tile_nearest_first(capacity):
+@pytest.mark.parametrize(("capacity", "shown"), [(512, 40), (60, 40), (512, 9)])
+def test_lists_hold_the_splats_of_a_tile_nearest_first(capacity, shown, monkeypatch):
+    """In all the room and, where few splats are shown, in a part of it."""
+    monkeypatch.setattr(tiling, "_LARGE", 50)
     box, order = random_boxes()
+    box[shown:] = [0, 0, -1, -1]
     make = functools.partial(tile_lists, height=HEIGHT, width=WIDTH, tile=TILE, block=BLOCK)
     make = jax.jit(functools.partial(make, capacity=capacity))
     lists = jax.tree.map(np.asarray, make(jnp.asarray(box), jnp.asarray(order)))
     expected = expected_lists(box, order)
     total = sum(map(len, expected))
     assert lists.overflow == max(total - capacity, 0)
+    assert shown == 40 or total <= 512 // 4
     if lists.overflow > 0:  # pairs of the farthest splats are missing
         pairs = sorted((order[i], i, t) for t, found in enumerate(expected) for i in found)
         kept = {(t, i) for _, i, t in pairs[:capacity]}

@@ -47,7 +47,6 @@ TINY_SURFELS = dataclasses.replace(
         steps_per_target=2,
         raster=RasterizeConfig(capacity=2**14, tile=8, chunk=4, block=12),
     ),
-    labels=REDUCED.labels,
     baseline_steps=20,
     closeup_steps=2,
     downscale=1,

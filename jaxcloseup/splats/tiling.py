@@ -4,8 +4,6 @@ Tiles are squares of pixels in row-major order. The number of pairs is static; p
 are left out and counted.
 """
 
-import functools
-
 import chex
 import jax
 import jax.numpy as jnp
@@ -72,20 +70,25 @@ def tile_lists(
 
     total = jnp.sum(pairs)
     too_many = jnp.sum(pairs.astype(jnp.float32)) > LARGEST / 2  # int32 may have wrapped
-    sort = functools.partial(_sort, first, extent, order, across=across, tiles=across * down)
+
+    def sort(rows, room):
+        found = _sort(first, extent, order, rows, room, across=across, tiles=across * down)
+        fill = across * down, 0
+        return tuple(
+            jnp.pad(part, (0, capacity - room), constant_values=value)
+            for part, value in zip(found, fill, strict=True)
+        )
+
     if capacity < _LARGE:
-        tile_of, splats = sort(rows=count, capacity=capacity)
+        tile_of, splats = sort(count, capacity)
     else:
         # Sorting costs what there is room for, and windows show few splats in few pairs.
-        rows, room = count // _PART, capacity // _PART
+        rows, room = max(count // _PART, 1), capacity // _PART
         after = jnp.max(jnp.where(pairs > 0, jnp.arange(count), -1), initial=-1)
         tile_of, splats = lax.cond(
             (after < rows) & (total <= room) & ~too_many,
-            lambda: tuple(
-                jnp.pad(part, (0, capacity - room), constant_values=across * down)
-                for part in sort(rows=rows, capacity=room)
-            ),
-            lambda: sort(rows=count, capacity=capacity),
+            lambda: sort(rows, room),
+            lambda: sort(count, capacity),
         )
     starts = jnp.searchsorted(tile_of, jnp.arange(across * down + 1, dtype=jnp.int32))
     starts = starts.astype(jnp.int32)
@@ -109,7 +112,7 @@ def tile_lists(
     )
 
 
-def _sort(first, extent, order, *, across, tiles, rows, capacity):
+def _sort(first, extent, order, rows, capacity, *, across, tiles):
     """Sorted pairs `[capacity]` of the first `rows` splats: tiles, or `tiles` for none, and splats.
 
     Pairs are laid out by depth rank, so those of the farthest splats overflow.
