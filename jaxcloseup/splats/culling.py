@@ -128,7 +128,8 @@ def _rows(shown):
     """Indices of the shown items, then of none, in whole blocks; and how many are shown."""
     count = shown.shape[0]
     size = -(-count // _BLOCK) * _BLOCK
-    return jnp.nonzero(shown, size=size, fill_value=count)[0], jnp.sum(shown, dtype=jnp.int32)
+    rows = jnp.nonzero(shown, size=size, fill_value=count)[0].astype(jnp.int32)
+    return rows, jnp.sum(shown, dtype=jnp.int32)
 
 
 def _pick(block, rows, number, items):
@@ -136,7 +137,7 @@ def _pick(block, rows, number, items):
     at = block * _BLOCK
     index = lax.dynamic_slice_in_dim(rows, at, _BLOCK)
     picked = jax.tree.map(lambda leaf: leaf.at[index].get(mode="clip"), items)
-    return at, picked, at + jnp.arange(_BLOCK) < number
+    return at, picked, at + jnp.arange(_BLOCK, dtype=jnp.int32) < number
 
 
 def _only(there, values):

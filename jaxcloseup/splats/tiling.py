@@ -68,7 +68,7 @@ def tile_lists(
     extent = jnp.maximum(last - first + 1, 0)
     pairs = extent[:, 0] * extent[:, 1]
 
-    total = jnp.sum(pairs)
+    total = jnp.sum(pairs, dtype=jnp.int32)
     too_many = jnp.sum(pairs.astype(jnp.float32)) > LARGEST / 2  # int32 may have wrapped
 
     def sort(rows, room):
@@ -84,7 +84,7 @@ def tile_lists(
     else:
         # Sorting costs what there is room for, and windows show few splats in few pairs.
         rows, room = max(count // _PART, 1), capacity // _PART
-        after = jnp.max(jnp.where(pairs > 0, jnp.arange(count), -1), initial=-1)
+        after = jnp.max(jnp.where(pairs > 0, jnp.arange(count, dtype=jnp.int32), -1), initial=-1)
         tile_of, splats = lax.cond(
             (after < rows) & (total <= room) & ~too_many,
             lambda: sort(rows, room),
