@@ -240,7 +240,7 @@ def test_the_interval_is_that_of_the_mean():
         ("baseline+lr_scale=2", "baseline has no fine-tuning"),
         ("oracle+depth_error=0.5", "oracle takes no other depth"),
         ("mask+label=residual", "mask has labels of its own"),
-        ("label=residual+depth_error=0.5", "label=residual takes no other depth"),
+        ("label=residual+depth_error=0.5", r"label=residual has its own depth: add \+label=warp"),
         ("test_time+label=exact", "label must be warp or residual"),
     ],
 )
@@ -267,7 +267,7 @@ def parsed_flags():
         ({"arms": ["expected_depth=2"]}, "expected_depth must be true or false or none"),
         ({"arms": ["depth_error=-1"]}, "depth_error is a share"),
         ({"set": ["capacity=0"]}, "--set=capacity=0: capacity must be between 1 and inf"),
-        ({"arms": ["depth_error=0+expected_depth=1"]}, "do not go together"),
+        ({"arms": ["label=warp+depth_error=0+expected_depth=1"]}, "do not go together"),
         ({"scenes": ["nowhere"]}, "nowhere"),
     ],
 )

@@ -89,9 +89,10 @@ def make_arm(name: str, preset: Preset) -> Arm:
     changes_depth = (
         depth_error is not None or labels.expected_depth != of_kind.labels.expected_depth
     )
-    own_depth = kind if kind in ARMS_IN_TURN else f"label={labels.label}"
-    if (kind in ARMS_IN_TURN or labels.label == "residual") and changes_depth:
-        raise ValueError(f"--arms={name}: {own_depth} takes no other depth than its own")
+    if kind in ARMS_IN_TURN and changes_depth:
+        raise ValueError(f"--arms={name}: {kind} takes no other depth than its own")
+    if labels.label == "residual" and changes_depth:
+        raise ValueError(f"--arms={name}: label=residual has its own depth: add +label=warp")
     if labels.label != of_kind.labels.label and kind not in ("diverse", "test_time"):
         raise ValueError(f"--arms={name}: {kind} has labels of its own: change label of others")
     if None not in (labels.expected_depth, depth_error):

@@ -30,7 +30,12 @@ from jaxcloseup.geometry.poses import (
 )
 from jaxcloseup.geometry.rotations import euler_to_matrix, matrix_to_euler, quaternion_to_matrix
 from jaxcloseup.geometry.union_warp import SourceBlocks, block_sources, union_warp
-from jaxcloseup.geometry.visibility import WarpedImage, sample_where_visible, warp_to
+from jaxcloseup.geometry.visibility import (
+    WarpedImage,
+    sample_where_visible,
+    sphere_in_view,
+    warp_to,
+)
 from jaxcloseup.geometry.warp import ForwardWarp, backward_warp, draw_nearest, forward_warp
 
 
@@ -61,6 +66,7 @@ __all__ = [
     "sample_anchor",
     "sample_closeup_camera",
     "sample_where_visible",
+    "sphere_in_view",
     "union_warp",
     "warp_to",
 ]
