@@ -113,9 +113,6 @@ QUICK = dataclasses.replace(
     ),
     windows=WindowConfig(),
     score_downscale=4,
-    labels=dataclasses.replace(
-        REDUCED.labels, label="residual", magnification=(1.5, 8.0), label_loss_weight=0.25
-    ),
     baseline_steps=2500,
 )
 
