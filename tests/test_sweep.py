@@ -29,7 +29,7 @@ from experiments.training import sweep as sweep_stages
 from experiments.training.arms import make_arm
 from experiments.training.programs import Programs
 from experiments.training.setup import initial_points, start_labels
-from experiments.training.sweep import run_sweep, stack_arms
+from experiments.training.sweep import order_arms, run_sweep, stack_arms
 from jaxcloseup.scenes import load_scene
 from jaxcloseup.train import init_state
 
@@ -300,6 +300,18 @@ def test_names_change_settings():
     both = make_arm("mask+lr_scale=2", TINY).settings
     mask = make_arm("mask", TINY).settings
     chex.assert_trees_all_equal(both, mask.replace(lr_scale=jnp.float32(2)))
+
+
+def test_labels_with_detail_are_made_before_the_first_step():
+    """The paper's rows and the control keep warps, which all arms of one program share."""
+    preset = dataclasses.replace(
+        TINY_SURFELS, labels=dataclasses.replace(TINY_SURFELS.labels, label="residual")
+    )
+    arms = [make_arm(name, preset) for name in ("control", "labels", "mask", "diverse")]
+    assert [arm.labels.label for arm in arms] == ["warp", "warp", "warp", "residual"]
+    together, in_turn = order_arms(arms, seeds=1)
+    assert [arm.name for arm, _ in in_turn] == ["diverse"] and len(together) == 3
+    assert make_arm("label=residual", TINY_SURFELS).in_turn
 
 
 def test_an_arm_may_have_labels_from_the_other_depth(capture_folder, tmp_path):
