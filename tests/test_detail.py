@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from tiny_runs import KEPT
 
+from experiments.evaluation.scores import targets_by_split
 from experiments.training import detail as training_detail
 from experiments.training import gate
 from experiments.training.detail import detail_path, detailed, find_detail
@@ -20,7 +22,7 @@ from jaxcloseup.detail import Evidence, learn_weights, predict, reliability
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.photographs import camera_at, to_float
 from jaxcloseup.pyramids import scene_pyramid
-from jaxcloseup.scenes import load_scene
+from jaxcloseup.scenes import SceneError, load_scene
 
 
 def made_up(share, count=20_000, seed=0):
@@ -191,3 +193,26 @@ def test_held_out_parts_of_photographs_are_not_read(capture_folder):
     scene = load_scene(str(capture_folder), split="zoom", zoom=2)
     assert scene.photographs_at is None
     assert scene_pyramid(scene)[0].sizes[0] == scene.train.rgb.shape[1:3]
+
+
+def test_views_are_scored_finer_only_where_finer_photographs_are_kept(capture_folder, capsys):
+    scene = load_scene(str(capture_folder), downscale=4)
+    depths = jnp.ones(scene.train.weight.shape)
+
+    def score(scene):
+        flat = lambda camera: SimpleNamespace(depth=jnp.ones((camera.height, camera.width)))  # noqa: E731
+        targets = targets_by_split(scene, depths, None, flat, finer=2)
+        return {split: views[0].rgb.shape[:2] for split, views in targets.items()}
+
+    sizes = score(scene)
+    assert set(sizes.values()) == {(6, 8), (12, 16)}
+    assert all(
+        sizes[split] == ((12, 16) if split.endswith("_finer") else (6, 8)) for split in sizes
+    )
+
+    def gone(factor, split):
+        raise SceneError("images/000.png is not there")
+
+    kept = score(dataclasses.replace(scene, photographs_at=gone))
+    assert kept == {split: size for split, size in sizes.items() if size == (6, 8)}
+    assert "size of training alone: images/000.png is not there" in capsys.readouterr().out

@@ -19,8 +19,7 @@ from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.lpips import BACKBONES, SMALLEST, LpipsError, LpipsWeights, load_lpips, lpips
 from jaxcloseup.metrics import SSIM_TAPS, cc_psnr, psnr, quantize, ssim
 from jaxcloseup.photographs import Views, camera_at, to_float
-from jaxcloseup.scene import Surface
-from jaxcloseup.scenes import Scene
+from jaxcloseup.scene import Scene, SceneError, Surface
 from jaxcloseup.support import count_seen
 
 
@@ -144,7 +143,11 @@ def targets_by_split(
     splits = [split for split in scene.names if split != "train"]
     targets = {split: make_targets(scene, split, seen_from, render) for split in splits}
     for split in splits if finer is not None and scene.photographs_at else ():
-        views = scene.photographs_at(finer, split)
+        try:
+            views = scene.photographs_at(finer, split)
+        except SceneError as error:  # such as full-size photographs that were not kept
+            print(f"views are scored at the size of training alone: {error}")
+            break
         targets[split + FINER] = make_targets(scene, split, seen_from, render, views)
     return targets
 
