@@ -243,52 +243,6 @@ def test_a_rigid_motion_of_scene_and_camera_changes_nothing():
         np.testing.assert_allclose(after[name], still[name], atol=1e-4)
 
 
-def facing_discs(z, scale, opacity_logit):
-    """`COUNT` discs on the camera's axis that face the camera."""
-    scene = random_scene(0)
-    scene["means"] = np.stack([0 * z, 0 * z, z], axis=1).astype(np.float32).astype(np.float64)
-    scene["log_scales"] = np.full((COUNT, 2), np.log(scale))
-    scene["quaternions"] = np.tile([1.0, 0, 0, 0], (COUNT, 1))
-    scene["opacity_logits"] = np.full(COUNT, opacity_logit)
-    return scene
-
-
-def test_one_disc_facing_the_camera_is_a_gaussian():
-    scene = facing_discs(np.full(COUNT, 2.0), 0.25, 0.0)
-    only = jnp.arange(COUNT) == 3
-    images = render(to_surfels(scene), to_camera(), only)
-    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    squared = ((x - 14.5) * 2 / 30 / 0.25) ** 2 + ((y - 13) * 2 / 34 / 0.25) ** 2
-    expected = 0.5 * np.exp(-squared / 2)
-    expected = np.where(expected < 1 / 255, 0, expected)
-    np.testing.assert_allclose(images["alpha"], expected, atol=1e-6)
-    np.testing.assert_allclose(images["depth"], np.where(expected > 0, 2, 0), atol=1e-6)
-    np.testing.assert_allclose(images["normal"], expected[..., None] * [0, 0, -1], atol=1e-6)
-    assert np.all(images["distortion"] == 0)
-
-
-def test_a_tilted_disc_has_the_depth_of_its_plane():
-    scene = facing_discs(np.full(COUNT, 2.0), 40.0, 0.0)
-    tilt = np.array([np.cos(0.5), np.sin(0.5) * 0.6, np.sin(0.5) * 0.8, 0])
-    scene["quaternions"][:] = tilt
-    images = render(to_surfels(scene), to_camera())
-    normal = reference.rotation_of(tilt)[:, 2]
-    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    rays = np.stack([(x - 14.5) / 30, (y - 13) / 34, np.ones_like(x)], axis=-1)
-    expected = 2 * normal[2] / (rays @ normal)
-    seen = np.asarray(images["alpha"] > 0)
-    assert seen.mean() > 0.5
-    for name in ("depth", "median_depth"):
-        np.testing.assert_allclose(images[name][seen], expected[seen], rtol=5e-6)
-
-
-def test_distortion_keeps_its_digits_on_a_converged_surface():
-    z = 2 * (1 + 1e-3 * np.random.default_rng(0).uniform(-1, 1, COUNT))
-    scene = facing_discs(z, 0.5, -1.5)
-    images, expected = render(to_surfels(scene), to_camera()), oracle(scene)
-    np.testing.assert_allclose(images["distortion"], expected["distortion"], rtol=5e-3, atol=1e-11)
-
-
 def test_discs_behind_are_invisible_and_both_sides_are_visible():
     scene = random_scene(8)
     turned = dict(scene)
