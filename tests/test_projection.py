@@ -3,13 +3,14 @@
 import functools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference_splats as reference
 from splat_scenes import IDENTITY, NEAR, random_scene, to_surfels
 from splat_scenes import to_camera as make_camera
 
-from jaxcloseup.splats.projection import Discs, project_discs, to_camera
+from jaxcloseup.splats.projection import project_discs, to_camera
 
 
 SIZE, INTRINSICS = (48, 64), np.array([50.0, 56.0, 29.5, 27.0])
@@ -20,8 +21,10 @@ DISCS = 500
 def project(surfels, camera, antialias=False):
     discs, normals = to_camera(surfels, camera)
     opacity = jax.nn.sigmoid(surfels.opacity_logits)
-    found = project_discs(discs, opacity, normals, camera, near=NEAR, antialias=antialias)
-    return found.box, found.opacity, found.anchor, found.homography, found.low_pass
+    options = {"near": NEAR, "antialias": antialias}
+    found = project_discs(discs, opacity, jnp.stack(normals), camera, **options)
+    homography = jnp.moveaxis(found.homography, -1, 0)
+    return found.box.T, found.opacity, found.anchor.T, homography, found.low_pass
 
 
 @pytest.mark.parametrize(
@@ -131,6 +134,6 @@ def test_antialiased_discs_are_convolved_with_the_pixel(log_scale):
 
 
 def test_near_must_be_positive():
-    discs = Discs(np.zeros((2, 3)), np.zeros((2, 3, 3)), np.ones((2, 2)))
+    discs, _ = to_camera(to_surfels(random_scene(0)), make_camera())
     with pytest.raises(ValueError, match="near must be a positive depth"):
-        project_discs(discs, np.ones(2), np.ones((2, 3)), make_camera(), near=0.0)
+        project_discs(discs, np.ones(16), np.ones((3, 16)), make_camera(), near=0.0)

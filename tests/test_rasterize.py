@@ -324,19 +324,19 @@ def test_volumetric_gaussians_share_the_kernel():
     opacity, color = rng.uniform(0.2, 1, COUNT), rng.uniform(0, 1, (COUNT, 3))
 
     root = np.linalg.cholesky(np.linalg.inv(ellipse)).swapaxes(1, 2)
-    homography = np.zeros((COUNT, 3, 3))
-    homography[:, :2, 1:] = root / z[:, None, None]
-    homography[:, 2, 0] = 1 / z
+    homography = np.zeros((3, 3, COUNT))
+    homography[:2, 1:] = np.moveaxis(root, 0, -1) / z
+    homography[2, 0] = 1 / z
     reach = 3.34 * np.sqrt(np.diagonal(ellipse, axis1=1, axis2=2))
     footprints = Footprints(
-        anchor=center,
+        anchor=center.T,
         homography=homography,
         opacity=opacity,
         low_pass=np.full(COUNT, 1e9),
-        inverse_depth=np.tile([0.0, np.inf], (COUNT, 1)),
-        payload=color,
+        inverse_depth=np.stack([1 / z, 1 / z]),
+        payload=color.T,
         order=z,
-        box=np.concatenate([center - reach, center + reach], axis=1),
+        box=np.concatenate([center - reach, center + reach], axis=1).T,
     )
     footprints = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), footprints)
     image = jax.jit(lambda f: rasterize(f, CONFIG, height=HEIGHT, width=WIDTH))(footprints)

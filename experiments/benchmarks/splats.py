@@ -163,14 +163,14 @@ def _footprints(surfels, camera, config):
     discs, normals = to_camera(surfels, camera)
     offset = surfels.means - camera.position[None]
     colors = sh_to_rgb(surfels.sh, offset / safe_norm(offset, keepdims=True))
-    payload = jnp.concatenate([colors, normals], axis=-1)
+    payload = jnp.stack([*colors.T, *normals])
     opacity = jax.nn.sigmoid(surfels.opacity_logits)
     return project_discs(discs, opacity, payload, camera, near=config.near)
 
 
 def _lists(footprints, camera, config):
     return tile_lists(
-        lax.stop_gradient(footprints.box),
+        lax.stop_gradient(footprints.box.T),
         lax.stop_gradient(footprints.order),
         height=camera.height,
         width=camera.width,

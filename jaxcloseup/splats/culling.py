@@ -20,7 +20,8 @@ from jaxcloseup.splats.projection import LOW_PASS, MAX_LOG_SCALE, PIXEL_VARIANCE
 from jaxcloseup.splats.surfels import Surfels
 
 
-_BLOCK = 2048  # items that are computed at once
+# Items that are computed at once. XLA repeats work in loops over arrays of less than 16 KiB.
+_BLOCK = 8192
 
 
 def may_show(

@@ -23,24 +23,21 @@ ALPHA_MAX = 0.99  # keeps a gradient for splats behind an opaque one
 TRANSMITTANCE_MIN = 1e-4  # a pixel is finished before its transmittance falls below this
 
 # First columns of the packed table that chunks gather; the payload comes last.
-_ANCHOR, _HOMOGRAPHY, _OPACITY, _LOW_PASS, _RANGE, _PAYLOAD = 0, 2, 11, 12, 13, 15
+ANCHOR, HOMOGRAPHY, OPACITY, LOW_PASS, RANGE, PAYLOAD = 0, 2, 11, 12, 13, 15
 _EXACT = lax.Precision.HIGHEST
 
 
 def pack(footprints) -> jax.Array:
     """Pack `Footprints` into one table `[N, C]`, whose rows the chunks gather."""
-    count = footprints.opacity.shape[0]
-    return jnp.concatenate(
-        [
-            footprints.anchor,
-            footprints.homography.reshape(count, 9),
-            footprints.opacity[:, None],
-            lax.stop_gradient(footprints.low_pass)[:, None],
-            lax.stop_gradient(footprints.inverse_depth),
-            footprints.payload,
-        ],
-        axis=-1,
-    )
+    columns = [
+        footprints.anchor,
+        footprints.homography.reshape(9, -1),
+        footprints.opacity[None],
+        lax.stop_gradient(footprints.low_pass)[None],
+        lax.stop_gradient(footprints.inverse_depth),
+        footprints.payload,
+    ]
+    return jnp.concatenate(columns).T
 
 
 class _Trace(NamedTuple):
@@ -67,20 +64,20 @@ class _Shade(NamedTuple):
 def _shade(splats: jax.Array, x: jax.Array, y: jax.Array, near: float) -> _Shade:
     """Evaluate gathered table rows `[K, B, C]` (anchors local to the tile) at pixels `[P]`."""
     column = lambda i: splats[:, :, i, None]  # noqa: E731
-    dx, dy = x[None, None] - column(_ANCHOR), y[None, None] - column(_ANCHOR + 1)
+    dx, dy = x[None, None] - column(ANCHOR), y[None, None] - column(ANCHOR + 1)
     u, v, w = (
         column(i) + column(i + 1) * dx + column(i + 2) * dy
-        for i in (_HOMOGRAPHY, _HOMOGRAPHY + 3, _HOMOGRAPHY + 6)
+        for i in (HOMOGRAPHY, HOMOGRAPHY + 3, HOMOGRAPHY + 6)
     )
     squared = u * u + v * v
-    low_pass = column(_LOW_PASS) * (dx * dx + dy * dy)
+    low_pass = column(LOW_PASS) * (dx * dx + dy * dy)
     # Compare rho without dividing; where w <= 0 the ray misses the plane and the low-pass counts.
     on_plane = (w > 0) & (squared <= low_pass * (w * w))
-    low, high = column(_RANGE), column(_RANGE + 1)
+    low, high = column(RANGE), column(RANGE + 1)
     inverse = jnp.where(on_plane, w, jnp.clip(w, low, high))
     z = 1 / inverse
     rho = jnp.where(on_plane, squared * (z * z), low_pass)
-    alpha = jnp.minimum(column(_OPACITY) * jnp.exp(-0.5 * rho), ALPHA_MAX)
+    alpha = jnp.minimum(column(OPACITY) * jnp.exp(-0.5 * rho), ALPHA_MAX)
     alpha = jnp.where((alpha >= ALPHA_MIN) & (w * near <= 1), alpha, 0)
     return _Shade(alpha, inverse, z, u, v, rho, on_plane, ~on_plane & ((w < low) | (w > high)))
 
@@ -93,10 +90,10 @@ def _gather(table, lists: TileLists, tiles, position, chunk):
     # Past a list's end, take the splat at its start and give it opacity 0.
     index = lists.splats[starts[None] + jnp.where(inside, place, 0)]
     rows = table[index]
-    anchor = rows[..., :_HOMOGRAPHY] - origins[None].astype(table.dtype)
-    opacity = jnp.where(inside, rows[..., _OPACITY], 0)[..., None]
+    anchor = rows[..., :HOMOGRAPHY] - origins[None].astype(table.dtype)
+    opacity = jnp.where(inside, rows[..., OPACITY], 0)[..., None]
     rows = jnp.concatenate(
-        [anchor, rows[..., _HOMOGRAPHY:_OPACITY], opacity, rows[..., _OPACITY + 1 :]], axis=-1
+        [anchor, rows[..., HOMOGRAPHY:OPACITY], opacity, rows[..., OPACITY + 1 :]], axis=-1
     )
     return rows, index
 
@@ -165,7 +162,7 @@ def _batched_backward(config):
 
 
 def _forward(config, table, lists):
-    features = table.shape[1] - _PAYLOAD
+    features = table.shape[1] - PAYLOAD
     x, y = _pixels(config.tile, table.dtype)
 
     def attenuate(product, alpha):
@@ -228,7 +225,7 @@ def _add_chunk(sums, weights, rows, shade, *, reference):
     """The sums of `blend_tiles`, one `[B, P]` for each channel, with a chunk's splats added."""
     # Splats in front of the first drawn one have weight 0, so one reference serves all.
     shifted = shade.inverse_depth - reference[None]
-    channels = [rows[:, :, f, None] for f in range(_PAYLOAD, rows.shape[-1])]
+    channels = [rows[:, :, f, None] for f in range(PAYLOAD, rows.shape[-1])]
     channels += [shade.z, jnp.ones_like(shade.z), shifted, shifted * shifted]
     return tuple(
         total + sum(weights[k] * channel[k] for k in range(len(weights)))
@@ -315,8 +312,8 @@ def _backward(config, table, lists, trace, cotangents):
 def _worth(rows, shade, shifted, sums_bar):
     """Derivative `[K, B, P]` of the loss with respect to each splat's weight."""
     z_bar, alpha_bar, first_bar, second_bar = (sums_bar[None, :, i] for i in range(-4, 0))
-    features = range(rows.shape[-1] - _PAYLOAD)
-    worth = sum(rows[:, :, _PAYLOAD + f, None] * sums_bar[None, :, f] for f in features)
+    features = range(rows.shape[-1] - PAYLOAD)
+    worth = sum(rows[:, :, PAYLOAD + f, None] * sums_bar[None, :, f] for f in features)
     worth = worth + alpha_bar + shade.z * z_bar
     return worth + shifted * (first_bar + shifted * second_bar)
 
@@ -330,16 +327,16 @@ def _assemble(rows, middle, *, u, v, w, low_pass, clip, scaled, payload):
     ax, ay = rows[..., 0] - middle, rows[..., 1] - middle
     about_anchor = lambda m: (m[0], m[1] - ax * m[0], m[2] - ay * m[0])  # noqa: E731
     u, v, w, low_pass = map(about_anchor, (u, v, w, low_pass))
-    slopes = rows[..., _HOMOGRAPHY:_OPACITY].reshape(*rows.shape[:2], 3, 3)[..., 1:]
+    slopes = rows[..., HOMOGRAPHY:OPACITY].reshape(*rows.shape[:2], 3, 3)[..., 1:]
     anchor_bar = [
-        rows[..., _LOW_PASS] * low_pass[1 + axis]
+        rows[..., LOW_PASS] * low_pass[1 + axis]
         - sum(bar[0] * slopes[..., i, axis] for i, bar in enumerate((u, v, w)))
         for axis in range(2)
     ]
     # A clipped depth moves with the anchor's depth, 1 / homography[2, 0].
-    constant_bar = w[0] + safe_divide(clip, rows[..., _HOMOGRAPHY + 6] ** 2)
-    opacity_bar = safe_divide(scaled, rows[..., _OPACITY])
-    constants = [jnp.zeros_like(ax)] * (_PAYLOAD - _LOW_PASS)
+    constant_bar = w[0] + safe_divide(clip, rows[..., HOMOGRAPHY + 6] ** 2)
+    opacity_bar = safe_divide(scaled, rows[..., OPACITY])
+    constants = [jnp.zeros_like(ax)] * (PAYLOAD - LOW_PASS)
     columns = [*anchor_bar, *u, *v, constant_bar, *w[1:], opacity_bar, *constants]
     return jnp.concatenate([jnp.stack(columns, axis=-1), payload], axis=-1)
 

@@ -16,8 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxcloseup.geometry.cameras import Camera
-from jaxcloseup.geometry.rotations import quaternion_to_matrix
-from jaxcloseup.numerics import matmul, safe_norm
+from jaxcloseup.geometry.rotations import quaternion_rows
 from jaxcloseup.splats.kernel import ALPHA_MIN
 from jaxcloseup.splats.rasterize import Footprints
 from jaxcloseup.splats.surfels import Surfels
@@ -29,32 +28,47 @@ EDGE_ON = 1e-4  # |cos| between normal and line of sight below which a disc is n
 MAX_LOG_SCALE = 30.0  # beyond it, products of scales leave the range of float32
 
 
+# Components x, y, z `[N]` of N vectors. On a CPU, loops over many splats are several times faster
+# in arrays of single components than in arrays of short vectors.
+Vector = tuple[jax.Array, jax.Array, jax.Array]
+
+
 class Discs(NamedTuple):
     """`N` discs in one camera's frame, in world units.
 
     Attributes:
-      center: `[N, 3]` centers.
-      axes: `[N, 3, 3]` rotations; columns are the unit tangents t_u, t_v and the normal.
-      scales: `[N, 2]` standard deviations along the tangents.
+      center: centers.
+      tangent_u: first unit tangents.
+      tangent_v: second unit tangents.
+      normal: unit normals.
+      scales: standard deviations `[N]` along the two tangents.
     """
 
-    center: jax.Array
-    axes: jax.Array
-    scales: jax.Array
+    center: Vector
+    tangent_u: Vector
+    tangent_v: Vector
+    normal: Vector
+    scales: tuple[jax.Array, jax.Array]
 
 
-def to_camera(surfels: Surfels, camera: Camera) -> tuple[Discs, jax.Array]:
-    """Discs in the camera's frame, and their normals `[N, 3]`, world frame, facing the camera."""
-    axes = quaternion_to_matrix(surfels.quaternions)
-    offset = surfels.means - camera.position[None]
-    normal = axes[..., 2]
-    away = jnp.sum(offset * normal, axis=-1, keepdims=True) > 0
-    discs = Discs(
-        center=matmul(offset, camera.rotation),
-        axes=matmul(camera.rotation.T[None], axes),
-        scales=jnp.exp(jnp.clip(surfels.log_scales, -MAX_LOG_SCALE, MAX_LOG_SCALE)),
-    )
-    return discs, jnp.where(away, -normal, normal)
+def to_camera(surfels: Surfels, camera: Camera) -> tuple[Discs, Vector]:
+    """Discs in the camera's frame, and their normals, world frame, facing the camera."""
+    columns = zip(*quaternion_rows(*surfels.quaternions.T), strict=True)
+    tangent_u, tangent_v, normal = columns
+    offset = offsets(surfels, camera)
+    away = _dot(offset, normal) > 0
+    scales = jnp.exp(jnp.clip(surfels.log_scales, -MAX_LOG_SCALE, MAX_LOG_SCALE))
+
+    def turn(vector):
+        return tuple(_dot(axis, vector) for axis in camera.rotation.T)
+
+    discs = Discs(*map(turn, (offset, tangent_u, tangent_v, normal)), scales=tuple(scales.T))
+    return discs, tuple(jnp.where(away, -n, n) for n in normal)
+
+
+def offsets(surfels: Surfels, camera: Camera) -> Vector:
+    """From the camera to the surfels' centers, world frame."""
+    return tuple(mean - at for mean, at in zip(surfels.means.T, camera.position, strict=True))
 
 
 def project_discs(
@@ -77,7 +91,7 @@ def project_discs(
     Args:
       discs: `N` discs in the frame of `camera`.
       opacity: `[N]` in [0, 1].
-      payload: `[N, F]` values to blend.
+      payload: `[F, N]` values to blend.
       camera: one camera; only its intrinsics and image size are used.
       near: positive z-depth; nothing nearer is drawn, and a disc may reach through it.
       antialias: see above.
@@ -87,119 +101,137 @@ def project_discs(
     """
     if near <= 0:
         raise ValueError(f"near must be a positive depth, not {near}")
-    focal, principal = camera.intrinsics[None, :2], camera.intrinsics[None, 2:]
-    size = jnp.array([[camera.width, camera.height]], focal.dtype)
-    mu, depth = discs.center, discs.center[:, 2]
+    focal, principal = camera.intrinsics[:2], camera.intrinsics[2:]
+    size = camera.width, camera.height
+    mu, depth = discs.center, discs.center[2]
     ahead = depth > near
     inverse_depth = 1 / jnp.where(ahead, depth, 1)
-    center = mu[:, :2] * inverse_depth[:, None] * focal + principal
+    center = [mu[i] * inverse_depth * focal[i] + principal[i] for i in range(2)]
 
     # A center far outside the image, or behind the camera, is a poor origin for numbers that are
     # evaluated inside it. Any other pixel serves if the low-pass about it stays out of sight.
-    margin = jnp.maximum(size, 16)
-    within = jnp.all((center > -margin) & (center < size + margin), axis=-1, keepdims=True)
-    centered = ahead[:, None] & within
     # Discs behind the camera are anchored at a corner of pixels, never at a pixel's center.
-    corner = jnp.floor(size / 2)
-    elsewhere = jnp.where(ahead[:, None], jnp.clip(center, -margin, size + margin), corner)
-    anchor = jnp.where(centered, center, lax.stop_gradient(elsewhere))
-
-    tangent_u, tangent_v, normal = (discs.axes[..., i] for i in range(3))
-    facing = jnp.sum(normal * mu, axis=-1)
-    edge_on = jnp.abs(facing) <= EDGE_ON * safe_norm(mu)
-    covectors = [
-        jnp.cross(tangent_v, mu) / discs.scales[:, :1],
-        jnp.cross(mu, tangent_u) / discs.scales[:, 1:],
-        normal,
+    margin = [max(side, 16) for side in size]
+    around = list(zip(center, margin, size, strict=True))
+    within = [(at > -more) & (at < side + more) for at, more, side in around]
+    centered = ahead & within[0] & within[1]
+    elsewhere = [
+        jnp.where(ahead, jnp.clip(at, -more, side + more), side // 2) for at, more, side in around
     ]
-    covectors = jnp.stack(covectors, axis=1) / jnp.where(edge_on, 1, facing)[:, None, None]
-    ray = jnp.concatenate([(anchor - principal) / focal, jnp.ones_like(anchor[:, :1])], axis=-1)
-    at_anchor = jnp.sum(covectors * ray[:, None], axis=-1)
-    at_center = jnp.stack([jnp.zeros_like(depth), jnp.zeros_like(depth), inverse_depth], axis=-1)
-    constants = jnp.where(centered, at_center, at_anchor)
-    homography = jnp.concatenate(
-        [constants[..., None], covectors[..., :2] / focal[:, None]], axis=-1
+    anchor = [
+        jnp.where(centered, at, lax.stop_gradient(other))
+        for at, other in zip(center, elsewhere, strict=True)
+    ]
+
+    facing = _dot(discs.normal, mu)
+    edge_on = jnp.abs(facing) <= EDGE_ON * jnp.sqrt(lax.stop_gradient(_dot(mu, mu)))
+    per_facing = 1 / jnp.where(edge_on, 1, facing)
+    covectors = (
+        _scale(per_facing / discs.scales[0], _cross(discs.tangent_v, mu)),
+        _scale(per_facing / discs.scales[1], _cross(mu, discs.tangent_u)),
+        _scale(per_facing, discs.normal),
     )
-    vectors = discs.axes[..., :2] * discs.scales[:, None]
+    ray = [(anchor[i] - principal[i]) / focal[i] for i in range(2)]
+    homography = [
+        (
+            jnp.where(centered, at_center, x * ray[0] + y * ray[1] + z),
+            x / focal[0],
+            y / focal[1],
+        )
+        for (x, y, z), at_center in zip(covectors, (0, 0, inverse_depth), strict=True)
+    ]
+    vectors = _scale(discs.scales[0], discs.tangent_u), _scale(discs.scales[1], discs.tangent_v)
     if antialias:
-        spread = _pixel_spread(homography, depth, centered[:, 0] & ~edge_on)
+        spread = _pixel_spread(homography, depth, centered & ~edge_on)
         homography, vectors = _widen(homography, vectors, spread)
         opacity = opacity / (spread[0] * spread[2])
 
     # Neither the box nor the disc's range of depth has a derivative.
-    vectors, opacity_now, center = lax.stop_gradient((vectors, opacity, center))
+    mu, vectors, opacity_now, center = lax.stop_gradient((mu, vectors, opacity, center))
     cutoff = jnp.sqrt(2 * jnp.log(jnp.maximum(opacity_now / ALPHA_MIN, 1)))
-    reach = cutoff * safe_norm(vectors[:, 2])
-    drawn = ~edge_on & (opacity_now >= ALPHA_MIN) & (depth + reach >= near)
-    nearest, farthest = (jnp.maximum(limit, near) for limit in (depth - reach, depth + reach))
-    box = _disc_box(lax.stop_gradient(mu), vectors, cutoff, camera, near)
+    reach = cutoff * jnp.hypot(vectors[0][2], vectors[1][2])
+    drawn = ~edge_on & (opacity_now >= ALPHA_MIN) & (mu[2] + reach >= near)
+    nearest, farthest = (jnp.maximum(limit, near) for limit in (mu[2] - reach, mu[2] + reach))
+    box = _disc_box(mu, vectors, cutoff, camera, near)
     if not antialias:
-        box = jnp.where(ahead[:, None], _unite(box, _low_pass_box(center, cutoff)), box)
+        sides = zip((jnp.minimum,) * 2 + (jnp.maximum,) * 2, box, _low_pass_box(center, cutoff))
+        box = [jnp.where(ahead, unite(a, b), a) for unite, a, b in sides]
     return Footprints(
-        anchor=anchor,
-        homography=homography,
+        anchor=jnp.stack(anchor),
+        homography=jnp.stack([jnp.stack(row) for row in homography]),
         opacity=jnp.where(drawn, opacity, 0),
         low_pass=jnp.where(ahead & (not antialias), LOW_PASS, 1e9),
-        inverse_depth=jnp.stack([1 / farthest, 1 / nearest], axis=-1),
+        inverse_depth=jnp.stack([1 / farthest, 1 / nearest]),
         payload=payload,
-        order=lax.stop_gradient(jnp.maximum(depth, near)),
-        box=lax.stop_gradient(jnp.where(drawn[:, None], box, -1)),
+        order=jnp.maximum(mu[2], near),
+        box=jnp.where(drawn[None], jnp.stack(box), -1),
     )
+
+
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _cross(a, b):
+    return (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )
+
+
+def _scale(factor, vector):
+    return tuple(factor * component for component in vector)
 
 
 def _pixel_spread(homography, depth, known):
     """Cholesky factor (l11, l21, l22) of I + s^2 J J^T of each disc; the identity if not known."""
-    across, down = (
-        jnp.where(known[:, None], depth[:, None] * homography[:, :2, i], 0) for i in (1, 2)
+    (ux, uy), (vx, vy) = (
+        [jnp.where(known, depth * slope, 0) for slope in row[1:]] for row in homography[:2]
     )
     uu, uv, vv = (
-        PIXEL_VARIANCE * (across[:, i] * across[:, j] + down[:, i] * down[:, j])
-        for i, j in ((0, 0), (0, 1), (1, 1))
+        PIXEL_VARIANCE * sums for sums in (ux * ux + uy * uy, ux * vx + uy * vy, vx * vx + vy * vy)
     )
     first = jnp.sqrt(1 + uu)
     below = uv / first
     # 1 + vv - below^2, without taking large numbers from each other.
-    cross = PIXEL_VARIANCE * (across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0])
+    cross = PIXEL_VARIANCE * (ux * vy - vx * uy)
     second = jnp.sqrt((1 + uu + vv + cross * cross) / (1 + uu))
     return first, below, second
 
 
 def _widen(homography, vectors, spread):
-    """Homography and vectors of discs `[N, 3, 2]` whose covariance (u, v) is L L^T."""
-    first, below, second = (factor[:, None] for factor in spread)
-    u = homography[:, 0] / first
-    v = (homography[:, 1] - below * u) / second
-    homography = jnp.stack([u, v, homography[:, 2]], axis=1)
-    one, other = vectors[..., 0], vectors[..., 1]
-    return homography, jnp.stack([first * one + below * other, second * other], axis=-1)
+    """Homography and vectors of discs whose covariance of (u, v) is L L^T."""
+    first, below, second = spread
+    u = _scale(1 / first, homography[0])
+    v = tuple((b - below * a) / second for a, b in zip(u, homography[1], strict=True))
+    one, other = vectors
+    one = tuple(first * a + below * b for a, b in zip(one, other, strict=True))
+    return (u, v, homography[2]), (one, _scale(second, other))
 
 
-def _disc_box(
-    center: jax.Array, vectors: jax.Array, cutoff: jax.Array, camera: Camera, near: float
-) -> jax.Array:
-    """Exact bounds `[N, 4]` in pixels of discs of radius `cutoff[N]`, cut off at z = near.
+def _disc_box(center, vectors, cutoff, camera, near):
+    """Exact bounds x0, y0, x1, y1 `[N]` in pixels of discs of radius `cutoff[N]` cut at z = near.
 
-    The rim is center + cutoff (cos t, sin t) . vectors, for `[N, 3]` centers and `[N, 3, 2]`
-    vectors.
-
-    The visible part is convex, so points of its rim bound its image: those where a coordinate is
-    stationary along the circle, and the ends of the chord at z = near.
+    The rim is center + cutoff (cos t vectors[0] + sin t vectors[1]). The visible part is convex, so
+    points of its rim bound its image: those where a coordinate is stationary along the circle, and
+    the ends of the chord at z = near.
     """
     # The margin keeps pixels that only just reach the cutoff in spite of rounding.
-    radii = (1.001 * cutoff)[:, None, None] * vectors
+    radius = 1.001 * cutoff
     # Each coordinate x, y, z of the rim is a cos + b sin + c, a triple of [N].
-    circle = [(radii[:, i, 0], radii[:, i, 1], center[:, i]) for i in range(3)]
+    circle = [(radius * vectors[0][i], radius * vectors[1][i], center[i]) for i in range(3)]
     depth = circle[2]
     chord, has_chord = _meet_circle(depth[0], depth[1], depth[2] - near)
     low, high = [], []
     for axis in range(2):
-        a, b = circle[axis], depth
-        rim, has_rim = _meet_circle(
-            a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[1] * b[0] - a[0] * b[1]
-        )
+        a = circle[axis]
+        # The derivative of (a.p) / (depth.p) vanishes, where p = (cos t, sin t, 1).
+        cos, sin, constant = _cross(a, depth)
+        rim, has_rim = _meet_circle(cos, sin, -constant)
         candidates = [(point, near, has_chord) for point in chord]
         for point in rim:
-            at_depth = _on_circle(b, point)
+            at_depth = _on_circle(depth, point)
             exists = has_rim & (at_depth >= near)
             candidates.append((point, jnp.where(exists, at_depth, 1), exists))
         least, most = jnp.inf, -jnp.inf
@@ -210,7 +242,7 @@ def _disc_box(
             most = jnp.maximum(most, jnp.where(exists, at, -jnp.inf))
         low.append(least - 0.01)
         high.append(most + 0.01)
-    return jnp.stack([*low, *high], axis=-1)
+    return *low, *high
 
 
 def _on_circle(coordinate, point):
@@ -233,11 +265,6 @@ def _meet_circle(a, b, c):
     return points, discriminant >= 0
 
 
-def _low_pass_box(center: jax.Array, cutoff: jax.Array) -> jax.Array:
-    half = (1.001 * cutoff / jnp.sqrt(LOW_PASS) + 0.01)[:, None]
-    return jnp.concatenate([center - half, center + half], axis=-1)
-
-
-def _unite(a: jax.Array, b: jax.Array) -> jax.Array:
-    low, high = jnp.minimum(a[:, :2], b[:, :2]), jnp.maximum(a[:, 2:], b[:, 2:])
-    return jnp.concatenate([low, high], axis=-1)
+def _low_pass_box(center, cutoff):
+    half = 1.001 * cutoff / jnp.sqrt(LOW_PASS) + 0.01
+    return [center[0] - half, center[1] - half, center[0] + half, center[1] + half]

@@ -16,6 +16,7 @@ from jax import lax
 
 from jaxcloseup.numerics import safe_divide
 from jaxcloseup.splats.kernel import blend_tiles, pack
+from jaxcloseup.splats.reach import reaches
 from jaxcloseup.splats.tiling import tile_lists
 
 
@@ -43,24 +44,26 @@ class RasterizeConfig:
 
 @struct.dataclass
 class Footprints:
-    """`N` splats in any order, ready to be drawn.
+    """`N` splats in any order, ready to be drawn. Splats are the last axis.
 
     At pixel q, with d = (1, q - anchor) and the homography H, the local coordinates are
     (u, v) = (H[0].d, H[1].d) / (H[2].d) and the z-depth is 1 / (H[2].d). The opacity falls as
     exp(-rho / 2) with rho = min(u^2 + v^2, low_pass |q - anchor|^2).
 
     Attributes:
-      anchor: `[N, 2]` reference pixel: the projected center wherever the low-pass is visible.
-      homography: `[N, 3, 3]` map from pixels to (u, v, 1) / z; its columns multiply 1, x - anchor_x
+      anchor: `[2, N]` reference pixel: the projected center; of a center far outside the image, the
+        nearest pixel of a larger rectangle; any pixel if the splat reaches the near plane and has
+        no low-pass.
+      homography: `[3, 3, N]` map from pixels to (u, v, 1) / z; its columns multiply 1, x - anchor_x
         and y - anchor_y.
       opacity: `[N]` in [0, 1]; splats of opacity 0 are not drawn.
       low_pass: `[N]` inverse variance, in 1/px^2, of the smallest screen-space Gaussian; a very
         large value has no effect. No gradient.
-      inverse_depth: `[N, 2]` lower and upper limit of 1/z where the low-pass gives rho. At a limit,
+      inverse_depth: `[2, N]` lower and upper limit of 1/z where the low-pass gives rho. At a limit,
         the derivative is that of the depth at the anchor.
-      payload: `[N, F]` values to blend, such as colors and normals.
+      payload: `[F, N]` values to blend, such as colors and normals.
       order: `[N]` positive z-depth by which splats are sorted. No gradient.
-      box: `[N, 4]` bounds (x0, y0, x1, y1) in pixels outside which the splat is fainter than
+      box: `[4, N]` bounds x0, y0, x1, y1 in pixels outside which the splat is fainter than
         `ALPHA_MIN`; empty where x1 < x0. No gradient.
     """
 
@@ -104,13 +107,13 @@ def rasterize(
     same `order`, the one with the lower index is in front.
     """
     count = footprints.opacity.shape[0]
-    chex.assert_shape(footprints.payload, (count, None))
-    chex.assert_shape(footprints.anchor, (count, 2))
-    chex.assert_shape(footprints.homography, (count, 3, 3))
+    chex.assert_shape(footprints.payload, (None, count))
+    chex.assert_shape(footprints.anchor, (2, count))
+    chex.assert_shape(footprints.homography, (3, 3, count))
     chex.assert_shape([footprints.opacity, footprints.low_pass, footprints.order], (count,))
-    chex.assert_shape(footprints.inverse_depth, (count, 2))
-    box, order = footprints.box, footprints.order
-    return blend(pack(footprints), box, order, config, height=height, width=width)
+    chex.assert_shape(footprints.inverse_depth, (2, count))
+    table, box, order = pack(footprints), footprints.box.T, footprints.order
+    return blend(table, box, order, config, height=height, width=width)
 
 
 def blend(
@@ -123,6 +126,7 @@ def blend(
     width: int,
 ) -> SplatImage:
     """`rasterize` of splats whose footprints are a table `[N, C]` from `pack`, boxes and order."""
+    kept = lax.stop_gradient(table)
     lists = tile_lists(
         lax.stop_gradient(box),
         lax.stop_gradient(order),
@@ -131,6 +135,7 @@ def blend(
         tile=config.tile,
         block=config.block,
         capacity=config.capacity,
+        reaches=functools.partial(reaches, kept, tile=config.tile, near=config.near),
     )
     sums, median = blend_tiles(config, table, lists)
     image = functools.partial(_untile, height=height, width=width, tile=config.tile)

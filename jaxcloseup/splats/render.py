@@ -9,12 +9,11 @@ import jax.numpy as jnp
 
 from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import Camera
-from jaxcloseup.numerics import safe_norm
 from jaxcloseup.splats.culling import map_shown, may_show
 from jaxcloseup.splats.kernel import pack
-from jaxcloseup.splats.projection import project_discs, to_camera
+from jaxcloseup.splats.projection import offsets, project_discs, to_camera
 from jaxcloseup.splats.rasterize import RasterizeConfig, blend
-from jaxcloseup.splats.spherical_harmonics import sh_to_rgb
+from jaxcloseup.splats.spherical_harmonics import sh_to_channels
 from jaxcloseup.splats.surfels import Surfels
 
 
@@ -89,9 +88,10 @@ def _project(surfels, camera, *, near, antialias):
     """Table, boxes and order of surfels, for `blend`."""
     surfels, opacity = surfels
     discs, normals = to_camera(surfels, camera)
-    offset = surfels.means - camera.position[None]
-    distance = safe_norm(offset, keepdims=True)
-    colors = sh_to_rgb(surfels.sh, offset / jnp.where(distance == 0, 1, distance))
-    payload = jnp.concatenate([colors, normals], axis=-1)
+    x, y, z = offsets(surfels, camera)
+    squared = x * x + y * y + z * z
+    distance = jnp.sqrt(jnp.where(squared == 0, 1, squared))
+    colors = sh_to_channels(surfels.sh, x / distance, y / distance, z / distance)
+    payload = jnp.stack([*colors, *normals])
     footprints = project_discs(discs, opacity, payload, camera, near=near, antialias=antialias)
-    return pack(footprints), footprints.box, footprints.order
+    return pack(footprints), footprints.box.T, footprints.order

@@ -19,9 +19,12 @@ def sh_basis(directions: jax.Array, degree: int) -> jax.Array:
       ValueError: `degree` is not 0 to 3.
     """
     chex.assert_axis_dimension(directions, -1, 3)
+    return jnp.stack(_basis(*jnp.moveaxis(directions, -1, 0), degree), axis=-1)
+
+
+def _basis(x, y, z, degree):
     if degree not in range(4):
         raise ValueError(f"spherical harmonics must have degree 0 to 3, not {degree}")
-    x, y, z = jnp.moveaxis(directions, -1, 0)
     xx, yy, zz = x * x, y * y, z * z
     root = lambda numerator, denominator: math.sqrt(numerator / (denominator * math.pi))  # noqa: E731
     basis = [jnp.full_like(x, _CONSTANT)]
@@ -45,7 +48,7 @@ def sh_basis(directions: jax.Array, degree: int) -> jax.Array:
             root(105, 16) * z * (xx - yy),
             -root(35, 32) * x * (xx - 3 * yy),
         ]
-    return jnp.stack(basis, axis=-1)
+    return basis
 
 
 def sh_to_rgb(sh: jax.Array, directions: jax.Array) -> jax.Array:
@@ -55,10 +58,20 @@ def sh_to_rgb(sh: jax.Array, directions: jax.Array) -> jax.Array:
       sh: `[..., (L + 1)^2, 3]` coefficients.
       directions: `[..., 3]` unit vectors from the camera to the splat, world frame.
     """
+    chex.assert_axis_dimension(directions, -1, 3)
+    return jnp.stack(sh_to_channels(sh, *jnp.moveaxis(directions, -1, 0)), axis=-1)
+
+
+def sh_to_channels(
+    sh: jax.Array, x: jax.Array, y: jax.Array, z: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """`sh_to_rgb` channel by channel `[...]`, of directions with components `x`, `y`, `z` `[...]`."""
     degree = math.isqrt(sh.shape[-2]) - 1
     chex.assert_axis_dimension(sh, -2, (degree + 1) ** 2)
-    basis = sh_basis(directions, degree)
-    return jnp.maximum(jnp.sum(basis[..., None] * sh, axis=-2) + 0.5, 0)
+    basis = _basis(x, y, z, degree)
+    return tuple(
+        jnp.maximum(sum(y * sh[..., k, c] for k, y in enumerate(basis)) + 0.5, 0) for c in range(3)
+    )
 
 
 def rgb_to_sh(rgb: jax.Array) -> jax.Array:

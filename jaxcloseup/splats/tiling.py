@@ -4,6 +4,8 @@ Tiles are squares of pixels in row-major order. The number of pairs is static; p
 are left out and counted.
 """
 
+from collections.abc import Callable
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -48,6 +50,7 @@ def tile_lists(
     tile: int,
     block: int,
     capacity: int,
+    reaches: Callable[[jax.Array, jax.Array], jax.Array] | None = None,
 ) -> TileLists:
     """Sort (tile, splat) pairs by tile, then by `order[N]`, then by index.
 
@@ -59,7 +62,9 @@ def tile_lists(
       width: image width in pixels; static.
       tile: side of a tile in pixels; static.
       block: largest number `B` of tiles in a block; static.
-      capacity: largest number of pairs; static.
+      capacity: largest number of pairs of splats and tiles that their boxes touch; static.
+      reaches: says of `[P]` indices of splats and `[P, 2]` corners x, y of tiles, in pixels, which of
+        these pairs are worth listing, `[P]` bool. None lists all.
     """
     chex.assert_shape(box, (order.shape[0], 4))
     count = order.shape[0]
@@ -72,7 +77,7 @@ def tile_lists(
     too_many = jnp.sum(pairs.astype(jnp.float32)) > LARGEST / 2  # int32 may have wrapped
 
     def sort(rows, room):
-        found = _sort(first, extent, order, rows, room, across=across, tiles=across * down)
+        found = _sort(first, extent, order, rows, room, reaches, tile=tile, across=across, down=down)
         fill = across * down, 0
         return tuple(
             jnp.pad(part, (0, capacity - room), constant_values=value)
@@ -112,10 +117,11 @@ def tile_lists(
     )
 
 
-def _sort(first, extent, order, rows, capacity, *, across, tiles):
-    """Sorted pairs `[capacity]` of the first `rows` splats: tiles, or `tiles` for none, and splats.
+def _sort(first, extent, order, rows, capacity, reaches, *, tile, across, down):
+    """Sorted pairs `[capacity]` of the first `rows` splats: tiles and splats.
 
-    Pairs are laid out by depth rank, so those of the farthest splats overflow.
+    Pairs are laid out by depth rank, so those of the farthest splats overflow. The tile is
+    `across * down` past the last pair.
     """
     by_depth = _nearest_first(order[:rows])
     first, extent = first[by_depth], extent[by_depth]
@@ -125,9 +131,14 @@ def _sort(first, extent, order, rows, capacity, *, across, tiles):
     ranks = jnp.arange(rows, dtype=jnp.int32)
     rank = jnp.repeat(ranks, pairs, total_repeat_length=capacity)
     within = place - (ends - pairs)[rank]
-    row = within // columns[rank]
-    tile_of = (first[rank, 1] + row) * across + first[rank, 0] + within - row * columns[rank]
-    tile_of = jnp.where(place < ends[-1], tile_of, tiles)
+    down_by = within // columns[rank]
+    row = first[rank, 1] + down_by
+    column = first[rank, 0] + within - down_by * columns[rank]
+    listed = place < ends[-1]
+    if reaches is not None:
+        listed &= reaches(by_depth[rank], tile * jnp.stack([column, row], axis=-1))
+    tiles = across * down
+    tile_of = jnp.where(listed, row * across + column, tiles)
     tile_of, rank = _sort_pairs(tile_of, rank, tiles + 1, rows)
     return tile_of, by_depth[rank]
 
