@@ -269,6 +269,7 @@ def run_steps(
 
     `count` may be traced, so one compiled program serves any number of steps.
     """
+    step = jax.jit(step)  # is traced once, though called twice
     _, shapes = jax.eval_shape(step, state, *data)
     total = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 

@@ -60,13 +60,15 @@ def test_whatever_shows_is_kept(kwargs, share, antialias):
     assert kept["corner"] < share * kept["whole"]
 
 
-@pytest.mark.parametrize("number", [0, 1, 16, 17, COUNT])
+@pytest.mark.parametrize("number", [0, 1, COUNT // 4, COUNT // 4 + 1, COUNT])
 def test_a_function_of_the_shown_items_alone(number, monkeypatch):
-    """Values and gradients against NumPy, for none, some and all items, and for part of a block."""
-    monkeypatch.setattr(culling, "_BLOCK", 16)
+    """Values and gradients against NumPy, of few shown items and of too many."""
+    monkeypatch.setattr(culling, "_MANY", 16)
+    few = number <= COUNT // 4
     rng = np.random.default_rng(5)
     items, faint = rng.normal(size=(COUNT, 3)), rng.uniform(size=COUNT)
     shown = np.isin(np.arange(COUNT), rng.permutation(COUNT)[:number])
+    computed = shown if few else np.ones(COUNT, bool)
 
     def function(items, shared):
         values, faint = items
@@ -82,23 +84,25 @@ def test_a_function_of_the_shown_items_alone(number, monkeypatch):
 
     given = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), ((items, faint), 2.0))
     table, kept = map(np.asarray, compute(*given))
-    items, faint = items[shown], faint[shown]
+    items, faint, rows = items[computed], faint[computed], computed.sum()
     expected = 2 * faint[:, None] * np.sin(items)
-    np.testing.assert_allclose(table[:number], expected, atol=1e-6)
-    np.testing.assert_allclose(kept[:number], faint, atol=1e-6)
-    assert not table[number:].any() and COUNT <= len(table) < COUNT + 16
+    np.testing.assert_allclose(table[:rows], expected, atol=1e-6)
+    np.testing.assert_allclose(kept[:rows], faint, atol=1e-6)
+    assert not table[rows:].any() and len(table) == COUNT
 
     (moved, fainter), by_shared = jax.grad(total, argnums=(0, 1))(*given)
     bar = -np.sin(expected)
-    np.testing.assert_allclose(moved[shown], bar * 2 * faint[:, None] * np.cos(items), atol=1e-6)
+    np.testing.assert_allclose(moved[computed], bar * 2 * faint[:, None] * np.cos(items), atol=1e-6)
     np.testing.assert_allclose(
-        fainter[shown], (bar * 2 * np.sin(items)).sum(1) + 2 * faint, atol=1e-5
+        fainter[computed], (bar * 2 * np.sin(items)).sum(1) + 2 * faint, atol=1e-5
     )
     assert by_shared == pytest.approx((bar * expected / 2).sum(), abs=1e-3)
-    assert not np.any(moved[~shown]) and not np.any(fainter[~shown])
+    assert not np.any(moved[~computed]) and not np.any(fainter[~computed])
 
 
 def test_culling_changes_no_image(monkeypatch):
+    monkeypatch.setattr(culling, "_MANY", 16)
+    monkeypatch.setattr(culling, "_PART", 1)  # any number is few
     surfels = to_surfels(random_scene(4, count=COUNT, log_scale=(-4.0, -2.0)))
     intrinsics, size = window("middle")
     camera, alive = to_camera(intrinsics=intrinsics, size=size), jnp.arange(COUNT) % 7 != 3

@@ -20,8 +20,8 @@ from jaxcloseup.splats.projection import LOW_PASS, MAX_LOG_SCALE, PIXEL_VARIANCE
 from jaxcloseup.splats.surfels import Surfels
 
 
-# Items that are computed at once. XLA repeats work in loops over arrays of less than 16 KiB.
-_BLOCK = 8192
+_MANY = 2**14  # fewer items are not worth compiling everything twice
+_PART = 4  # one of so many items is few
 
 
 def may_show(
@@ -66,9 +66,9 @@ def may_show(
 def map_shown(
     function: Callable[[Any, Any], Any], items: Any, shared: Any, shown: jax.Array
 ) -> Any:
-    """`function(items, shared)` of those items alone that are shown, block by block.
+    """`function(items, shared)` of all items or, where few of many are shown, of those alone.
 
-    The derivative computes each block anew, so that nothing is kept for it.
+    The derivative computes everything anew, so that nothing is kept for it.
 
     Args:
       function: maps arrays with a leading axis of items to others with the same axis, item by item.
@@ -77,26 +77,17 @@ def map_shown(
       shown: `[N]` bool.
 
     Returns:
-      The results of the shown items, in their order, then zeros: arrays with `N` rows or a few
-      more, to fill the last block. Differentiable in items and `shared`.
+      The results, arrays with `N` rows: of all items; or of the shown items, in their order, and
+      then zeros. Differentiable in items and `shared`.
     """
-    rows, number = _rows(shown)
-    first = jax.tree.map(lambda leaf: leaf[:1], items)
-    shapes = jax.eval_shape(function, first, shared)
-    results = jax.tree.map(
-        lambda shape: jnp.zeros((rows.size, *shape.shape[1:]), shape.dtype), shapes
-    )
 
-    def add(block, results):
-        at, picked, there = _pick(block, rows, number, items)
-        found = function(picked, shared)
-        return jax.tree.map(
-            lambda all_, new: lax.dynamic_update_slice_in_dim(all_, _only(there, new), at, 0),
-            results,
-            found,
-        )
+    count = shown.size
 
-    return lax.fori_loop(0, -(-number // _BLOCK), add, results)
+    def of_few(index, there):
+        found = _only(there, function(_pick(items, index), shared))
+        return jax.tree.map(lambda leaf: _pad(leaf, count), found)
+
+    return _few_or_all(shown, of_few, lambda: function(items, shared))
 
 
 def _map_shown_forward(function, items, shared, shown):
@@ -105,41 +96,49 @@ def _map_shown_forward(function, items, shared, shown):
 
 def _map_shown_backward(function, residuals, cotangents):
     items, shared, shown = residuals
-    rows, number = _rows(shown)
 
-    def add(block, bars):
-        at, picked, there = _pick(block, rows, number, items)
-        bar = jax.tree.map(
-            lambda leaf: _only(there, lax.dynamic_slice_in_dim(leaf, at, _BLOCK)), cotangents
-        )
-        _, pull_back = jax.vjp(function, picked, shared)
-        items_bar, shared_bar = pull_back(bar)
-        index = lax.dynamic_slice_in_dim(rows, at, _BLOCK)
+    def of_few(index, there):
+        _, pull_back = jax.vjp(function, _pick(items, index), shared)
+        first = jax.tree.map(lambda leaf: leaf[: index.size], cotangents)
+        picked_bar, shared_bar = pull_back(_only(there, first))
+        zeros = jax.tree.map(jnp.zeros_like, items)
         place = lambda all_, new: all_.at[index].set(new, mode="drop")  # noqa: E731
-        return jax.tree.map(place, bars[0], items_bar), jax.tree.map(jnp.add, bars[1], shared_bar)
+        return jax.tree.map(place, zeros, picked_bar), shared_bar
 
-    zeros = jax.tree.map(jnp.zeros_like, (items, shared))
-    return *lax.fori_loop(0, -(-number // _BLOCK), add, zeros), None
+    def of_all():
+        return jax.vjp(function, items, shared)[1](cotangents)
+
+    return *_few_or_all(shown, of_few, of_all), None
 
 
 map_shown.defvjp(_map_shown_forward, _map_shown_backward)
 
 
-def _rows(shown):
-    """Indices of the shown items, then of none, in whole blocks; and how many are shown."""
-    count = shown.shape[0]
-    size = -(-count // _BLOCK) * _BLOCK
-    rows = jnp.nonzero(shown, size=size, fill_value=count)[0].astype(jnp.int32)
-    return rows, jnp.sum(shown, dtype=jnp.int32)
+def _few_or_all(shown, of_few, of_all):
+    """`of_few(index, there)` with room for a part of the items, if that suffices; or `of_all()`."""
+    count = shown.size
+    if count < _MANY:
+        return of_all()
+    few = count // _PART
+    number = jnp.sum(shown, dtype=jnp.int32)
+
+    def picked():
+        index = jnp.nonzero(shown, size=few, fill_value=count)[0].astype(jnp.int32)
+        return of_few(index, jnp.arange(few, dtype=jnp.int32) < number)
+
+    return lax.cond(number <= few, picked, of_all)
 
 
-def _pick(block, rows, number, items):
-    """Where a block starts, its items, and which of them are there."""
-    at = block * _BLOCK
-    index = lax.dynamic_slice_in_dim(rows, at, _BLOCK)
-    picked = jax.tree.map(lambda leaf: leaf.at[index].get(mode="clip"), items)
-    return at, picked, at + jnp.arange(_BLOCK, dtype=jnp.int32) < number
+def _pick(items, index):
+    return jax.tree.map(lambda leaf: leaf.at[index].get(mode="clip"), items)
 
 
 def _only(there, values):
-    return jnp.where(there.reshape(-1, *(1,) * (values.ndim - 1)), values, 0)
+    def one(leaf):
+        return jnp.where(there.reshape(-1, *(1,) * (leaf.ndim - 1)), leaf, 0)
+
+    return jax.tree.map(one, values)
+
+
+def _pad(leaf, count):
+    return jnp.zeros((count, *leaf.shape[1:]), leaf.dtype).at[: leaf.shape[0]].set(leaf)

@@ -154,8 +154,10 @@ def project_discs(
     nearest, farthest = (jnp.maximum(limit, near) for limit in (mu[2] - reach, mu[2] + reach))
     box = _disc_box(mu, vectors, cutoff, camera, near)
     if not antialias:
-        sides = zip((jnp.minimum,) * 2 + (jnp.maximum,) * 2, box, _low_pass_box(center, cutoff))
-        box = [jnp.where(ahead, unite(a, b), a) for unite, a, b in sides]
+        half = 1.001 * cutoff / jnp.sqrt(LOW_PASS) + 0.01
+        square = center[0] - half, center[1] - half, center[0] + half, center[1] + half
+        sides = zip([jnp.minimum] * 2 + [jnp.maximum] * 2, box, square, strict=True)
+        box = [jnp.where(ahead, farther(a, b), a) for farther, a, b in sides]
     return Footprints(
         anchor=jnp.stack(anchor),
         homography=jnp.stack([jnp.stack(row) for row in homography]),
@@ -263,8 +265,3 @@ def _meet_circle(a, b, c):
         ((-c * a - s * b * root) / divisor, (-c * b + s * a * root) / divisor) for s in (-1, 1)
     ]
     return points, discriminant >= 0
-
-
-def _low_pass_box(center, cutoff):
-    half = 1.001 * cutoff / jnp.sqrt(LOW_PASS) + 0.01
-    return [center[0] - half, center[1] - half, center[0] + half, center[1] + half]

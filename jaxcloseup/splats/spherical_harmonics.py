@@ -65,7 +65,7 @@ def sh_to_rgb(sh: jax.Array, directions: jax.Array) -> jax.Array:
 def sh_to_channels(
     sh: jax.Array, x: jax.Array, y: jax.Array, z: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """`sh_to_rgb` channel by channel `[...]`, of directions with components `x`, `y`, `z` `[...]`."""
+    """`sh_to_rgb` channel by channel `[...]`, of directions with components x, y, z `[...]`."""
     degree = math.isqrt(sh.shape[-2]) - 1
     chex.assert_axis_dimension(sh, -2, (degree + 1) ** 2)
     basis = _basis(x, y, z, degree)

@@ -63,8 +63,8 @@ def tile_lists(
       tile: side of a tile in pixels; static.
       block: largest number `B` of tiles in a block; static.
       capacity: largest number of pairs of splats and tiles that their boxes touch; static.
-      reaches: says of `[P]` indices of splats and `[P, 2]` corners x, y of tiles, in pixels, which of
-        these pairs are worth listing, `[P]` bool. None lists all.
+      reaches: says of `[P]` indices of splats and `[P, 2]` corners x, y of tiles, in pixels, which
+        of these pairs are worth listing, `[P]` bool; None lists all.
     """
     chex.assert_shape(box, (order.shape[0], 4))
     count = order.shape[0]
@@ -77,7 +77,8 @@ def tile_lists(
     too_many = jnp.sum(pairs.astype(jnp.float32)) > LARGEST / 2  # int32 may have wrapped
 
     def sort(rows, room):
-        found = _sort(first, extent, order, rows, room, reaches, tile=tile, across=across, down=down)
+        touched = first, extent, order, reaches
+        found = _sort(*touched, rows, room, tile=tile, across=across, down=down)
         fill = across * down, 0
         return tuple(
             jnp.pad(part, (0, capacity - room), constant_values=value)
@@ -117,7 +118,7 @@ def tile_lists(
     )
 
 
-def _sort(first, extent, order, rows, capacity, reaches, *, tile, across, down):
+def _sort(first, extent, order, reaches, rows, capacity, *, tile, across, down):
     """Sorted pairs `[capacity]` of the first `rows` splats: tiles and splats.
 
     Pairs are laid out by depth rank, so those of the farthest splats overflow. The tile is
