@@ -116,11 +116,10 @@ map_shown.defvjp(_map_shown_forward, _map_shown_backward)
 
 def _few_or_all(shown, of_few, of_all):
     """`of_few(index, there)` with room for a part of the items, if that suffices; or `of_all()`."""
-    count = shown.size
-    if count < _MANY:
-        return of_all()
-    few = count // _PART
-    number = jnp.sum(shown, dtype=jnp.int32)
+    count, number = shown.size, jnp.sum(shown, dtype=jnp.int32)
+    # XLA computes what a conditional returns once, and loops over it; without one it computes most
+    # of the projection anew for each column of the tables that are made from it.
+    few = count // _PART if count >= _MANY else 1
 
     def picked():
         index = jnp.nonzero(shown, size=few, fill_value=count)[0].astype(jnp.int32)

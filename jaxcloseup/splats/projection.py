@@ -51,24 +51,50 @@ class Discs(NamedTuple):
     scales: tuple[jax.Array, jax.Array]
 
 
+def columns(surfels: Surfels) -> Surfels:
+    """The surfels with tuples of columns `[N]` in place of arrays `[N, ...]`, see `Vector`."""
+    split = lambda array: _split(array.reshape(array.shape[0], -1))  # noqa: E731
+    sh = split(surfels.sh)
+    return Surfels(
+        means=split(surfels.means),
+        log_scales=split(surfels.log_scales),
+        quaternions=split(surfels.quaternions),
+        opacity_logits=surfels.opacity_logits,
+        sh=tuple(sh[start : start + 3] for start in range(0, len(sh), 3)),
+    )
+
+
+def _split(array):
+    # The derivative of a split is one concatenation, that of slices a sum of padded arrays.
+    return tuple(row[0] for row in lax.split(array.T, (1,) * array.shape[1]))
+
+
 def to_camera(surfels: Surfels, camera: Camera) -> tuple[Discs, Vector]:
-    """Discs in the camera's frame, and their normals, world frame, facing the camera."""
-    columns = zip(*quaternion_rows(*surfels.quaternions.T), strict=True)
-    tangent_u, tangent_v, normal = columns
+    """Discs in the camera's frame, and their normals, world frame, facing the camera.
+
+    Args:
+      surfels: from `columns`.
+      camera: one camera.
+    """
+    tangent_u, tangent_v, normal = zip(*quaternion_rows(*surfels.quaternions), strict=True)
     offset = offsets(surfels, camera)
     away = _dot(offset, normal) > 0
-    scales = jnp.exp(jnp.clip(surfels.log_scales, -MAX_LOG_SCALE, MAX_LOG_SCALE))
 
     def turn(vector):
         return tuple(_dot(axis, vector) for axis in camera.rotation.T)
 
-    discs = Discs(*map(turn, (offset, tangent_u, tangent_v, normal)), scales=tuple(scales.T))
+    discs = Discs(
+        *map(turn, (offset, tangent_u, tangent_v, normal)),
+        scales=tuple(
+            jnp.exp(jnp.clip(scale, -MAX_LOG_SCALE, MAX_LOG_SCALE)) for scale in surfels.log_scales
+        ),
+    )
     return discs, tuple(jnp.where(away, -n, n) for n in normal)
 
 
 def offsets(surfels: Surfels, camera: Camera) -> Vector:
-    """From the camera to the surfels' centers, world frame."""
-    return tuple(mean - at for mean, at in zip(surfels.means.T, camera.position, strict=True))
+    """From the camera to the centers of surfels from `columns`, world frame."""
+    return tuple(mean - at for mean, at in zip(surfels.means, camera.position, strict=True))
 
 
 def project_discs(

@@ -1,6 +1,7 @@
 """Real spherical harmonics to degree 3, the view-dependent color of a splat."""
 
 import math
+from collections.abc import Sequence
 
 import chex
 import jax
@@ -59,18 +60,24 @@ def sh_to_rgb(sh: jax.Array, directions: jax.Array) -> jax.Array:
       directions: `[..., 3]` unit vectors from the camera to the splat, world frame.
     """
     chex.assert_axis_dimension(directions, -1, 3)
-    return jnp.stack(sh_to_channels(sh, *jnp.moveaxis(directions, -1, 0)), axis=-1)
+    columns = [[sh[..., k, c] for c in range(3)] for k in range(sh.shape[-2])]
+    return jnp.stack(sh_to_channels(columns, *jnp.moveaxis(directions, -1, 0)), axis=-1)
 
 
 def sh_to_channels(
-    sh: jax.Array, x: jax.Array, y: jax.Array, z: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """`sh_to_rgb` channel by channel `[...]`, of directions with components x, y, z `[...]`."""
-    degree = math.isqrt(sh.shape[-2]) - 1
-    chex.assert_axis_dimension(sh, -2, (degree + 1) ** 2)
+    sh: Sequence[Sequence[jax.Array]], x: jax.Array, y: jax.Array, z: jax.Array
+) -> tuple[jax.Array, ...]:
+    """`sh_to_rgb` with `(L + 1)^2` times 3 arrays `[...]` of coefficients, to 3 of colors.
+
+    `x`, `y` and `z` are the components `[...]` of the directions.
+    """
+    degree = math.isqrt(len(sh)) - 1
+    if (degree + 1) ** 2 != len(sh):
+        raise ValueError(f"spherical harmonics of degree L have (L + 1)^2 terms, not {len(sh)}")
     basis = _basis(x, y, z, degree)
     return tuple(
-        jnp.maximum(sum(y * sh[..., k, c] for k, y in enumerate(basis)) + 0.5, 0) for c in range(3)
+        jnp.maximum(sum(y * terms[c] for y, terms in zip(basis, sh, strict=True)) + 0.5, 0)
+        for c in range(3)
     )
 
 
