@@ -26,7 +26,7 @@ from jaxcloseup.pseudo import (
     sample_virtual_camera,
 )
 from jaxcloseup.rendered_loss import judge, rendered_loss
-from jaxcloseup.windows import Windows, sample_window
+from jaxcloseup.windows import Windows, sample_window, sample_window_pixels
 
 
 Metrics = dict[str, jax.Array]
@@ -317,11 +317,12 @@ def render_depths(
 
 
 def _sample_batch(key, views, config):
-    if isinstance(views, Windows):
-        return sample_window(key, views)
-    if config.num_rays is None:
-        return sample_image(key, views)
-    return sample_pixels(key, views, config.num_rays)
+    whole, single = (
+        (sample_window, sample_window_pixels)
+        if isinstance(views, Windows)
+        else (sample_image, sample_pixels)
+    )
+    return whole(key, views) if config.num_rays is None else single(key, views, config.num_rays)
 
 
 def _sample_virtual_pixels(key, camera, count):

@@ -57,6 +57,30 @@ def sample_window(key: jax.Array, windows: Windows) -> Batch:
     return cut_window(windows, view, level, corner)
 
 
+def sample_window_pixels(key: jax.Array, windows: Windows, count: int) -> Batch:
+    """Draw `count` pixels with replacement, for fields that render single rays; consumes `key`.
+
+    Each is one of a photograph drawn uniformly, of a level by its share, of its pixels uniformly.
+    """
+    key_view, key_level, key_y, key_x = jax.random.split(key, 4)
+    pyramid = windows.pyramid
+    view = jax.random.randint(key_view, (count,), 0, len(windows))
+    level = jax.random.categorical(key_level, jnp.log(windows.shares), shape=(count,))
+    sizes, starts = (jnp.asarray(x, jnp.int32) for x in (pyramid.sizes, pyramid.starts))
+    height, width = sizes[level].T
+    y = jax.random.randint(key_y, (count,), 0, height)
+    x = jax.random.randint(key_x, (count,), 0, width)
+    values = to_float(pyramid.values[view, starts[level] + y * width + x])
+    return Batch(
+        cameras=camera_at(windows.cameras, view).replace(
+            intrinsics=pyramid.intrinsics[view, level]
+        ),
+        pixels=jnp.stack([x, y], axis=-1).astype(jnp.float32) + 0.5,
+        rgb=values[..., :3],
+        weight=values[..., 3],
+    )
+
+
 def cut_window(
     windows: Windows, view: jax.Array | int, level: jax.Array | int, corner: jax.Array
 ) -> Batch:

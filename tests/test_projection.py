@@ -10,7 +10,7 @@ import reference_splats as reference
 from splat_scenes import IDENTITY, NEAR, random_scene, to_surfels
 from splat_scenes import to_camera as make_camera
 
-from jaxcloseup.splats.projection import columns, project_discs, to_camera
+from jaxcloseup.splats.projection import project_discs, surfel_columns, to_camera
 
 
 SIZE, INTRINSICS = (48, 64), np.array([50.0, 56.0, 29.5, 27.0])
@@ -19,7 +19,7 @@ DISCS = 500
 
 @functools.partial(jax.jit, static_argnums=2)
 def project(surfels, camera, antialias=False):
-    discs, normals = to_camera(columns(surfels), camera)
+    discs, normals = to_camera(surfel_columns(surfels), camera)
     opacity = jax.nn.sigmoid(surfels.opacity_logits)
     options = {"near": NEAR, "antialias": antialias}
     found = project_discs(discs, opacity, jnp.stack(normals), camera, **options)
@@ -134,6 +134,6 @@ def test_antialiased_discs_are_convolved_with_the_pixel(log_scale):
 
 
 def test_near_must_be_positive():
-    discs, _ = to_camera(columns(to_surfels(random_scene(0))), make_camera())
+    discs, _ = to_camera(surfel_columns(to_surfels(random_scene(0))), make_camera())
     with pytest.raises(ValueError, match="near must be a positive depth"):
         project_discs(discs, np.ones(16), np.ones((3, 16)), make_camera(), near=0.0)

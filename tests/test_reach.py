@@ -51,7 +51,7 @@ def pixels_of(corners, at):
 def test_a_surfel_is_listed_where_it_draws_and_hardly_elsewhere(name, tile, antialias):
     scene = CROWDS[name]
     surfels, camera = to_surfels(scene), to_camera()
-    discs, _ = projection.to_camera(projection.columns(surfels), camera)
+    discs, _ = projection.to_camera(projection.surfel_columns(surfels), camera)
     opacity = jax.nn.sigmoid(surfels.opacity_logits)
     payload = jnp.zeros((1, len(opacity)))
     options = {"near": NEAR, "antialias": antialias}

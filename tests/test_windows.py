@@ -13,7 +13,12 @@ from splat_scenes import CONFIG, random_scene, to_surfels
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.pyramids import photograph_pyramid
 from jaxcloseup.splats import render_surfels
-from jaxcloseup.windows import cut_window, photograph_windows, sample_window
+from jaxcloseup.windows import (
+    cut_window,
+    photograph_windows,
+    sample_window,
+    sample_window_pixels,
+)
 
 
 WHOLE_SHARE = 0.25
@@ -70,6 +75,28 @@ def test_windows_cover_all_pixels_of_all_levels_with_the_stated_shares(windows, 
         for places, last in ((x, width - 16), (y, height - 12)):
             seen = np.bincount(places, minlength=last + 1) / len(places)
             np.testing.assert_allclose(seen, 1 / (last + 1), atol=0.015)
+
+
+def test_pixels_come_from_all_levels_with_the_stated_shares(windows, key):
+    count = 60_000
+    batch = jax.jit(functools.partial(sample_window_pixels, count=count))(key, windows)
+    view = np.searchsorted([-0.5, 0.5], batch.cameras.position[:, 0])
+    level = 2 - np.rint(np.log2(batch.cameras.intrinsics[:, 0] / 20)).astype(int)
+    np.testing.assert_allclose(np.bincount(view) / count, 1 / 3, atol=0.01)
+    np.testing.assert_allclose(np.bincount(level) / count, [0.375, 0.375, WHOLE_SHARE], atol=0.01)
+    own = np.asarray(windows.pyramid.intrinsics)[view, level]
+    np.testing.assert_array_equal(batch.cameras.intrinsics, own)
+    x, y = np.floor(batch.pixels).astype(int).T
+    for index, (height, width) in enumerate(windows.pyramid.sizes):
+        there = level == index
+        images = np.asarray(windows.pyramid.level(index)) / np.float32(255)
+        expected = images[view[there], y[there], x[there]]
+        np.testing.assert_allclose(batch.rgb[there], expected[:, :3], rtol=1e-6)
+        np.testing.assert_allclose(batch.weight[there], expected[:, 3], rtol=1e-6)
+        seen = np.bincount(y[there] * width + x[there], minlength=height * width)
+        assert np.all(seen < 5 * seen.mean() + 5) and seen.min() >= (0 if index == 0 else 1)
+        halves = np.bincount(y[there] >= height // 2), np.bincount(x[there] >= width // 2)
+        np.testing.assert_allclose(np.array(halves) / there.sum(), 0.5, atol=0.02)
 
 
 def test_a_window_learns_as_that_part_of_a_whole_image():

@@ -24,7 +24,7 @@ from jaxcloseup.photographs import to_float
 from jaxcloseup.scenes import load_scene
 from jaxcloseup.splats import RasterizeConfig, render_surfels, surfels_from_points
 from jaxcloseup.splats.kernel import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from jaxcloseup.splats.projection import columns, project_discs, to_camera
+from jaxcloseup.splats.projection import project_discs, surfel_columns, to_camera
 from jaxcloseup.splats.spherical_harmonics import sh_to_rgb
 from jaxcloseup.splats.tiling import tile_lists
 
@@ -160,7 +160,7 @@ def _render(surfels, camera, config):
 
 
 def _footprints(surfels, camera, config):
-    discs, normals = to_camera(columns(surfels), camera)
+    discs, normals = to_camera(surfel_columns(surfels), camera)
     offset = surfels.means - camera.position[None]
     colors = sh_to_rgb(surfels.sh, offset / safe_norm(offset, keepdims=True))
     payload = jnp.stack([*colors.T, *normals])

@@ -78,11 +78,14 @@ def _traced(labels):
 
 @dataclasses.dataclass(frozen=True)
 class WindowConfig:
-    """How steps read photographs finer than they are reduced: in windows as large as reduced ones.
+    """How steps read photographs finer than they are reduced.
+
+    Fields that render whole images read windows as large as reduced photographs, and fields that
+    render single rays read single pixels.
 
     Attributes:
       finest: divisor of the finest size that is read; one that fits into memory is taken.
-      whole_share: share of the steps that read a whole reduced photograph.
+      whole_share: share of the steps, or pixels, that read a whole reduced photograph.
     """
 
     finest: int = 1

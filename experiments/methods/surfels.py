@@ -117,6 +117,27 @@ QUICK = dataclasses.replace(
 )
 
 
+# The same with windows twice as wide and high, twice the surfels, and as many steps.
+STANDARD = dataclasses.replace(
+    QUICK,
+    field=dataclasses.replace(
+        QUICK.field,
+        capacity=120_000,
+        raster=dataclasses.replace(QUICK.field.raster, capacity=2**18, block=128),
+    ),
+    coarse=dataclasses.replace(
+        QUICK.coarse,
+        field=dataclasses.replace(
+            QUICK.coarse.field,
+            capacity=20_000,
+            raster=dataclasses.replace(QUICK.coarse.field.raster, capacity=2**17, block=128),
+        ),
+    ),
+    downscale=4,
+    score_downscale=2,
+)
+
+
 def with_adaptive_density(preset: Preset, density: AdaptiveConfig) -> Preset:
     """The preset with clone, split and prune, which starts fainter and needs no prior to fade."""
     field = dataclasses.replace(
@@ -189,6 +210,7 @@ def refine(
 METHOD = Method(
     presets={
         "quick": QUICK,
+        "standard": STANDARD,
         "paper": PAPER,
         "reduced": REDUCED,
         "quick_adaptive": QUICK_ADAPTIVE,

@@ -120,14 +120,15 @@ class Programs:
 
     @functools.cached_property
     def photographs(self) -> Views | Windows:
-        """What steps learn from: reduced photographs, or windows of finer ones."""
+        """What steps learn from: reduced photographs, or windows or pixels of finer ones."""
         views, windows = self.scene.train, self.preset.windows
         if windows is None or windows.finest >= self.preset.downscale:
             return views
         pyramid, divisor = self.pyramid(windows.finest)
         if len(pyramid.sizes) == 1:
             return views
-        print(f"learning from windows of {describe_photographs(pyramid, divisor)}")
+        parts = "pixels" if self.method.renders_pixels else "windows"
+        print(f"learning from {parts} of {describe_photographs(pyramid, divisor)}")
         return photograph_windows(views.cameras, pyramid, whole_share=windows.whole_share)
 
     def make_room(self, growth: int) -> None:

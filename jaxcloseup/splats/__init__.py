@@ -12,7 +12,7 @@ from jaxcloseup.splats.field import (
     with_expected_depth,
 )
 from jaxcloseup.splats.mcmc import McmcConfig
-from jaxcloseup.splats.projection import Discs, project_discs, to_camera
+from jaxcloseup.splats.projection import Discs, project_discs, surfel_columns, to_camera
 from jaxcloseup.splats.rasterize import Footprints, RasterizeConfig, SplatImage, rasterize
 from jaxcloseup.splats.refinement import join_surfels, surfels_where_wrong
 from jaxcloseup.splats.regularizers import (
@@ -54,6 +54,7 @@ __all__ = [
     "scale_free_distortion",
     "sh_basis",
     "sh_to_rgb",
+    "surfel_columns",
     "surfel_field",
     "surfel_optimizer",
     "surfels_from_points",

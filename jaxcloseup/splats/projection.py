@@ -51,7 +51,7 @@ class Discs(NamedTuple):
     scales: tuple[jax.Array, jax.Array]
 
 
-def columns(surfels: Surfels) -> Surfels:
+def surfel_columns(surfels: Surfels) -> Surfels:
     """The surfels with tuples of columns `[N]` in place of arrays `[N, ...]`, see `Vector`."""
     split = lambda array: _split(array.reshape(array.shape[0], -1))  # noqa: E731
     sh = split(surfels.sh)
@@ -73,7 +73,7 @@ def to_camera(surfels: Surfels, camera: Camera) -> tuple[Discs, Vector]:
     """Discs in the camera's frame, and their normals, world frame, facing the camera.
 
     Args:
-      surfels: from `columns`.
+      surfels: from `surfel_columns`.
       camera: one camera.
     """
     tangent_u, tangent_v, normal = zip(*quaternion_rows(*surfels.quaternions), strict=True)
@@ -93,7 +93,7 @@ def to_camera(surfels: Surfels, camera: Camera) -> tuple[Discs, Vector]:
 
 
 def offsets(surfels: Surfels, camera: Camera) -> Vector:
-    """From the camera to the centers of surfels from `columns`, world frame."""
+    """From the camera to the centers of surfels from `surfel_columns`, world frame."""
     return tuple(mean - at for mean, at in zip(surfels.means, camera.position, strict=True))
 
 

@@ -11,7 +11,7 @@ from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.splats.culling import map_shown, may_show
 from jaxcloseup.splats.kernel import pack
-from jaxcloseup.splats.projection import columns, offsets, project_discs, to_camera
+from jaxcloseup.splats.projection import offsets, project_discs, surfel_columns, to_camera
 from jaxcloseup.splats.rasterize import RasterizeConfig, blend
 from jaxcloseup.splats.spherical_harmonics import sh_to_channels
 from jaxcloseup.splats.surfels import Surfels
@@ -74,7 +74,7 @@ def render_surfels(
     opacity = jnp.where(alive, jax.nn.sigmoid(surfels.opacity_logits), 0)
     shown = may_show(surfels, opacity, camera, near=config.near, antialias=config.antialias)
     project = functools.partial(_project, near=config.near, antialias=config.antialias)
-    table, box, order = map_shown(project, (columns(surfels), opacity), camera, shown)
+    table, box, order = map_shown(project, (surfel_columns(surfels), opacity), camera, shown)
     image = blend(table, box, order, config, height=camera.height, width=camera.width)
     rgb, normal = image.payload[..., :3], image.payload[..., 3:]
     if background is not None:
