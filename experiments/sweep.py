@@ -192,7 +192,7 @@ def sweep_scenes(
         found[scene.name] = outcome.scores
         if first:
             folder = output_dir / "compare" / scene.name
-            drawn = comparisons(folder, outcome.shown, outcome.renderings)
+            drawn = comparisons(folder, outcome.shown, outcome.images)
             pictures += [one._replace(section=f"{scene.name}: {one.section}") for one in drawn]
             write_sweep(output_dir, found, about, pictures)
     if first:

@@ -145,7 +145,7 @@ def test_a_sweep_cut_off_and_resumed_ends_the_same(capture_folder, tmp_path, mon
     compare = tmp_path / "compare"
     again = sweep_tiny(scene, tmp_path / "sweep")
     assert again.scores == whole
-    pictures = comparisons(compare, again.shown, again.renderings)
+    pictures = comparisons(compare, again.shown, again.images)
     assert capsys.readouterr().out.count("resumed") == 3  # both baselines and the first arms
 
     # Truth, four arms and the error of the last, of the one close-up and the one ordinary view.

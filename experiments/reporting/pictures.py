@@ -11,7 +11,6 @@ from experiments.evaluation.metrics_text import FINER, SPLIT_TITLES
 from experiments.evaluation.scores import Target
 from experiments.reporting.report import Picture
 from jaxcloseup.artifacts.images import colorize_depth, colorize_error, side_by_side, write_png
-from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.pseudo import (
     LabelSources,
@@ -29,7 +28,7 @@ SHOWN_LABELS = 6  # pictures of labels for each kind of camera
 def comparisons(
     folder: pathlib.Path,
     targets: Mapping[str, Sequence[Target]],
-    renderings: Mapping[tuple[str, str], Mapping[str, Rendering]],
+    images: Mapping[tuple[str, str], Mapping[str, np.ndarray]],
 ) -> list[Picture]:
     """Write `<name>.png`: the true image, every stage, and the error of the last stage.
 
@@ -39,7 +38,7 @@ def comparisons(
     Args:
       folder: folder to write to.
       targets: held-out views by split.
-      renderings: renderings by (stage, split), then by the view's name.
+      images: rendered colors by (stage, split), then by the view's name.
 
     Returns:
       The pictures, for the report.
@@ -48,12 +47,12 @@ def comparisons(
     # Finer views show the same, larger.
     shown = {split: views for split, views in targets.items() if split + FINER not in targets}
     for split, views in shown.items():
-        stages = [stage for stage, rendered in renderings if rendered == split]
+        stages = [stage for stage, rendered in images if rendered == split]
         for target in views if stages else ():
-            images = [renderings[stage, split][target.name].rgb for stage in stages]
+            seen = [images[stage, split][target.name] for stage in stages]
             truth = np.asarray(target.rgb)
-            error = colorize_error(np.abs(images[-1] - truth).mean(axis=-1))
-            panels = [truth, *images, error]
+            error = colorize_error(np.abs(seen[-1] - truth).mean(axis=-1))
+            panels = [truth, *seen, error]
             labels = ["truth", *stages, f"error of {stages[-1]}"]
             image = side_by_side(map(enlarge, panels), labels=labels)
             name = f"{split}_{target.name}" if target.name in written else target.name

@@ -30,7 +30,7 @@ def report_run(
     programs, scene = training.programs, training.programs.scene
     with timed(training.seconds, "report"):
         targets = outcome.held_out.targets
-        pictures = comparisons(output_dir / "compare", targets, outcome.renderings)
+        pictures = comparisons(output_dir / "compare", targets, outcome.images)
         _, _, key = jax.random.split(jax.random.key(about["seed"]), 3)
         pictures += label_pictures(
             key,

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
 from experiments.evaluation.ladder import describe_ladder, ladder_targets
 from experiments.evaluation.metrics_text import describe_split
@@ -58,7 +59,7 @@ class Scorer:
 
     Attributes:
       scores: by stage and split.
-      renderings: by stage and split, then by the view's name; without the zoom ladder's.
+      images: renders by stage and split, then by the view's name; without the zoom ladder's.
     """
 
     def __init__(
@@ -72,7 +73,7 @@ class Scorer:
         self._training, self._held_out = training, held_out
         self._folder, self._perceptual = output_dir, perceptual
         self.scores: dict[str, dict[str, Any]] = {}
-        self.renderings: dict[tuple[str, str], Mapping[str, Rendering]] = {}
+        self.images: dict[tuple[str, str], Mapping[str, np.ndarray]] = {}
 
     def score(
         self, stage: str, state: TrainState, render: Callable[[Camera], Rendering] | None = None
@@ -95,7 +96,7 @@ class Scorer:
                 scores[split], seen = evaluate(render, views, self._perceptual)
                 write_renders(self._folder / "renders" / stage / split, seen, programs.scene)
                 if split in targets:
-                    self.renderings[stage, split] = seen
+                    self.images[stage, split] = {name: one.rgb for name, one in seen.items()}
                     name, first = next(iter(seen.items()))
                     shown[f"{split}/{name}"] = first.rgb
                     print(f"{stage:>9} {split}: {describe_split(scores[split])}", flush=True)

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
 from experiments.evaluation.audit import audit_labels, left_out_curve
 from experiments.evaluation.renders import write_truth
@@ -23,7 +24,6 @@ from experiments.training.setup import (
     start_labels,
     timed,
 )
-from jaxcloseup.field import Rendering
 from jaxcloseup.label_rules import label_depth
 from jaxcloseup.photographs import Views
 from jaxcloseup.pseudo import LabelSources, PseudoSettings, label_sources
@@ -42,7 +42,7 @@ class Outcome(NamedTuple):
       gate: the evidence of the left-out photographs, or None without a gate.
       held_out: the views that were scored.
       scores: by stage and split.
-      renderings: of held-out views, by stage and split, then by name.
+      images: renders of held-out views, by stage and split, then by name.
       audit: labels against the truth, by the depth they are made from; empty on captures.
       left_out: `error_curve` of labels of left-out photographs.
       detail: what `find_detail` says of the stage that got detail, with its `stage`; None without.
@@ -53,7 +53,7 @@ class Outcome(NamedTuple):
     gate: Mapping[str, Any] | None
     held_out: HeldOut
     scores: Mapping[str, Mapping[str, Any]]
-    renderings: Mapping[tuple[str, str], Mapping[str, Rendering]]
+    images: Mapping[tuple[str, str], Mapping[str, np.ndarray]]
     audit: Mapping[str, Any]
     left_out: Mapping[str, Any] | None
     detail: Mapping[str, Any] | None
@@ -135,7 +135,7 @@ def run_stages(
     with timed(training.seconds, "audit"):
         audit, left_out = audit_all(programs, start, held_out.exact, settings, seed)
     return Outcome(
-        *(start, settings, gate, held_out, scorer.scores, scorer.renderings),
+        *(start, settings, gate, held_out, scorer.scores, scorer.images),
         *(audit, left_out, detail),
     )
 

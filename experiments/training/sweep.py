@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from experiments.evaluation.metrics_text import SPLIT_TITLES
 from experiments.evaluation.scores import NO_PERCEPTUAL, Perceptual, Target, evaluate
@@ -29,7 +30,6 @@ from experiments.training.setup import (
     start_labels,
 )
 from jaxcloseup.artifacts.checkpoints import Checkpoints
-from jaxcloseup.field import Rendering
 from jaxcloseup.photographs import Views
 from jaxcloseup.pseudo import LabelSources, PseudoSettings
 from jaxcloseup.scene import Scene
@@ -45,12 +45,12 @@ class SweepOutcome(NamedTuple):
     Attributes:
       scores: for each arm, then seed, `skipped` steps and the metrics of each split in `splits`.
       shown: the first held-out views of each split.
-      renderings: the first seed's renderings of these, by arm and split, then by name.
+      images: the first seed's renders of these, by arm and split, then by name.
     """
 
     scores: dict[str, dict[str, Any]]
     shown: dict[str, Sequence[Target]]
-    renderings: dict[tuple[str, str], dict[str, Rendering]]
+    images: dict[tuple[str, str], dict[str, np.ndarray]]
 
 
 def run_sweep(
@@ -161,7 +161,7 @@ class ArmScorer:
         targets = held_out.targets
         self._shown = {split: targets[split][:SHOWN] for split in SPLIT_TITLES if split in targets}
         self.scores: dict[str, dict[str, Any]] = {arm.name: {} for arm in arms}
-        self._renderings: dict[tuple[str, str], dict[str, Rendering]] = {}
+        self._images: dict[tuple[str, str], dict[str, np.ndarray]] = {}
 
     def score(self, arm: str, seed: int, state: TrainState, skipped: int) -> None:
         """Render and score one arm of one seed."""
@@ -171,13 +171,13 @@ class ArmScorer:
             splits[split], seen = evaluate(render, targets, self._perceptual)
             if seed == 0 and split in self._shown:
                 shown = self._shown[split]
-                self._renderings[arm, split] = {view.name: seen[view.name] for view in shown}
+                self._images[arm, split] = {view.name: seen[view.name].rgb for view in shown}
         self.scores[arm][str(seed)] = {"skipped": skipped, "splits": splits}
 
     def outcome(self) -> SweepOutcome:
         """Everything that was scored, with arms in the order in which the user named them."""
         order = {arm: i for i, arm in enumerate(self.scores)}
-        pairs = sorted(self._renderings.items(), key=lambda pair: order[pair[0][0]])
+        pairs = sorted(self._images.items(), key=lambda pair: order[pair[0][0]])
         return SweepOutcome(self.scores, self._shown, dict(pairs))
 
 
