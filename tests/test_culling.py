@@ -60,11 +60,17 @@ def test_whatever_shows_is_kept(kwargs, share, antialias):
     assert kept["corner"] < share * kept["whole"]
 
 
-@pytest.mark.parametrize("number", [0, 1, COUNT // 4, COUNT // 4 + 1, COUNT])
-def test_a_function_of_the_shown_items_alone(number, monkeypatch):
-    """Values and gradients against NumPy, of few shown items and of too many."""
-    monkeypatch.setattr(culling, "_MANY", 16)
-    few = number <= COUNT // 4
+@pytest.mark.parametrize(
+    ("many", "number"),
+    [
+        *((16, number) for number in (0, 1, COUNT // 4, COUNT // 4 + 1, COUNT)),
+        *((2 * COUNT, number) for number in (0, 1)),
+    ],
+)
+def test_a_function_of_the_shown_items_alone(many, number, monkeypatch):
+    """Values and gradients against NumPy, of few shown items, of too many, and of few in all."""
+    monkeypatch.setattr(culling, "_MANY", many)
+    few = number <= (COUNT // 4 if many == 16 else 0)
     rng = np.random.default_rng(5)
     items, faint = rng.normal(size=(COUNT, 3)), rng.uniform(size=COUNT)
     shown = np.isin(np.arange(COUNT), rng.permutation(COUNT)[:number])

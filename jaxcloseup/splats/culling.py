@@ -80,14 +80,16 @@ def map_shown(
       The results, arrays with `N` rows: of all items; or of the shown items, in their order, and
       then zeros. Differentiable in items and `shared`.
     """
-
     count = shown.size
 
     def of_few(index, there):
         found = _only(there, function(_pick(items, index), shared))
         return jax.tree.map(lambda leaf: _pad(leaf, count), found)
 
-    return _few_or_all(shown, of_few, lambda: function(items, shared))
+    def of_none():
+        return _zeros(jax.eval_shape(function, items, shared))
+
+    return _choose(shown, of_none, of_few, lambda: function(items, shared))
 
 
 def _map_shown_forward(function, items, shared, shown):
@@ -101,25 +103,26 @@ def _map_shown_backward(function, residuals, cotangents):
         _, pull_back = jax.vjp(function, _pick(items, index), shared)
         first = jax.tree.map(lambda leaf: leaf[: index.size], cotangents)
         picked_bar, shared_bar = pull_back(_only(there, first))
-        zeros = jax.tree.map(jnp.zeros_like, items)
         place = lambda all_, new: all_.at[index].set(new, mode="drop")  # noqa: E731
-        return jax.tree.map(place, zeros, picked_bar), shared_bar
+        return jax.tree.map(place, _zeros(items), picked_bar), shared_bar
 
     def of_all():
         return jax.vjp(function, items, shared)[1](cotangents)
 
-    return *_few_or_all(shown, of_few, of_all), None
+    return *_choose(shown, lambda: _zeros((items, shared)), of_few, of_all), None
 
 
 map_shown.defvjp(_map_shown_forward, _map_shown_backward)
 
 
-def _few_or_all(shown, of_few, of_all):
+def _choose(shown, of_none, of_few, of_all):
     """`of_few(index, there)` with room for a part of the items, if that suffices; or `of_all()`."""
+    # XLA computes what a conditional returns once; without one it computes most of the projection
+    # anew for each column of what is made from it. So there is one for small numbers too.
     count, number = shown.size, jnp.sum(shown, dtype=jnp.int32)
-    # XLA computes what a conditional returns once, and loops over it; without one it computes most
-    # of the projection anew for each column of the tables that are made from it.
-    few = count // _PART if count >= _MANY else 1
+    if count < _MANY:
+        return lax.cond(number > 0, of_all, of_none)
+    few = count // _PART
 
     def picked():
         index = jnp.nonzero(shown, size=few, fill_value=count)[0].astype(jnp.int32)
@@ -137,6 +140,10 @@ def _only(there, values):
         return jnp.where(there.reshape(-1, *(1,) * (leaf.ndim - 1)), leaf, 0)
 
     return jax.tree.map(one, values)
+
+
+def _zeros(shapes):
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
 
 def _pad(leaf, count):
