@@ -28,7 +28,12 @@ from jaxcloseup.geometry.poses import (
     sample_anchor,
     sample_closeup_camera,
 )
-from jaxcloseup.geometry.rotations import euler_to_matrix, matrix_to_euler, quaternion_to_matrix
+from jaxcloseup.geometry.rotations import (
+    euler_to_matrix,
+    matrix_to_euler,
+    quaternion_rows,
+    quaternion_to_matrix,
+)
 from jaxcloseup.geometry.union_warp import SourceBlocks, block_sources, union_warp
 from jaxcloseup.geometry.visibility import (
     WarpedImage,
@@ -61,6 +66,7 @@ __all__ = [
     "pixels_to_points",
     "pixels_to_rays",
     "points_to_pixels",
+    "quaternion_rows",
     "quaternion_to_matrix",
     "rgb_consistent",
     "sample_anchor",
