@@ -23,8 +23,9 @@ from jaxcloseup.numerics import safe_divide, safe_norm
 from jaxcloseup.photographs import to_float
 from jaxcloseup.scenes import load_scene
 from jaxcloseup.splats import RasterizeConfig, render_surfels, surfels_from_points
-from jaxcloseup.splats.kernel import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from jaxcloseup.splats.kernel import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, pack
 from jaxcloseup.splats.projection import project_discs, surfel_columns, to_camera
+from jaxcloseup.splats.reach import reaches
 from jaxcloseup.splats.spherical_harmonics import sh_to_rgb
 from jaxcloseup.splats.tiling import tile_lists
 
@@ -58,9 +59,9 @@ def run() -> None:
 def _report(surfels, camera, rate):
     count, size = surfels.means.shape[0], (camera.height, camera.width)
     # The overflow of a first guess shows how much capacity is needed.
-    pairs, _ = _count(surfels, camera, RasterizeConfig(capacity=2**16))
-    config = RasterizeConfig(capacity=-(-pairs // 2**14) * 2**14)
-    _, longest = _count(surfels, camera, config)
+    touched, _ = _count(surfels, camera, RasterizeConfig(capacity=2**16), exact=False)
+    config = RasterizeConfig(capacity=-(-touched // 2**14) * 2**14)
+    pairs, longest = _count(surfels, camera, config)
 
     loss = functools.partial(_loss, functools.partial(_render, config=config))
     forward, both = jax.jit(loss), jax.jit(jax.grad(loss, argnums=(0, 1)))
@@ -168,7 +169,9 @@ def _footprints(surfels, camera, config):
     return project_discs(discs, opacity, payload, camera, near=config.near)
 
 
-def _lists(footprints, camera, config):
+def _lists(footprints, camera, config, *, exact=True):
+    """Lists of the splats that draw in each tile, or else of those whose boxes touch it."""
+    table = pack(footprints)
     return tile_lists(
         lax.stop_gradient(footprints.box.T),
         lax.stop_gradient(footprints.order),
@@ -177,19 +180,28 @@ def _lists(footprints, camera, config):
         tile=config.tile,
         block=1,
         capacity=config.capacity,
+        reaches=functools.partial(reaches, table, tile=config.tile, near=config.near)
+        if exact
+        else None,
     )
 
 
-def _count(surfels, camera, config):
+def _count(surfels, camera, config, *, exact=True):
     """Return the number of (tile, surfel) pairs, and the most that fit in one tile's list."""
-    lists = jax.jit(lambda s, c: _lists(_footprints(s, c, config), c, config))(surfels, camera)
+
+    @jax.jit
+    def find(surfels, camera):
+        return _lists(_footprints(surfels, camera, config), camera, config, exact=exact)
+
+    lists = find(surfels, camera)
     return int(lists.counts.sum() + lists.overflow), int(lists.counts.max())
 
 
 def _render_by_scan(surfels, camera, config, longest):
     """Blend all tiles together, one splat of each list at a time."""
     splats = _footprints(surfels, camera, config)
-    lists = _lists(splats, camera, config)
+    lists = _lists(lax.stop_gradient(splats), camera, config)
+    splats = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), splats)
     starts, counts, origins = (a[:, 0] for a in (lists.starts, lists.counts, lists.origins))
     inner = jnp.arange(config.tile) + 0.5
     inner = jnp.stack(jnp.meshgrid(inner, inner), axis=-1).reshape(-1, 2)

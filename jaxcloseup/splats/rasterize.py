@@ -25,8 +25,9 @@ class RasterizeConfig:
     """Static settings of the rasterizer; the sizes change no image whose pairs fit.
 
     Attributes:
-      capacity: largest number of (tile, splat) pairs. `overflow` counts the pairs beyond it, which
-        are those of the farthest splats; render again with a larger capacity.
+      capacity: largest number of pairs of splats and the tiles that their boxes touch. `overflow`
+        counts the pairs beyond it, which are those of the farthest splats; render again with a
+        larger capacity.
       near: positive z-depth in world units; nothing nearer is drawn.
       antialias: convolve surfels with the pixel, see `project_discs`.
       tile: side of a tile in pixels.
