@@ -1,6 +1,8 @@
 """Training steps, pure, for any field: on photographs alone, and with pseudo-labels beside them.
 
 `field`, `optimizer` and `config` are static: bind them with `functools.partial` before `jax.jit`.
+Without it, a step whose field and optimizer are compiled themselves, as those of surfels are, runs
+a few compiled parts, and all kinds of steps share them.
 """
 
 import dataclasses
@@ -102,8 +104,7 @@ def train_step(
       The next state, and metrics: `loss`, `skipped` and those of the field. A step whose loss or
       gradient is not finite changes nothing but the count of steps; then `skipped` is 1, else 0.
     """
-    key_step = jax.random.fold_in(state.key, state.step)
-    key_batch, key_render, key_adapt, _ = jax.random.split(key_step, 4)
+    key_batch, key_render, key_adapt, _ = _keys_of(state.key, state.step)
     batch = _sample_batch(key_batch, views, config)
     loss_of = functools.partial(rendered_loss, field=field, chunk=field.gradient_chunk)
 
@@ -160,27 +161,22 @@ def closeup_step(
       The next state, and metrics with `label_coverage`, the share of labeled virtual pixels; unless
       the rule pools both losses, also the field's metrics of the labeled pixels as `label_<name>`.
     """
-    key_step = jax.random.fold_in(state.key, state.step)
-    key_batch, key_render, key_adapt, key_label = jax.random.split(key_step, 4)
-    key_virtual, key_pixels, key_depth, key_virtual_render = jax.random.split(key_label, 4)
+    key_batch, key_render, key_adapt, key_label = _keys_of(state.key, state.step)
     batch = _sample_batch(key_batch, views, config)
-    camera, source_index = sample_virtual_camera(key_virtual, sources, settings)
-    pixels = _sample_virtual_pixels(key_pixels, camera, config.num_label_rays)
+    virtual = _sample_closeup(key_label, sources, settings, config)
+    camera, source_index, pixels, key_depth, key_virtual_render = virtual
     rule = LABEL_RULES[config.label_rule]
     loss_of = functools.partial(rendered_loss, field=field, chunk=field.gradient_chunk)
     weight = settings.label_loss_weight
 
-    def render_depth_image(params):
-        return field.render(params, state.buffers, camera, pixels, rule.depth_key(key_depth))
-
-    def label_of(rendering, pixels):
-        depth = rule.depth(jax.lax.stop_gradient(rendering))
-        return label_pixels(camera, pixels, depth, source_index, sources, settings)
+    def label_of(rendering):
+        rendering = jax.lax.stop_gradient(rendering)
+        return _label(rendering, pixels, camera, source_index, sources, settings, depth=rule.depth)
 
     def image_loss(params):
         # The loss judges the same image that depth is taken from.
-        rendering = render_depth_image(params)
-        label = label_of(rendering, pixel_grid(camera.height, camera.width))
+        rendering = field.render(params, state.buffers, camera, None, rule.depth_key(key_depth))
+        label = label_of(rendering)
         of_labels = judge(field, rendering, label.rgb, label.weight)
         of_photographs = loss_of(params, state.buffers, batch, key_render)
         value, metrics = mix_losses(of_photographs, of_labels, weight)
@@ -199,7 +195,7 @@ def closeup_step(
         pixels,
         rule.depth_key(key_depth),
     )
-    label = label_of(rendering, pixels)
+    label = label_of(rendering)
     labeled = Batch(camera, pixels, label.rgb, label.weight)
 
     def pixel_loss(params):
@@ -238,14 +234,9 @@ def labeled_step(
       optimizer: static.
       config: static.
     """
-    key_step = jax.random.fold_in(state.key, state.step)
-    key_batch, key_render, key_adapt, key_label = jax.random.split(key_step, 4)
-    key_label_batch, key_label_render = jax.random.split(key_label)
+    key_batch, key_render, key_adapt, key_label = _keys_of(state.key, state.step)
     batch = _sample_batch(key_batch, views, config)
-    if config.num_label_rays is None:
-        labeled = sample_image(key_label_batch, labels)
-    else:
-        labeled = sample_pixels(key_label_batch, labels, config.num_label_rays)
+    labeled, key_label_render = _sample_labels(key_label, labels, config)
     loss_of = functools.partial(rendered_loss, field=field, chunk=field.gradient_chunk)
 
     def loss(params):
@@ -316,6 +307,12 @@ def render_depths(
     return jax.lax.map(one_view, (cameras, keys))
 
 
+@jax.jit
+def _keys_of(key, step):
+    return tuple(jax.random.split(jax.random.fold_in(key, step), 4))
+
+
+@functools.partial(jax.jit, static_argnums=2)
 def _sample_batch(key, views, config):
     whole, single = (
         (sample_window, sample_window_pixels)
@@ -323,6 +320,23 @@ def _sample_batch(key, views, config):
         else (sample_image, sample_pixels)
     )
     return whole(key, views) if config.num_rays is None else single(key, views, config.num_rays)
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _sample_labels(key, labels, config):
+    key_batch, key_render = jax.random.split(key)
+    if config.num_label_rays is None:
+        return sample_image(key_batch, labels), key_render
+    return sample_pixels(key_batch, labels, config.num_label_rays), key_render
+
+
+@functools.partial(jax.jit, static_argnums=3)
+def _sample_closeup(key, sources, settings, config):
+    """A virtual camera, its nearest photograph, pixels, and keys of its depth and rendering."""
+    key_virtual, key_pixels, key_depth, key_render = jax.random.split(key, 4)
+    camera, source_index = sample_virtual_camera(key_virtual, sources, settings)
+    pixels = _sample_virtual_pixels(key_pixels, camera, config.num_label_rays)
+    return camera, source_index, pixels, key_depth, key_render
 
 
 def _sample_virtual_pixels(key, camera, count):
@@ -333,18 +347,35 @@ def _sample_virtual_pixels(key, camera, count):
     return jax.random.randint(key, (count, 2), 0, size).astype(jnp.float32) + 0.5
 
 
+@functools.partial(jax.jit, static_argnames="depth")
+def _label(rendering, pixels, camera, source_index, sources, settings, *, depth):
+    if pixels is None:
+        pixels = pixel_grid(camera.height, camera.width)
+    return label_pixels(camera, pixels, depth(rendering), source_index, sources, settings)
+
+
 def _update(state, loss, key_adapt, field, optimizer, lr_scale=None):
     (value, metrics), gradients = jax.value_and_grad(loss, has_aux=True)(state.params)
     updates, opt_state = optimizer.update(gradients, state.opt_state, state.params)
+    moved = _move(state, updates, opt_state, lr_scale)
+    after, skipped = _unless_broken(state, field.adapt(key_adapt, moved), value, gradients)
+    return after, {"loss": value, "skipped": skipped} | metrics
+
+
+@jax.jit
+def _move(state, updates, opt_state, lr_scale):
     if lr_scale is not None:
         updates = jax.tree.map(lambda leaf: lr_scale.astype(leaf.dtype) * leaf, updates)
-    after = state.replace(
-        step=state.step + 1,
-        params=optax.apply_updates(state.params, updates),
-        opt_state=opt_state,
-    )
-    after = field.adapt(key_adapt, after)
-    # One bad step must not spoil the run: it is skipped, whole, and counted.
+    params = optax.apply_updates(state.params, updates)
+    return state.replace(step=state.step + 1, params=params, opt_state=opt_state)
+
+
+@jax.jit
+def _unless_broken(state, after, value, gradients):
+    """The state after a step, but for a step whose loss or gradient is not finite.
+
+    One bad step must not spoil the run: it is skipped, whole, and counted.
+    """
     finite = jnp.isfinite(value)
     for leaf in jax.tree.leaves(gradients):
         finite &= jnp.all(jnp.isfinite(leaf))
@@ -357,4 +388,4 @@ def _update(state, loss, key_adapt, field, optimizer, lr_scale=None):
         buffers=kept(after.buffers, state.buffers),
         opt_state=kept(after.opt_state, state.opt_state),
     )
-    return after, {"loss": value, "skipped": 1 - finite.astype(jnp.float32)} | metrics
+    return after, 1 - finite.astype(jnp.float32)

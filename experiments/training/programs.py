@@ -55,9 +55,13 @@ class Programs:
             "target_views": functools.partial(labeled_step, **bound),
         }
         # The number of steps is traced; the input state is left alone.
-        runners = {kind: functools.partial(run_steps, step) for kind, step in steps.items()}
-        runners["arms"] = self._run_arms(steps["random_closeups"])
-        self._runners = {kind: jax.jit(run) for kind, run in runners.items()}
+        self._runners = {
+            kind: jax.jit(functools.partial(run_steps, step))
+            if self.method.renders_pixels
+            else functools.partial(_take_steps, step)
+            for kind, step in steps.items()
+        }
+        self._runners["arms"] = jax.jit(self._run_arms(steps["random_closeups"]))
         self._render = jax.jit(
             lambda state, camera, key: self.field.render(
                 state.params, state.buffers, camera, None, key
@@ -206,6 +210,25 @@ class Programs:
             if rendering.overflow is None or not int(rendering.overflow):
                 return rendering
             programs._grow()
+
+
+def _take_steps(
+    step: Callable[..., tuple[TrainState, dict[str, Any]]],
+    state: TrainState,
+    *data: Any,
+    count: int,
+) -> tuple[TrainState, dict[str, Any]]:
+    """`run_steps` of steps whose parts are compiled, and shared by all kinds of steps.
+
+    To compile the rendering of an image, with its derivative, takes as long as hundreds of steps.
+    """
+    total = None
+    for _ in range(count):
+        state, metrics = step(state, *data)
+        # No step begins before the last one ends: what waits would hold memory.
+        total = metrics if total is None else jax.tree.map(jnp.add, total, metrics)
+        jax.block_until_ready(total)
+    return state, jax.tree.map(lambda leaf: leaf / count, total)
 
 
 def describe_photographs(pyramid: Pyramid, divisor: int) -> str:

@@ -127,7 +127,7 @@ class SurfelFieldAux(NamedTuple):
 
 
 def surfel_field(config: SurfelConfig, *, extent: float) -> RadianceField:
-    """Surfels as a field of whole images.
+    """Surfels as a field of whole images, with `render`, `loss` and `adapt` compiled.
 
     Where `Rendering.overflow` is not 0, `config.raster.capacity` was too small and the image is
     wrong. Check it outside `jax.jit`; then build the field again with twice the capacity and repeat
@@ -177,6 +177,10 @@ def surfel_field(config: SurfelConfig, *, extent: float) -> RadianceField:
         del key  # rendering is deterministic
         if pixels is not None:
             raise ValueError("surfels render whole images: pixels must be None")
+        return draw(params, buffers, camera)
+
+    @jax.jit
+    def draw(params, buffers, camera):
         surfels = control.before_render(_limit_degree(params, buffers.degree), camera)
         background = None if config.background is None else jnp.full(3, config.background)
         image = render_surfels(surfels, buffers.alive, camera, config.raster, background=background)
@@ -187,12 +191,13 @@ def surfel_field(config: SurfelConfig, *, extent: float) -> RadianceField:
             aux=SurfelFieldAux(image.aux, penalty, prior),
         )
 
+    @jax.jit
     def adapt(key: jax.Array, state: Any) -> Any:
         degree, regularize = _schedule(config, state.step)
         buffers = state.buffers.replace(degree=degree, regularize=regularize)
         return control.adapt(key, state.replace(buffers=buffers))
 
-    loss = functools.partial(_loss, config=config)
+    loss = jax.jit(functools.partial(_loss, config=config))
     return RadianceField(init=init, render=render, loss=loss, adapt=adapt)
 
 
@@ -214,13 +219,16 @@ def camera_extent(cameras: Camera) -> jax.Array:
 def surfel_optimizer(config: SurfelConfig, *, extent: float) -> optax.GradientTransformation:
     """Adam with one learning rate for each kind of parameter, and the density control's records.
 
+    Its `update` is compiled.
+
     Args:
       config: static.
       extent: size of the capture in world units.
     """
     moments = scale_by_selective_adam if config.selective_adam else optax.scale_by_adam
     adam = optax.chain(moments(eps=1e-15), _scale_by_learning_rates(config, extent))
-    return _density_control(config, extent).wrap_optimizer(adam)
+    optimizer = _density_control(config, extent).wrap_optimizer(adam)
+    return optimizer._replace(update=jax.jit(optimizer.update))
 
 
 def means_lr_at(config: SurfelConfig, step: jax.Array) -> jax.Array:
