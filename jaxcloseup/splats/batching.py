@@ -1,4 +1,4 @@
-"""Batches of images as one image with more tiles, see the batching rules in `kernel`."""
+"""Batches of images as one image with more tiles, see the batching rules in `blending`."""
 
 from collections.abc import Sequence
 from typing import Any

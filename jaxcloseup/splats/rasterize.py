@@ -15,7 +15,8 @@ from flax import struct
 from jax import lax
 
 from jaxcloseup.numerics import safe_divide
-from jaxcloseup.splats.kernel import blend_tiles, pack
+from jaxcloseup.splats.blending import blend_tiles
+from jaxcloseup.splats.kernel import pack
 from jaxcloseup.splats.reach import reaches
 from jaxcloseup.splats.tiling import tile_lists
 
