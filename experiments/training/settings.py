@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 from experiments.methods import METHODS, Method, Preset
 from jaxcloseup.label_rules import LABEL_RULES
+from jaxcloseup.splats.rasterize import COMPOSITORS
 
 
 _GROUPS = ("field", "train", "labels")
@@ -31,6 +32,7 @@ _CHOICES = {
     "depth": ("median", "expected"),
     "compute_dtype": ("float32", "bfloat16"),
     "label_rule": tuple(LABEL_RULES),
+    "compositor": COMPOSITORS,
 }
 _TRUTH = {"true": True, "1": True, "false": False, "0": False}
 
@@ -135,8 +137,9 @@ def _parse(name, text, kind):
     (kind,) = (choice for choice in kinds if choice is not type(None))
     or_none = " or none" if len(kinds) > 1 else ""
     if kind is str:
-        if text not in _CHOICES[name]:
-            raise ValueError(" or ".join(_CHOICES[name]))
+        choices = _CHOICES[name.rpartition(".")[2]]
+        if text not in choices:
+            raise ValueError(" or ".join(choices))
         return text
     if kind is bool:
         if text.lower() not in _TRUTH:

@@ -1,12 +1,16 @@
 """Blends the splats of all tiles, by the compositor that suits the platform."""
 
 import functools
+import logging
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
-from jaxcloseup.splats import loops
+from jaxcloseup.splats import gpu_kernel, loops
 from jaxcloseup.splats.batching import broadcast_batch, merge_images, split_images
-from jaxcloseup.splats.kernel import Trace
+from jaxcloseup.splats.kernel import PAYLOAD, Trace
 from jaxcloseup.splats.tiling import TileLists
 
 
@@ -39,13 +43,53 @@ def _blend_backward(config, residuals, cotangents):
 blend_tiles.defvjp(_blend_forward, _blend_backward)
 
 
+def _compositor(config, name: str) -> Callable[..., Any]:
+    """The function `name` of the compositor that `config` asks for."""
+    on_gpu = jax.default_backend() == "gpu"
+    if config.compositor == "loops" or (
+        config.compositor == "auto" and not (on_gpu and _kernels_compile(config.tile))
+    ):
+        return functools.partial(getattr(loops, name), config)
+    return functools.partial(getattr(gpu_kernel, name), config, interpret=not on_gpu)
+
+
+@functools.cache
+def _kernels_compile(tile: int) -> bool:
+    """Whether this GPU runs the kernels; says why not, once."""
+    config, array = _Tiles(tile, near=1.0), jax.ShapeDtypeStruct
+    one, grid = array((1,), jnp.int32), array((1, 1), jnp.int32)
+    lists = TileLists(one, grid, grid, array((1, 1, 2), jnp.int32), grid, one, one)
+    table = array((1, PAYLOAD + 1), jnp.float32)
+
+    def both(table, lists):
+        *sums, trace = gpu_kernel.forward(config, table, lists)
+        return gpu_kernel.backward(config, table, lists, trace, tuple(sums))
+
+    try:
+        jax.jit(both).lower(table, lists).compile()
+    except Exception as error:  # whatever stops the compiler
+        reason = str(error).splitlines() or [type(error).__name__]
+        logging.getLogger(__name__).warning(
+            "splats are blended by jax.lax, for this GPU cannot run the kernels: %s", reason[0]
+        )
+        return False
+    return True
+
+
+class _Tiles(NamedTuple):
+    """What compositors read of a `RasterizeConfig`."""
+
+    tile: int
+    near: float
+
+
 @functools.cache
 def _batched_forward(config):
     """`forward` that blends a batch of images as one image with more tiles.
 
     If `vmap` batched the loops instead, all images would wait for the slowest at every chunk.
     """
-    forward = jax.custom_batching.custom_vmap(functools.partial(loops.forward, config))
+    forward = jax.custom_batching.custom_vmap(_compositor(config, "forward"))
 
     @forward.def_vmap
     def _(size, batched, table, lists):
@@ -58,7 +102,7 @@ def _batched_forward(config):
 @functools.cache
 def _batched_backward(config):
     """`backward` with the batching of `_batched_forward`."""
-    backward = jax.custom_batching.custom_vmap(functools.partial(loops.backward, config))
+    backward = jax.custom_batching.custom_vmap(_compositor(config, "backward"))
 
     @backward.def_vmap
     def _(size, batched, table, lists, trace, cotangents):

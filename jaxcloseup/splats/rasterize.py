@@ -21,6 +21,10 @@ from jaxcloseup.splats.reach import reaches
 from jaxcloseup.splats.tiling import tile_lists
 
 
+COMPOSITORS = ("auto", "loops", "kernel")
+_GPU_BLOCK = 4096  # tiles that a GPU's many cores evaluate at once; not measured
+
+
 @dataclasses.dataclass(frozen=True)
 class RasterizeConfig:
     """Static settings of the rasterizer; the sizes change no image whose pairs fit.
@@ -32,8 +36,14 @@ class RasterizeConfig:
       near: positive z-depth in world units; nothing nearer is drawn.
       antialias: convolve surfels with the pixel, see `project_discs`.
       tile: side of a tile in pixels.
-      chunk: number of a tile's splats that the kernel evaluates at once.
-      block: largest number of tiles that the kernel evaluates at once.
+      chunk: number of a tile's splats that loops evaluate at once.
+      block: largest number of tiles that loops evaluate at once on a CPU; a GPU takes thousands.
+      compositor: "loops" blends by `jax.lax`, with chunks and blocks; "kernel" by Pallas kernels,
+        which other platforms than GPUs interpret, slowly; "auto" by kernels on a GPU that runs
+        them, else by loops.
+
+    Raises:
+      ValueError: there is no such compositor.
     """
 
     capacity: int = 2**18
@@ -42,6 +52,14 @@ class RasterizeConfig:
     tile: int = 8
     chunk: int = 8
     block: int = 128
+    compositor: str = "auto"
+
+    def __post_init__(self) -> None:
+        """Check the compositor's name."""
+        if self.compositor not in COMPOSITORS:
+            raise ValueError(
+                f'RasterizeConfig.compositor must be one of {COMPOSITORS}, not "{self.compositor}"'
+            )
 
 
 @struct.dataclass
@@ -129,13 +147,14 @@ def blend(
 ) -> SplatImage:
     """`rasterize` of splats whose footprints are a table `[N, C]` from `pack`, boxes and order."""
     kept = lax.stop_gradient(table)
+    block = config.block if jax.default_backend() == "cpu" else max(config.block, _GPU_BLOCK)
     lists = tile_lists(
         lax.stop_gradient(box),
         lax.stop_gradient(order),
         height=height,
         width=width,
         tile=config.tile,
-        block=config.block,
+        block=block,
         capacity=config.capacity,
         reaches=functools.partial(reaches, kept, tile=config.tile, near=config.near),
     )
