@@ -9,7 +9,7 @@ import importlib
 from absl import app, flags
 
 
-SUITES = ("nerf", "warp", "labels", "splats", "sweep", "resume", "detail", "scales")
+SUITES = ("nerf", "warp", "labels", "splats", "sweep", "resume", "detail", "scales", "gpu")
 
 _SUITE = flags.DEFINE_list("suite", ["nerf", "warp"], f"suites to run: {', '.join(SUITES)}")
 

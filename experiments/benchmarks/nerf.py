@@ -103,15 +103,15 @@ def product(dtype: str, rows: int) -> Callable[[], jax.Array]:
     return call
 
 
-def training_step(config: NerfConfig, *, recompute: bool = False):
+def training_step(config: NerfConfig, *, recompute: bool = False, num_rays: int = NUM_RAYS):
     """Return a training step on random pixels, and its temporary memory in MB."""
     field = nerf(config, near=0.5, far=4.0)
     params, buffers = jax.jit(field.init)(jax.random.key(0), jnp.zeros((1, 3)), jnp.zeros((1, 3)))
     optimizer = optax.adam(5e-4)
     key_pixels, key_rgb, key_step = jax.random.split(jax.random.key(1), 3)
-    cameras = jax.tree.map(lambda x: jnp.tile(x, (NUM_RAYS,) + (1,) * x.ndim), CAMERA)
-    pixels = IMAGE * jax.random.uniform(key_pixels, (NUM_RAYS, 2))
-    batch = Batch(cameras, pixels, jax.random.uniform(key_rgb, (NUM_RAYS, 3)), jnp.ones(NUM_RAYS))
+    cameras = jax.tree.map(lambda x: jnp.tile(x, (num_rays,) + (1,) * x.ndim), CAMERA)
+    pixels = IMAGE * jax.random.uniform(key_pixels, (num_rays, 2))
+    batch = Batch(cameras, pixels, jax.random.uniform(key_rgb, (num_rays, 3)), jnp.ones(num_rays))
     chunk = None if recompute else config.rays_at_once
 
     def step(params, opt_state, key):

@@ -51,19 +51,19 @@ def run() -> None:
     scene = load_scene("table", downscale=4)
     for count in COUNTS:
         for size in SIZES:
-            _report(*_workload(scene, count, size), rate)
+            _report(*_discs_on_table(scene, count, size), rate)
     print("a wavy wall, which gives all tiles lists of nearly the same length:")
-    _report(*_wall(20_000, (270, 480)), rate)
+    _report(*discs_on_a_wall(20_000, (270, 480)), rate)
 
 
 def _report(surfels, camera, rate):
     count, size = surfels.means.shape[0], (camera.height, camera.width)
     # The overflow of a first guess shows how much capacity is needed.
-    touched, _ = _count(surfels, camera, RasterizeConfig(capacity=2**16), exact=False)
+    touched, _ = count_pairs(surfels, camera, RasterizeConfig(capacity=2**16), exact=False)
     config = RasterizeConfig(capacity=-(-touched // 2**14) * 2**14)
-    pairs, longest = _count(surfels, camera, config)
+    pairs, longest = count_pairs(surfels, camera, config)
 
-    loss = functools.partial(_loss, functools.partial(_render, config=config))
+    loss = functools.partial(loss_of_all, functools.partial(render_all, config=config))
     forward, both = jax.jit(loss), jax.jit(jax.grad(loss, argnums=(0, 1)))
     start = time.perf_counter()
     compiled = both.lower(surfels, camera).compile()
@@ -78,7 +78,7 @@ def _report(surfels, camera, rate):
     scan_memory = None
     if pixels * longest * 80 < SCAN_BYTES:
         loss = functools.partial(
-            _loss, functools.partial(_render_by_scan, config=config, longest=longest)
+            loss_of_all, functools.partial(_render_by_scan, config=config, longest=longest)
         )
         plain = jax.jit(jax.grad(loss, argnums=(0, 1))).lower(surfels, camera).compile()
         plain_forward = jax.jit(loss)
@@ -111,7 +111,7 @@ def _report(surfels, camera, rate):
     )
 
 
-def _workload(scene, count, size):
+def _discs_on_table(scene, count, size):
     """Return discs at random points that the photographs see, and the first photograph's camera."""
     key_pixel, key_opacity, key_surfels = jax.random.split(jax.random.key(0), 3)
     cameras, depths = scene.train.cameras, exact_depths(scene, scene.train.cameras)
@@ -129,7 +129,7 @@ def _workload(scene, count, size):
     return surfels.replace(opacity_logits=logits), camera
 
 
-def _wall(count, size):
+def discs_on_a_wall(count, size):
     """Discs on a wavy surface that fills the view evenly: the scan's best case."""
     keys = jax.random.split(jax.random.key(0), 6)
     a, b = jax.random.uniform(keys[0], (2, count), minval=-1)
@@ -147,14 +147,15 @@ def _wall(count, size):
     return surfels, Camera(jnp.eye(4)[:3], intrinsics, *size)
 
 
-def _loss(render, surfels, camera):
+def loss_of_all(render, surfels, camera):
     """Return a loss of every output, as in training with all regularizers."""
     rgb, depth, normal, distortion = render(surfels, camera)
     loss = jnp.mean((rgb - 0.4) ** 2) + 0.05 * jnp.mean((depth - 3) ** 2)
     return loss + 0.05 * jnp.mean(normal[..., 2]) + 0.1 * jnp.mean(distortion)
 
 
-def _render(surfels, camera, config):
+def render_all(surfels, camera, config):
+    """Return the color, depth, normal and distortion of an image."""
     alive = jnp.ones(surfels.means.shape[0], bool)
     image = render_surfels(surfels, alive, camera, config)
     return image.rgb, image.depth, image.aux.normal, image.aux.distortion
@@ -186,7 +187,7 @@ def _lists(footprints, camera, config, *, exact=True):
     )
 
 
-def _count(surfels, camera, config, *, exact=True):
+def count_pairs(surfels, camera, config, *, exact=True):
     """Return the number of (tile, surfel) pairs, and the most that fit in one tile's list."""
 
     @jax.jit

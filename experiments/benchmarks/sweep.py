@@ -3,7 +3,7 @@
 import jax
 
 from experiments.benchmarks.timing import interleaved_medians
-from experiments.methods import METHODS, pseudo_settings
+from experiments.methods import METHODS, Preset, pseudo_settings
 from experiments.training.arms import make_arm
 from experiments.training.programs import Programs
 from experiments.training.setup import initial_state, start_labels
@@ -20,27 +20,32 @@ def run() -> None:
     """Print milliseconds and the ratio for each method."""
     print("method   one step alone  one step of 8 arms  over 8 alone")
     for name, method in METHODS.items():
-        preset = method.presets["quick"]
-        scene = load_scene("table", downscale=preset.downscale)
-        programs = Programs(preset, scene)
-        state = initial_state(programs, seed=0)
-        views = jax.device_put(scene.train)
-        state, _ = programs.run("photographs", state, views, count=WARMUP)
-        start = start_labels(programs, state, seed=0)
-        arms = [make_arm(arm, preset) for arm in ARMS + GRID]
-        arms = [arm.settings for arm in sorted(arms, key=lambda arm: arm.outlook)]
-        states, *data = stack_arms(arms, [start] * len(arms), len(jax.devices()))
-        stacked = states, views, *data
-        alone = start.state, views, start.sources, pseudo_settings(preset.labels)
-        programs.make_room(4)  # virtual cameras need more than photographs; both calls get the same
-        calls = {
-            "alone": lambda p=programs, a=alone: p.run("random_closeups", *a, count=STEPS)[0],
-            "arms": lambda p=programs, a=stacked: p.run("arms", *a, count=STEPS)[0],
-        }
-        seconds = {k: v / STEPS for k, v in interleaved_medians(calls, 5).items()}
-        ratio = seconds["arms"] / (len(arms) * seconds["alone"])
+        alone, together = step_seconds(method.presets["quick"])
         print(
-            f"{name:<8} {1e3 * seconds['alone']:>11.0f} ms  {1e3 * seconds['arms']:>15.0f} ms"
-            f"  {ratio:>12.2f}",
+            f"{name:<8} {1e3 * alone:>11.0f} ms  {1e3 * together:>15.0f} ms"
+            f"  {together / (len(ARMS + GRID) * alone):>12.2f}",
             flush=True,
         )
+
+
+def step_seconds(
+    preset: Preset, scene: str = "table", *, warmup: int = WARMUP
+) -> tuple[float, float]:
+    """Seconds of a step alone, and of a step of all arms together, on a scene by its name."""
+    scene = load_scene(scene, downscale=preset.downscale)
+    programs = Programs(preset, scene)
+    state = initial_state(programs, seed=0)
+    views = jax.device_put(scene.train)
+    state, _ = programs.run("photographs", state, views, count=warmup)
+    start = start_labels(programs, state, seed=0)
+    arms = [make_arm(arm, preset) for arm in ARMS + GRID]
+    arms = [arm.settings for arm in sorted(arms, key=lambda arm: arm.outlook)]
+    states, *data = stack_arms(arms, [start] * len(arms), len(jax.devices()))
+    alone = start.state, views, start.sources, pseudo_settings(preset.labels)
+    programs.make_room(4)  # virtual cameras need more than photographs; both calls get the same
+    calls = {
+        "alone": lambda: programs.run("random_closeups", *alone, count=STEPS)[0],
+        "arms": lambda: programs.run("arms", states, views, *data, count=STEPS)[0],
+    }
+    seconds = interleaved_medians(calls, 5)
+    return seconds["alone"] / STEPS, seconds["arms"] / STEPS
