@@ -206,12 +206,10 @@ def splat_rates(size: Size) -> list[dict[str, Any]]:
 
 
 def _passes(surfels_, camera, config, pairs, known):
-    loss = functools.partial(
-        splats.loss_of_all, functools.partial(splats.render_all, config=config)
-    )
     begun = time.perf_counter()
-    forward = jax.jit(loss).lower(surfels_, camera).compile()
-    both = jax.jit(jax.grad(loss, argnums=(0, 1))).lower(surfels_, camera).compile()
+    render = jax.jit(functools.partial(splats.render_all, config=config))
+    forward = render.lower(surfels_, camera).compile()
+    both = _pull.lower(surfels_, camera, config).compile()
     compiled = time.perf_counter() - begun
     seconds = interleaved_medians(
         {"forward": lambda: forward(surfels_, camera), "both": lambda: both(surfels_, camera)},
