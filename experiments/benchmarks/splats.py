@@ -189,13 +189,13 @@ def _lists(footprints, camera, config, *, exact=True):
 
 def count_pairs(surfels, camera, config, *, exact=True):
     """Return the number of (tile, surfel) pairs, and the most that fit in one tile's list."""
-
-    @jax.jit
-    def find(surfels, camera):
-        return _lists(_footprints(surfels, camera, config), camera, config, exact=exact)
-
-    lists = find(surfels, camera)
+    lists = _find_lists(surfels, camera, config, exact)
     return int(lists.counts.sum() + lists.overflow), int(lists.counts.max())
+
+
+@functools.partial(jax.jit, static_argnums=(2, 3))
+def _find_lists(surfels, camera, config, exact):
+    return _lists(_footprints(surfels, camera, config), camera, config, exact=exact)
 
 
 def _render_by_scan(surfels, camera, config, longest):
