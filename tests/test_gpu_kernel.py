@@ -77,6 +77,7 @@ def test_a_batch_of_images_is_each_image():
             np.testing.assert_allclose(b[i], a, rtol=1e-4, atol=1e-5 * np.abs(a).max())
 
 
+@pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated")
 def test_kernels_become_programs_of_a_gpu():
     # Triton's part of the compiler needs no GPU; what follows it does.
     count, height, width = COUNT, 16, 16
@@ -90,7 +91,10 @@ def test_kernels_become_programs_of_a_gpu():
         *sums, trace = gpu_kernel.forward(CONFIG, table, lists)
         return gpu_kernel.backward(CONFIG, table, lists, trace, tuple(sums))
 
-    lowered = jax.jit(both).trace(table, lists).lower(lowering_platforms=("cuda",))
+    gpu = jax.sharding.AbstractDevice("NVIDIA H100", num_cores=None, platform="cuda")
+    mesh = jax.sharding.AbstractMesh((), (), abstract_device=gpu)
+    with jax.sharding.use_abstract_mesh(mesh):
+        lowered = jax.jit(both).trace(table, lists).lower(lowering_platforms=("cuda",))
     assert lowered.as_text().count("triton") >= 3
 
 
