@@ -32,7 +32,7 @@ from experiments.training.manifest import (
 )
 from experiments.training.programs import Programs
 from experiments.training.settings import plain_config
-from experiments.training.setup import Training, identity_of
+from experiments.training.setup import Training, identity_of, timed_compiling
 from experiments.training.stages import STAGES, run_stages
 from jaxcloseup.artifacts.checkpoints import CheckpointError, Checkpoints
 from jaxcloseup.scene import Scene, SceneError
@@ -96,8 +96,10 @@ def run(
     manifest = about | about_scene(scene, load_options)
     write_manifest(output_dir, manifest)
     write_dataparser_transforms(output_dir, scene)
-    outcome = run_stages(training, seed, output_dir, to_run=to_run, perceptual=perceptual)
+    with timed_compiling(training.seconds):
+        outcome = run_stages(training, seed, output_dir, to_run=to_run, perceptual=perceptual)
     results = report_run(output_dir, training, outcome, about)
+    print(f"compiling took {training.seconds['compile']:.0f} s of the run")
     write_manifest(output_dir, manifest, training.seconds)
     return results
 

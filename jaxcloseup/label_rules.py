@@ -52,12 +52,10 @@ def add_label_loss(
     Returns:
       The loss, and the metrics of both; those of labels as `label_<name>`.
     """
-    return mix_losses(loss_of(*photographs), loss_of(*labels), weight)
-
-
-def mix_losses(photographs: Loss, labels: Loss, weight: jax.Array) -> Loss:
-    """(1 - w) L_c + w L_pl, and the metrics of both; those of labels as `label_<name>`."""
-    (photograph_loss, metrics), (label_loss, label_metrics) = photographs, labels
+    (photograph_loss, metrics), (label_loss, label_metrics) = (
+        loss_of(*photographs),
+        loss_of(*labels),
+    )
     named = {f"label_{name}": value for name, value in label_metrics.items()}
     return (1 - weight) * photograph_loss + weight * label_loss, metrics | named
 

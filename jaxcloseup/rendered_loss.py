@@ -1,4 +1,4 @@
-"""The loss of a rendering, with its gradient taken chunk by chunk."""
+"""The loss of a rendering, with its gradient taken in the same program, at once or in chunks."""
 
 import functools
 from typing import Any
@@ -64,13 +64,35 @@ def rendered_loss(
       The loss and its metrics, from `judge`.
     """
     if chunk is None or batch.pixels is None or len(batch.pixels) <= chunk:
-        return _plain(field, params, buffers, batch, key)
+        return _at_once(field, params, buffers, batch, key)
     return _chunked(field, chunk, params, buffers, batch, key)
 
 
 def _plain(field, params, buffers, batch, key):
     rendering = field.render(params, buffers, batch.cameras, batch.pixels, key)
     return judge(field, rendering, batch.rgb, batch.weight)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _at_once(field, params, buffers, batch, key):
+    return _plain(field, params, buffers, batch, key)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _at_once_forward(field, params, buffers, batch, key):
+    # Outside `jax.jit`, JAX would compile what comes before and after the derivative apart, and
+    # trace both in every step.
+    of_params = jax.value_and_grad(functools.partial(_plain, field), has_aux=True)
+    return of_params(params, buffers, batch, key)
+
+
+def _scale_gradients(*arguments):
+    """The cotangents of a loss whose forward pass has taken the gradients already."""
+    gradients, cotangent = arguments[-2:]
+    return jax.tree.map(lambda x: cotangent[0] * x, gradients), None, None, None
+
+
+_at_once.defvjp(_at_once_forward, _scale_gradients)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
@@ -105,12 +127,7 @@ def _add_up(field, chunk, params, buffers, batch, key):
     return judge(field, rendering, batch.rgb, batch.weight), gradients
 
 
-def _chunked_backward(field, chunk, gradients, cotangent):
-    del field, chunk
-    return jax.tree.map(lambda x: cotangent[0] * x, gradients), None, None, None
-
-
-_chunked.defvjp(_chunked_forward, _chunked_backward)
+_chunked.defvjp(_chunked_forward, _scale_gradients)
 
 
 def _split(batch: Batch, chunk: int) -> Batch:

@@ -15,20 +15,27 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
+from jaxcloseup.draws import (
+    Spread,
+    draw_keys,
+    in_a_loop,
+    sample_batch,
+    sample_closeup,
+    sample_labels,
+)
 from jaxcloseup.field import RadianceField
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
-from jaxcloseup.label_rules import LABEL_RULES, add_label_loss, label_depth, mix_losses
+from jaxcloseup.label_rules import LABEL_RULES, add_label_loss, label_depth
 from jaxcloseup.numerics import take_turns
-from jaxcloseup.photographs import Batch, Views, sample_image, sample_pixels
+from jaxcloseup.photographs import Batch, Views
 from jaxcloseup.pseudo import (
     LabelSources,
     PseudoSettings,
     label_pixels,
     label_sources,
-    sample_virtual_camera,
 )
-from jaxcloseup.rendered_loss import judge, rendered_loss
-from jaxcloseup.windows import Windows, sample_window, sample_window_pixels
+from jaxcloseup.rendered_loss import rendered_loss
+from jaxcloseup.windows import Windows
 
 
 Metrics = dict[str, jax.Array]
@@ -61,11 +68,14 @@ class TrainConfig:
       num_rays: pixels of photographs in a step; None takes one whole photograph.
       num_label_rays: labeled pixels in a step; None takes the whole virtual image.
       label_rule: a name in `LABEL_RULES`. Whole virtual images always add both losses.
+      num_windows: how often a step draws all this: photographs or their windows, and labels. The
+        mean gradient of the draws moves the parameters.
     """
 
     num_rays: int | None = 1024
     num_label_rays: int | None = 1024
     label_rule: str = "paper"
+    num_windows: int = 1
 
 
 def init_state(
@@ -97,21 +107,29 @@ def train_step(
     field: RadianceField,
     optimizer: optax.GradientTransformation,
     config: TrainConfig,
+    spread: Spread = in_a_loop,
 ) -> tuple[TrainState, Metrics]:
     """One step on training photographs alone.
+
+    Args:
+      state: what is trained.
+      views: training photographs.
+      field: static; what is trained.
+      optimizer: static.
+      config: static.
+      spread: how several draws are taken.
 
     Returns:
       The next state, and metrics: `loss`, `skipped` and those of the field. A step whose loss or
       gradient is not finite changes nothing but the count of steps; then `skipped` is 1, else 0.
     """
-    key_batch, key_render, key_adapt, _ = _keys_of(state.key, state.step)
-    batch = _sample_batch(key_batch, views, config)
     loss_of = functools.partial(rendered_loss, field=field, chunk=field.gradient_chunk)
 
-    def loss(params):
-        return loss_of(params, state.buffers, batch, key_render)
+    def loss(params, buffers, keys, views):
+        batch = sample_batch(keys.batch, views, config.num_rays)
+        return loss_of(params, buffers, batch, keys.render)
 
-    return _update(state, loss, key_adapt, field, optimizer)
+    return _update(state, loss, (views,), field, optimizer, config, spread)
 
 
 def pseudo_step(
@@ -142,6 +160,7 @@ def closeup_step(
     field: RadianceField,
     optimizer: optax.GradientTransformation,
     config: TrainConfig,
+    spread: Spread = in_a_loop,
 ) -> tuple[TrainState, Metrics]:
     """One step on training photographs and on one pseudo-labeled random close-up.
 
@@ -156,58 +175,41 @@ def closeup_step(
       field: static; what is trained.
       optimizer: static.
       config: static.
+      spread: how several draws are taken.
 
     Returns:
       The next state, and metrics with `label_coverage`, the share of labeled virtual pixels; unless
       the rule pools both losses, also the field's metrics of the labeled pixels as `label_<name>`.
     """
-    key_batch, key_render, key_adapt, key_label = _keys_of(state.key, state.step)
-    batch = _sample_batch(key_batch, views, config)
-    virtual = _sample_closeup(key_label, sources, settings, config)
-    camera, source_index, pixels, key_depth, key_virtual_render = virtual
     rule = LABEL_RULES[config.label_rule]
     loss_of = functools.partial(rendered_loss, field=field, chunk=field.gradient_chunk)
-    weight = settings.label_loss_weight
-
-    def label_of(rendering):
-        rendering = jax.lax.stop_gradient(rendering)
-        return _label(rendering, pixels, camera, source_index, sources, settings, depth=rule.depth)
-
-    def image_loss(params):
-        # The loss judges the same image that depth is taken from.
-        rendering = field.render(params, state.buffers, camera, None, rule.depth_key(key_depth))
-        label = label_of(rendering)
-        of_labels = judge(field, rendering, label.rgb, label.weight)
-        of_photographs = loss_of(params, state.buffers, batch, key_render)
-        value, metrics = mix_losses(of_photographs, of_labels, weight)
-        return value, metrics | {"label_coverage": jnp.mean(label.weight)}
-
-    if pixels is None:
-        return _update(state, image_loss, key_adapt, field, optimizer, settings.lr_scale)
 
     def render_pixels(params, buffers, camera, pixels, key):
         return field.render(params, buffers, camera, pixels, key)
 
-    rendering = take_turns(render_pixels)(
-        jax.lax.stop_gradient(state.params),
-        state.buffers,
-        camera,
-        pixels,
-        rule.depth_key(key_depth),
-    )
-    label = label_of(rendering)
-    labeled = Batch(camera, pixels, label.rgb, label.weight)
+    whole = config.num_label_rays is None
+    render = render_pixels if whole else take_turns(render_pixels)
 
-    def pixel_loss(params):
-        value, metrics = rule.loss(
-            lambda batch, key: loss_of(params, state.buffers, batch, key),
-            (batch, key_render),
-            (labeled, key_virtual_render),
-            weight,
+    def loss(params, buffers, keys, views, sources, settings):
+        batch = sample_batch(keys.batch, views, config.num_rays)
+        virtual = sample_closeup(keys.label, sources, settings, config.num_label_rays)
+        camera, pixels = virtual.camera, virtual.pixels
+        key_depth = rule.depth_key(virtual.key_depth)
+        fixed = jax.lax.stop_gradient(params)
+        rendering = render(fixed, buffers, camera, pixels, key_depth)
+        label = _label(rendering, virtual, sources, settings, depth=rule.depth)
+        labeled = Batch(camera, pixels, label.rgb, label.weight)
+        add = add_label_loss if whole else rule.loss
+        value, metrics = add(
+            lambda batch, key: loss_of(params, buffers, batch, key),
+            (batch, keys.render),
+            (labeled, virtual.key_render),
+            settings.label_loss_weight,
         )
         return value, metrics | {"label_coverage": jnp.mean(label.weight)}
 
-    return _update(state, pixel_loss, key_adapt, field, optimizer, settings.lr_scale)
+    data = views, sources, settings
+    return _update(state, loss, data, field, optimizer, config, spread, settings.lr_scale)
 
 
 def labeled_step(
@@ -219,6 +221,7 @@ def labeled_step(
     field: RadianceField,
     optimizer: optax.GradientTransformation,
     config: TrainConfig,
+    spread: Spread = in_a_loop,
 ) -> tuple[TrainState, Metrics]:
     """One step on training photographs and on views that were labeled once, such as target views.
 
@@ -233,21 +236,20 @@ def labeled_step(
       field: static.
       optimizer: static.
       config: static.
+      spread: how several draws are taken.
     """
-    key_batch, key_render, key_adapt, key_label = _keys_of(state.key, state.step)
-    batch = _sample_batch(key_batch, views, config)
-    labeled, key_label_render = _sample_labels(key_label, labels, config)
     loss_of = functools.partial(rendered_loss, field=field, chunk=field.gradient_chunk)
 
-    def loss(params):
+    def loss(params, buffers, keys, views, labels, settings):
         return add_label_loss(
-            lambda batch, key: loss_of(params, state.buffers, batch, key),
-            (batch, key_render),
-            (labeled, key_label_render),
+            lambda batch, key: loss_of(params, buffers, batch, key),
+            (sample_batch(keys.batch, views, config.num_rays), keys.render),
+            sample_labels(keys.label, labels, config.num_label_rays),
             settings.label_loss_weight,
         )
 
-    return _update(state, loss, key_adapt, field, optimizer, settings.lr_scale)
+    data = views, labels, settings
+    return _update(state, loss, data, field, optimizer, config, spread, settings.lr_scale)
 
 
 def run_steps(
@@ -307,55 +309,26 @@ def render_depths(
     return jax.lax.map(one_view, (cameras, keys))
 
 
-@jax.jit
-def _keys_of(key, step):
-    return tuple(jax.random.split(jax.random.fold_in(key, step), 4))
-
-
-@functools.partial(jax.jit, static_argnums=2)
-def _sample_batch(key, views, config):
-    whole, single = (
-        (sample_window, sample_window_pixels)
-        if isinstance(views, Windows)
-        else (sample_image, sample_pixels)
-    )
-    return whole(key, views) if config.num_rays is None else single(key, views, config.num_rays)
-
-
-@functools.partial(jax.jit, static_argnums=2)
-def _sample_labels(key, labels, config):
-    key_batch, key_render = jax.random.split(key)
-    if config.num_label_rays is None:
-        return sample_image(key_batch, labels), key_render
-    return sample_pixels(key_batch, labels, config.num_label_rays), key_render
-
-
-@functools.partial(jax.jit, static_argnums=3)
-def _sample_closeup(key, sources, settings, config):
-    """A virtual camera, its nearest photograph, pixels, and keys of its depth and rendering."""
-    key_virtual, key_pixels, key_depth, key_render = jax.random.split(key, 4)
-    camera, source_index = sample_virtual_camera(key_virtual, sources, settings)
-    pixels = _sample_virtual_pixels(key_pixels, camera, config.num_label_rays)
-    return camera, source_index, pixels, key_depth, key_render
-
-
-def _sample_virtual_pixels(key, camera, count):
-    """Pixel centers `[count, 2]`, drawn with replacement, or None for all."""
-    if count is None:
-        return None
-    size = jnp.array([[camera.width, camera.height]])
-    return jax.random.randint(key, (count, 2), 0, size).astype(jnp.float32) + 0.5
-
-
 @functools.partial(jax.jit, static_argnames="depth")
-def _label(rendering, pixels, camera, source_index, sources, settings, *, depth):
+def _label(rendering, virtual, sources, settings, *, depth):
+    camera, pixels = virtual.camera, virtual.pixels
     if pixels is None:
         pixels = pixel_grid(camera.height, camera.width)
-    return label_pixels(camera, pixels, depth(rendering), source_index, sources, settings)
+    return label_pixels(camera, pixels, depth(rendering), virtual.source_index, sources, settings)
 
 
-def _update(state, loss, key_adapt, field, optimizer, lr_scale=None):
-    (value, metrics), gradients = jax.value_and_grad(loss, has_aux=True)(state.params)
+def _update(state, loss, data, field, optimizer, config, spread, lr_scale=None):
+    """The state after a step whose draws have `loss(params, buffers, keys, *data)`, and metrics."""
+    keys, key_adapt = draw_keys(state.key, state.step, config.num_windows)
+
+    def gradient(keys, params, buffers, *data):
+        def of_params(params):
+            return loss(params, buffers, keys, *data)
+
+        return jax.value_and_grad(of_params, has_aux=True)(params)
+
+    take = spread if config.num_windows > 1 else lambda give, *arguments: give(*arguments)
+    (value, metrics), gradients = take(gradient, keys, state.params, state.buffers, *data)
     updates, opt_state = optimizer.update(gradients, state.opt_state, state.params)
     moved = _move(state, updates, opt_state, lr_scale)
     after, skipped = _unless_broken(state, field.adapt(key_adapt, moved), value, gradients)

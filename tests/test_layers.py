@@ -32,9 +32,10 @@ MAY_IMPORT = {
     "windows": {"geometry", "photographs", "pyramids"},
     "gather": {"numerics", "geometry", "photographs", "pyramids"},
     "detail": {"numerics", "geometry", "gather", "pyramids"},
+    "draws": {"geometry", "photographs", "pseudo", "pyramids", "windows"},
     "train": {
         *("numerics", "geometry", "field", "photographs"),
-        *("pseudo", "label_rules", "rendered_loss", "pyramids", "windows"),
+        *("draws", "pseudo", "label_rules", "rendered_loss", "pyramids", "windows"),
     },
     "captures": {"files", "ply", "numerics", "geometry", "photographs", "scene"},
     "procedural": {"files", "numerics", "geometry", "photographs", "scene"},

@@ -35,6 +35,13 @@ flags.DEFINE_integer(
     "divide the size of photographs by this, averaging areas; default: the preset's",
     lower_bound=1,
 )
+flags.DEFINE_integer(
+    "windows",
+    None,
+    "windows of photographs that a step learns from, and pseudo-labels, shared out among devices, "
+    "or among the cores of a CPU; default: the preset's",
+    lower_bound=1,
+)
 flags.DEFINE_bool("resume", False, "resume the training that was cut off in --output_dir")
 flags.DEFINE_bool(
     "tensorboard", False, "also write event files for TensorBoard; needs the extra tensorboard"
@@ -86,10 +93,9 @@ def preset_from_flags() -> Preset:
             f"--preset={FLAGS.preset} is not for --method={FLAGS.method}: choose "
             + " or ".join(presets)
         )
-    preset = with_settings(presets[FLAGS.preset], FLAGS.set)
-    if FLAGS.downscale is None:
-        return preset
-    return with_settings(preset, [f"downscale={FLAGS.downscale}"])
+    given = {"downscale": FLAGS.downscale, "num_windows": FLAGS.windows}
+    flagged = [f"{name}={value}" for name, value in given.items() if value is not None]
+    return with_settings(presets[FLAGS.preset], [*FLAGS.set, *flagged])
 
 
 def names_from_flags() -> dict[str, str]:

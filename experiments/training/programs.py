@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -14,6 +15,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from orbax.checkpoint.multihost import sync_global_processes
 
 from experiments.methods import METHODS, Preset
+from jaxcloseup.draws import in_a_loop, in_threads, over_devices
 from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.photographs import Views
@@ -54,19 +56,24 @@ class Programs:
             "random_closeups": functools.partial(closeup_step, **bound),
             "target_views": functools.partial(labeled_step, **bound),
         }
+        self._mesh = _mesh_of_windows(self.preset.train.num_windows)
+        spread = in_a_loop if self._mesh is None else over_devices(self._mesh)
+        in_parts = not self.method.renders_pixels and self._mesh is None
         # The number of steps is traced; the input state is left alone.
         self._runners = {
-            kind: jax.jit(functools.partial(run_steps, step))
-            if self.method.renders_pixels
-            else functools.partial(_take_steps, step)
+            kind: functools.partial(_take_steps, step)
+            if in_parts
+            else jax.jit(functools.partial(run_steps, functools.partial(step, spread=spread)))
             for kind, step in steps.items()
         }
         self._runners["arms"] = jax.jit(self._run_arms(steps["random_closeups"]))
-        self._render = jax.jit(
-            lambda state, camera, key: self.field.render(
-                state.params, state.buffers, camera, None, key
-            )
+        # What renders whole images is compiled by itself, and steps share it.
+        self._render = (
+            jax.jit(self._render_whole) if self.method.renders_pixels else (self._render_whole)
         )
+
+    def _render_whole(self, state: TrainState, camera: Camera, key: jax.Array | None) -> Rendering:
+        return self.field.render(state.params, state.buffers, camera, None, key)
 
     def _run_arms(self, step: Callable[..., Any]) -> Callable[..., Any]:
         """Steps of all arms of a sweep together, spread over the devices.
@@ -177,20 +184,32 @@ class Programs:
           steps that were skipped because loss or gradient was not finite (of "arms" a list of
           counts). A mean that is not finite, such as the PSNR without any label, is left out.
         """
-        if kind == "arms":
-            self._meet()
-            # What comes out of a checkpoint lies on one device.
-            state, *data = jax.tree.map(_place, self._on_devices, (state, *data))
+        arrays = self._share_out(kind, (state, *data))
         while True:
-            after, metrics = self._runners[kind](state, *data, count=count)
-            if kind == "arms" and jax.process_count() > 1:
-                after, metrics = _gather((after, metrics))
+            after, metrics = self._collect(kind, self._runners[kind](*arrays, count=count))
             metrics = jax.device_get(metrics)
             # Means of counts: positive if any step had an overflow.
             overflow = [metrics.pop(key, np.zeros(())) for key in ("overflow", "label_overflow")]
             if not any(np.any(values) for values in overflow):
                 return after, _checked(metrics, kind, count)
             self._grow()
+
+    def _share_out(self, kind: str, arrays: tuple[Any, ...]) -> tuple[Any, ...]:
+        """State and data of a step on the devices that take it."""
+        # What comes out of a checkpoint lies on one device.
+        if kind == "arms":
+            self._meet()
+            return jax.tree.map(_place, self._on_devices, arrays)
+        if self._mesh is None:
+            return arrays
+        self._meet()
+        return _place(NamedSharding(self._mesh, PartitionSpec()), arrays)
+
+    def _collect(self, kind: str, result: Any) -> Any:
+        """What steps on several devices gave, whole on this host."""
+        if kind == "arms":
+            return _gather(result) if jax.process_count() > 1 else result
+        return result if self._mesh is None else _one_copy(result)
 
     def _meet(self) -> None:
         if jax.process_count() > 1:
@@ -212,6 +231,22 @@ class Programs:
             programs._grow()
 
 
+def _mesh_of_windows(windows: int) -> Mesh | None:
+    """The devices that share the windows of a step evenly; None where that is one.
+
+    Raises:
+      ValueError: several hosts have devices that would get no window.
+    """
+    devices = jax.devices()
+    count = math.gcd(windows, len(devices))
+    if jax.process_count() > 1 and windows > 1 and count < len(devices):
+        raise ValueError(
+            f"--windows={windows} leaves devices of some hosts without work: choose a multiple of "
+            f"their {len(devices)} devices"
+        )
+    return Mesh(np.array(devices[:count]), ("windows",)) if count > 1 else None
+
+
 def _take_steps(
     step: Callable[..., tuple[TrainState, dict[str, Any]]],
     state: TrainState,
@@ -222,9 +257,11 @@ def _take_steps(
 
     To compile the rendering of an image, with its derivative, takes as long as hundreds of steps.
     """
+    cores = (os.cpu_count() or 1) if jax.default_backend() == "cpu" else 1
     total = None
-    for _ in range(count):
-        state, metrics = step(state, *data)
+    for i in range(count):
+        # Two threads would compile the same parts, so the first step takes one.
+        state, metrics = step(state, *data, spread=in_threads(cores if i else 1))
         # No step begins before the last one ends: what waits would hold memory.
         total = metrics if total is None else jax.tree.map(jnp.add, total, metrics)
         jax.block_until_ready(total)
@@ -259,6 +296,11 @@ def _place(sharding: NamedSharding, tree: Any) -> Any:
         return jax.make_array_from_callback(leaf.shape, sharding, leaf.__getitem__)
 
     return _map_keys_as_numbers(place, tree)
+
+
+def _one_copy(tree: Any) -> Any:
+    """This host's first copy of arrays that every device has whole."""
+    return _map_keys_as_numbers(lambda leaf: leaf.addressable_data(0), tree)
 
 
 def _gather(tree: Any) -> Any:

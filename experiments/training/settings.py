@@ -22,7 +22,9 @@ BOUNDS = {
     "label_loss_weight": (0, 1),
     "magnification": (1, math.inf),
     **dict.fromkeys(("num_sources", "baseline_steps", "closeup_steps", "downscale"), (1, math.inf)),
-    **dict.fromkeys(("num_rays", "num_label_rays", "chunk", "capacity"), (1, math.inf)),
+    **dict.fromkeys(
+        ("num_rays", "num_label_rays", "num_windows", "chunk", "capacity"), (1, math.inf)
+    ),
     **dict.fromkeys(("finest", "steps"), (1, math.inf)),
     **dict.fromkeys(("width", "num_coarse", "num_fine"), (1, math.inf)),
     **dict.fromkeys(("whole_share", "initial_opacity", "ssim_weight", "background"), (0, 1)),

@@ -40,6 +40,9 @@ from jaxcloseup.train import TrainState, init_state
 FEWEST_POINTS = 100  # a capture with fewer gets random points too
 _MOST_CLOSEUPS = 200  # that are labeled before the first step
 _CLOSEUPS = 3  # folded into a run's key
+_COMPILING = tuple(
+    f"/jax/core/compile/{part}_duration" for part in ("jaxpr_to_mlir_module", "backend_compile")
+)
 
 
 class LabelStart(NamedTuple):
@@ -283,3 +286,19 @@ def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
     start = time.perf_counter()
     yield
     seconds[name] = time.perf_counter() - start
+
+
+@contextlib.contextmanager
+def timed_compiling(seconds: dict[str, float]) -> Iterator[None]:
+    """Record under "compile" how much of the body's time, in whatever thread, goes to XLA."""
+    seconds["compile"] = 0.0
+
+    def add(event, duration, **_):
+        if event in _COMPILING:
+            seconds["compile"] += duration
+
+    jax.monitoring.register_event_duration_secs_listener(add)
+    try:
+        yield
+    finally:
+        jax.monitoring.unregister_event_duration_listener(add)
