@@ -39,9 +39,9 @@ def expected_lists(box, order):
     return lists
 
 
-@pytest.mark.parametrize(("capacity", "shown"), [(512, 40), (60, 40), (512, 9)])
+@pytest.mark.parametrize(("capacity", "shown"), [(512, 40), (60, 40), (40, 40), (512, 9)])
 def test_lists_hold_the_splats_of_a_tile_nearest_first(capacity, shown, monkeypatch):
-    """In all the room and, where few splats are shown, in a part of it."""
+    """In half of the room, in all of it, in too little, and, of few splats, in a quarter."""
     monkeypatch.setattr(tiling, "_LARGE", 50)
     box, order = random_boxes()
     box[shown:] = [0, 0, -1, -1]

@@ -4,6 +4,8 @@ Tiles are squares of pixels in row-major order. The number of pairs is static; p
 are left out and counted.
 """
 
+import functools
+import itertools
 from collections.abc import Callable
 
 import chex
@@ -14,7 +16,7 @@ from jax import lax
 
 
 LARGEST = 2**31 - 1
-_LARGE, _PART = 2**16, 4  # room that is worth a shortcut, and the part of it that often suffices
+_LARGE = 2**16  # room that is worth shortcuts
 
 
 @struct.dataclass
@@ -85,17 +87,16 @@ def tile_lists(
             for part, value in zip(found, fill, strict=True)
         )
 
-    if capacity < _LARGE:
-        tile_of, splats = sort(count, capacity)
-    else:
-        # Sorting costs what there is room for, and windows show few splats in few pairs.
-        rows, room = max(count // _PART, 1), capacity // _PART
-        after = jnp.max(jnp.where(pairs > 0, jnp.arange(count, dtype=jnp.int32), -1), initial=-1)
-        tile_of, splats = lax.cond(
-            (after < rows) & (total <= room) & ~too_many,
-            lambda: sort(rows, room),
-            lambda: sort(count, capacity),
-        )
+    # Sorting costs what there is room for; windows show few splats in few pairs.
+    rooms = [(count, capacity)]
+    if capacity >= _LARGE:
+        rooms = [(max(count // 4, 1), capacity // 4), (count, capacity // 2), *rooms]
+    after = jnp.max(jnp.where(pairs > 0, jnp.arange(count, dtype=jnp.int32), -1), initial=-1)
+    fits = [(after < rows) & (total <= room) & ~too_many for rows, room in rooms[:-1]]
+    branches = [functools.partial(sort, *room) for room in rooms]
+    # The first room that fits: each one that does not adds 1.
+    first_fit = sum((~fit).astype(jnp.int32) for fit in itertools.accumulate(fits, jnp.logical_or))
+    tile_of, splats = lax.switch(first_fit, branches) if fits else branches[0]()
     starts = jnp.searchsorted(tile_of, jnp.arange(across * down + 1, dtype=jnp.int32))
     starts = starts.astype(jnp.int32)
     counts = starts[1:] - starts[:-1]
