@@ -74,7 +74,7 @@ def resolved_by_photographs(
     Returns:
       `[H, W, 3]` the blurred true image, and `[H, W]` whether any photograph sees the surface.
     """
-    truth = jax.jit(scene.surface)(camera)
+    truth = scene.surface(camera)
     pixels = pixel_grid(camera.height, camera.width)
     finest = np.full(pixels.shape[:2], np.inf)
     for index, depth in enumerate(exact_depths):

@@ -36,7 +36,7 @@ def ladder_targets(scene: Scene, exact_depths: jax.Array) -> dict[str, list[Targ
     """
     if scene.surface is None or scene.test_far is None:
         return {}
-    surface, count = jax.jit(scene.surface), jax.jit(count_seen)
+    surface, count = scene.surface, jax.jit(count_seen)
     ladder: dict[str, list[Target]] = {f"{PREFIX}{m}": [] for m in MAGNIFICATIONS}
     for i, name in enumerate(scene.names["test_far"]):
         far = camera_at(scene.test_far.cameras, i)

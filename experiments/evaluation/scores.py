@@ -105,7 +105,7 @@ def make_targets(
       views: the split's photographs of another size; by default those of the scene.
     """
     views = getattr(scene, split) if views is None else views
-    surface = jax.jit(scene.surface) if scene.surface else None
+    surface = scene.surface  # is compiled; within jit, its textures would be constants
     count = jax.jit(count_seen)
     targets = []
     for i, name in enumerate(scene.names[split]):

@@ -46,7 +46,7 @@ def true_close_ups(
     Returns:
       `CEILING_VIEWS` close-ups; weight 0 where no photograph sees the surface.
     """
-    sample, surface = jax.jit(sample_virtual_camera), jax.jit(scene.surface)
+    sample, surface = jax.jit(sample_virtual_camera), scene.surface
     images = []
     for one in jax.random.split(key, CEILING_VIEWS):
         camera, _ = sample(one, sources, settings)
@@ -86,7 +86,7 @@ def labels_with_better_depth(
     def mix(trained, true):
         return jnp.where((trained > 0) & (true > 0), true + share * (trained - true), 0)
 
-    sample, surface = jax.jit(sample_virtual_camera), jax.jit(scene.surface)
+    sample, surface = jax.jit(sample_virtual_camera), scene.surface
     keys = jax.random.split(key, CEILING_VIEWS)
     cameras = [sample(one, sources, settings)[0] for one in keys]
     cameras = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)

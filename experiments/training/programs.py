@@ -68,9 +68,8 @@ class Programs:
         }
         self._runners["arms"] = jax.jit(self._run_arms(steps["random_closeups"]))
         # What renders whole images is compiled by itself, and steps share it.
-        self._render = (
-            jax.jit(self._render_whole) if self.method.renders_pixels else (self._render_whole)
-        )
+        render = self._render_whole
+        self._render = jax.jit(render) if self.method.renders_pixels else render
 
     def _render_whole(self, state: TrainState, camera: Camera, key: jax.Array | None) -> Rendering:
         return self.field.render(state.params, state.buffers, camera, None, key)

@@ -183,7 +183,7 @@ def audit_all(
         ways = {
             "exact_depth": (
                 label_sources(scene.train, exact),
-                jax.jit(lambda camera: scene.surface(camera).depth),
+                lambda camera: scene.surface(camera).depth,
             ),
             "trained_depth": (start.sources, lambda camera: label_depth(render(camera))),
         }
