@@ -5,7 +5,6 @@ are left out and counted.
 """
 
 import functools
-import itertools
 from collections.abc import Callable
 
 import chex
@@ -94,9 +93,8 @@ def tile_lists(
     after = jnp.max(jnp.where(pairs > 0, jnp.arange(count, dtype=jnp.int32), -1), initial=-1)
     fits = [(after < rows) & (total <= room) & ~too_many for rows, room in rooms[:-1]]
     branches = [functools.partial(sort, *room) for room in rooms]
-    # The first room that fits: each one that does not adds 1.
-    first_fit = sum((~fit).astype(jnp.int32) for fit in itertools.accumulate(fits, jnp.logical_or))
-    tile_of, splats = lax.switch(first_fit, branches) if fits else branches[0]()
+    first_fit = jnp.argmax(jnp.stack([*fits, jnp.array(True)]))
+    tile_of, splats = lax.switch(first_fit, branches)
     starts = jnp.searchsorted(tile_of, jnp.arange(across * down + 1, dtype=jnp.int32))
     starts = starts.astype(jnp.int32)
     counts = starts[1:] - starts[:-1]
