@@ -8,6 +8,7 @@ alone reads its weights from the public PyTorch files.
 import importlib.util
 import os
 import pathlib
+import re
 
 import chex
 import jax
@@ -166,11 +167,8 @@ def load_lpips(backbone: str, folder: str | os.PathLike[str] | None = None) -> L
     except TorchFileError as error:
         raise LpipsError(str(error)) from error
     # Convolutions stand in the order of the network, as "features.<i>.weight" and ".bias".
-    numbers = sorted(
-        int(name.split(".")[1])
-        for name in of_network
-        if name.startswith("features.") and name.endswith(".weight")
-    )
+    found = (re.fullmatch(r"features\.(\d{1,3})\.weight", name) for name in of_network)
+    numbers = sorted(int(match[1]) for match in found if match)
     kernels = [of_network[f"features.{i}.weight"] for i in numbers]
     biases = [of_network.get(f"features.{i}.bias") for i in numbers]
     bias_shapes = [getattr(bias, "shape", None) for bias in biases]

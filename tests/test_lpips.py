@@ -1,14 +1,21 @@
 """LPIPS against the reference implementation, and weights as PyTorch writes them."""
 
+import io
 import json
+import os
 import pathlib
+import pickle
+import sys
+import types
 import zipfile
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxcloseup import torch_file
 from jaxcloseup.lpips import BACKBONES, LpipsError, LpipsWeights, layer_shapes, load_lpips, lpips
 from jaxcloseup.torch_file import TorchFileError, read_tensors
 
@@ -112,6 +119,93 @@ def test_a_file_cannot_run_code(tmp_path):
         archive.writestr("evil/data.pkl", b"cos\nsystem\n(S'true'\ntR.")
     with pytest.raises(TorchFileError, match=r"it holds os\.system"):
         read_tensors(path)
+
+
+def tensor_file(path, arguments, *, name="weight", size=6):
+    """A file of one tensor of `size` numbers, rebuilt with these arguments after its storage."""
+
+    class Storage(str):
+        pass
+
+    class Pickler(pickle.Pickler):
+        def persistent_id(self, found):
+            return ("storage", Float, "0", "cpu", size) if isinstance(found, Storage) else None
+
+    # The pickle names what the reader looks up, without PyTorch.
+    Float, Rebuilt = (type(kind, (), {}) for kind in ("FloatStorage", "_rebuild_tensor_v2"))
+    Float.__module__, Rebuilt.__module__ = "torch", "torch._utils"
+    Rebuilt.__reduce__ = lambda self: (Rebuilt, (Storage(), *arguments))
+    module, utils = types.ModuleType("torch"), types.ModuleType("torch._utils")
+    module.FloatStorage, utils._rebuild_tensor_v2 = Float, Rebuilt
+    data = io.BytesIO()
+    with mock.patch.dict(sys.modules, {"torch": module, "torch._utils": utils}):
+        Pickler(data, protocol=2).dump({name: Rebuilt()})
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("archive/data.pkl", data.getvalue())
+        archive.writestr("archive/data/0", np.arange(size, dtype=np.float32).tobytes())
+    return path
+
+
+def test_no_tensor_reaches_beyond_its_storage(tmp_path):
+    path = tmp_path / "weights.pth"
+    found = read_tensors(tensor_file(path, (1, (2, 2), (2, 1))))
+    np.testing.assert_array_equal(found["weight"], [[1, 2], [3, 4]])
+    for arguments in (
+        (0, (7,), (1,)),
+        (3, (2, 2), (2, 1)),
+        (0, (2,), (2**62,)),
+        (0, (2,), (-1,)),
+        (-1, (2,), (1,)),
+        (0, (2**40,), (0,)),
+        (0, (6.0,), (1,)),
+        (0, (6,), (1, 1)),
+        (0, (True,), (1,)),
+    ):
+        with pytest.raises(TorchFileError, match="not a whole file"):
+            read_tensors(tensor_file(path, arguments))
+
+
+def test_a_pickle_cannot_call_the_types_of_storages(tmp_path):
+    """NumPy's integers, as strides, would wrap around in the check of bounds."""
+    path = tmp_path / "evil.pth"
+    with zipfile.ZipFile(path, "w") as archive:
+        call = b"ctorch\nLongStorage\n(I4611686018427387905\ntR."
+        archive.writestr("evil/data.pkl", call)
+    with pytest.raises(TorchFileError, match="not callable"):
+        read_tensors(path)
+
+
+def test_a_pickle_cannot_change_a_tensor_after_its_check(tmp_path):
+    path = tensor_file(tmp_path / "weights.pth", (0, (2,), (1,)))
+    with zipfile.ZipFile(path) as archive:
+        data = archive.read("archive/data.pkl")
+    assert data.count(b"Rq") == 1  # the call that makes the tensor; then its state is set
+    place = data.index(b"Rq") + 1
+    data = data[:place] + b"}(U\x06offsetJ\xf0\xff\xff\xffub" + data[place:]
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("archive/data.pkl", data)
+        archive.writestr("archive/data/0", bytes(24))
+    with pytest.raises(TorchFileError, match="not of whole numbers"):
+        read_tensors(path)
+
+
+def test_files_without_end_or_with_strange_names_are_refused(tmp_path, monkeypatch):
+    with pytest.raises(TorchFileError, match="no file of at most"):
+        read_tensors("/dev/zero")
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(TorchFileError, match="no file of at most"):
+        read_tensors(tmp_path / "pipe")
+    whole = (0, (2,), (1,))
+    with pytest.raises(TorchFileError, match="not a dictionary of tensors"):
+        read_tensors(tensor_file(tmp_path / "vgg16-1.pth", whole, name=3))
+    for name in ("features.abc.weight", "features.weight", f"features.{'9' * 5000}.weight"):
+        for file in ("vgg16-1.pth", "vgg.pth"):
+            tensor_file(tmp_path / file, whole, name=name)
+        with pytest.raises(LpipsError, match="does not hold the convolutions"):
+            load_lpips("vgg", tmp_path)
+    monkeypatch.setattr(torch_file, "LARGEST_FILE", 10)
+    with pytest.raises(TorchFileError, match="no file of at most"):
+        read_tensors(tensor_file(tmp_path / "large.pth", whole))
 
 
 def test_errors_name_the_file_that_is_missing(tmp_path, monkeypatch):

@@ -278,6 +278,19 @@ def test_depth_is_the_median_or_expected_depth(trained, capture):
         assert buffers.expected == flag
 
 
+def test_no_surfel_grows_beyond_the_largest_scale(trained):
+    state = trained[2]
+    before = np.asarray(state.params.log_scales, np.float64)
+    largest = np.exp(np.median(before))
+    config = dataclasses.replace(CONFIG, density=None, max_scale=float(largest / EXTENT))
+    after = surfel_field(config, extent=EXTENT).adapt(jax.random.key(1), state)
+    expected = np.minimum(before, np.log(largest))
+    assert 0.4 < np.mean(expected < before) < 0.6
+    np.testing.assert_allclose(after.params.log_scales, expected, rtol=1e-5)
+    unchanged = state.params.replace(log_scales=after.params.log_scales)
+    jax.tree.map(np.testing.assert_array_equal, after.params, unchanged)
+
+
 def test_without_density_control_only_the_schedule_changes(trained):
     state = trained[0].replace(step=jnp.int32(80))
     field = surfel_field(dataclasses.replace(CONFIG, density=None), extent=EXTENT)
@@ -310,6 +323,8 @@ def test_a_field_with_more_capacity_renders_what_overflowed(trained, capture):
 def test_invalid_settings_are_refused():
     with pytest.raises(ValueError, match="depth"):
         surfel_field(dataclasses.replace(CONFIG, depth="mean"), extent=EXTENT)
+    with pytest.raises(ValueError, match="max_scale must be positive or None, not 0"):
+        surfel_field(dataclasses.replace(CONFIG, max_scale=0), extent=EXTENT)
     with pytest.raises(ValueError, match="extent"):
         surfel_field(CONFIG, extent=0.0)
     with pytest.raises(TypeError, match="density must be None or one of McmcConfig"):

@@ -6,6 +6,7 @@ the light along a ray at one depth; their weights do not depend on the unit of l
 
 import dataclasses
 import functools
+import math
 from collections.abc import Hashable
 from typing import Any, NamedTuple
 
@@ -64,6 +65,8 @@ class SurfelConfig:
       opacity_lr: Adam's learning rate of the opacity logits.
       scale_lr: Adam's learning rate of the log scales.
       rotation_lr: Adam's learning rate of the quaternions.
+      max_scale: largest standard deviation of a surfel; None sets no bound. A very large surfel may
+        be hidden from every photograph, and fill a close-up.
       selective_adam: leave surfels that a step does not see alone, see `scale_by_selective_adam`.
       density: config of a density control, which moves, adds and removes surfels, see
         `density_control`; None has none.
@@ -90,6 +93,7 @@ class SurfelConfig:
     opacity_lr: float = 5e-2
     scale_lr: float = 5e-3
     rotation_lr: float = 1e-3
+    max_scale: float | None = None
     selective_adam: bool = False
     density: Hashable | None = dataclasses.field(default_factory=McmcConfig)
     raster: RasterizeConfig = dataclasses.field(default_factory=RasterizeConfig)
@@ -150,6 +154,8 @@ def surfel_field(config: SurfelConfig, *, extent: float) -> RadianceField:
     """
     if config.depth not in ("median", "expected"):
         raise ValueError(f'SurfelConfig.depth must be "median" or "expected", not "{config.depth}"')
+    if config.max_scale is not None and not config.max_scale > 0:
+        raise ValueError(f"SurfelConfig.max_scale must be positive or None, not {config.max_scale}")
     if not extent > 0:
         raise ValueError(f"extent must be a positive length, not {extent}")
     control = _density_control(config, extent)
@@ -195,7 +201,8 @@ def surfel_field(config: SurfelConfig, *, extent: float) -> RadianceField:
     def adapt(key: jax.Array, state: Any) -> Any:
         degree, regularize = _schedule(config, state.step)
         buffers = state.buffers.replace(degree=degree, regularize=regularize)
-        return control.adapt(key, state.replace(buffers=buffers))
+        state = control.adapt(key, state.replace(buffers=buffers))
+        return state.replace(params=_bound_scales(state.params, config, extent))
 
     loss = jax.jit(functools.partial(_loss, config=config))
     return RadianceField(init=init, render=render, loss=loss, adapt=adapt)
@@ -276,6 +283,14 @@ def _schedule(config, step):
     """Degree of spherical harmonics, and whether the normal and distortion losses count."""
     degree = jnp.minimum(step // config.sh_every, config.sh_degree).astype(jnp.int32)
     return degree, (step >= config.regularize_from).astype(jnp.float32)
+
+
+def _bound_scales(surfels, config, extent):
+    """Surfels no larger than the config allows."""
+    if config.max_scale is None:
+        return surfels
+    largest = math.log(config.max_scale * extent)
+    return surfels.replace(log_scales=jnp.minimum(surfels.log_scales, largest))
 
 
 def _limit_degree(surfels, degree):
