@@ -1,12 +1,19 @@
-"""Viser's server at exactly the requested address, or an error that says why not."""
+"""Viser's server at exactly the requested address, for pages of that address alone."""
 
 import contextlib
+import http
 import io
+import ipaddress
 import logging
 import os
 import socket
+import urllib.parse
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+from unittest import mock
 
 import viser
+from websockets.asyncio import server as websockets_server
 
 
 class ServeError(Exception):
@@ -34,7 +41,7 @@ def serve(host: str, port: int) -> Server:
 
     logging.getLogger("websockets").setLevel(logging.WARNING)
     # Viser prints a banner, and takes the next port if this one is in use.
-    with contextlib.redirect_stdout(io.StringIO()):
+    with contextlib.redirect_stdout(io.StringIO()), _guarded(host):
         server = Server(host=host, port=port, verbose=False)
     if server.get_port() != port:
         server.stop()
@@ -58,3 +65,64 @@ def check_address(host: str, port: int) -> None:
             f"cannot serve at --host={host} --port={port} ({reason}): choose another port, or an "
             "address of this computer"
         ) from None
+
+
+@contextlib.contextmanager
+def _guarded(host: str) -> Iterator[None]:
+    """Servers that start in this context answer requests alone that mean them, see `is_foreign`.
+
+    Any page that a visitor opens could otherwise read the scene through the visitor's browser.
+    Viser has no setting for it, and its server has started when its constructor returns.
+    """
+    serve = websockets_server.serve
+
+    def guarded_serve(*args: Any, process_request: Callable[..., Any], **options: Any) -> Any:
+        def process(connection, request):
+            hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
+            if is_foreign(host, hosts, origins):
+                text = "This page is served at another address.\n"
+                return connection.respond(http.HTTPStatus.FORBIDDEN, text)
+            return process_request(connection, request)
+
+        return serve(*args, process_request=process, **options)
+
+    with mock.patch.object(websockets_server, "serve", guarded_serve):
+        yield
+
+
+def is_foreign(served: str, hosts: Sequence[str], origins: Sequence[str]) -> bool:
+    """Whether a request was not meant for this server, or comes from a page of another one.
+
+    Ports may differ from the served one, because a tunnel's may.
+
+    Args:
+      served: the address of `--host`.
+      hosts: the request's headers `Host`.
+      origins: the request's headers `Origin`; a browser sends it with every request to a socket.
+    """
+    if len(hosts) != 1 or len(origins) > 1 or not _means(served, _name(f"//{hosts[0]}")):
+        return True
+    return any(urllib.parse.urlsplit(origin).netloc != hosts[0] for origin in origins)
+
+
+def _name(address: str) -> str:
+    with contextlib.suppress(ValueError):
+        return urllib.parse.urlsplit(address).hostname or ""
+    return ""
+
+
+def _means(served: str, name: str) -> bool:
+    """Whether a name in a request is the served address."""
+    ours, theirs = _ip(served), _ip(name)
+    if ours is not None and ours.is_unspecified:
+        # A name could be anyone's, made to lead here; a number cannot.
+        return theirs is not None or name in ("localhost", socket.gethostname().lower())
+    if served == "localhost" or (ours is not None and ours.is_loopback):
+        return name == "localhost" or (theirs is not None and theirs.is_loopback)
+    return name == served.lower() or (theirs is not None and theirs == ours)
+
+
+def _ip(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    with contextlib.suppress(ValueError):
+        return ipaddress.ip_address(name)
+    return None
