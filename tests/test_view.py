@@ -60,7 +60,7 @@ def serve(viser):
 
 
 def test_a_closeup_is_chosen_and_rendered_in_a_browser(serve, kept, monkeypatch):
-    def darker(programs, start, cameras, *, most):
+    def darker(programs, start, cameras, *, most, kept):
         state = start.state
         assert start.sources.depths.shape == programs.scene.train.weight.shape
         assert cameras.intrinsics.shape == (1, 4)
