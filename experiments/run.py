@@ -19,7 +19,7 @@ from absl import app, flags
 from experiments.command_line import make_output_dir, set_up
 from experiments.evaluation.scores import NO_PERCEPTUAL, Perceptual, find_perceptual
 from experiments.methods import Preset
-from experiments.reporting.report import print_table
+from experiments.reporting.report import print_results
 from experiments.reporting.run_report import report_run
 from experiments.training import flags as training_flags
 from experiments.training.logs import TrainLog, check_tensorboard
@@ -137,7 +137,7 @@ def main(argv: list[str]) -> None:
         )
     except (TrainingError, CheckpointError, OSError) as error:
         sys.exit(f"experiments.run: {error}")
-    print_table(results)
+    print_results(results)
     print(f"report: {output_dir / 'report.html'}")
 
 

@@ -20,8 +20,8 @@ from absl import app, flags
 from experiments.command_line import make_output_dir, set_up
 from experiments.evaluation.scores import Perceptual, find_perceptual
 from experiments.methods import Preset
+from experiments.reporting.page import Picture
 from experiments.reporting.pictures import comparisons
-from experiments.reporting.report import Picture
 from experiments.reporting.tables import print_sweep, write_sweep
 from experiments.training import flags as training_flags
 from experiments.training.arms import KINDS, make_arm

@@ -11,9 +11,9 @@ from jaxcloseup.artifacts.images import (
     colorize_error,
     colorize_normals,
     colorize_support,
-    png_data_uri,
     side_by_side,
     to_uint8,
+    webp_data_uri,
     write_png,
 )
 from jaxcloseup.files import write_file
@@ -70,12 +70,16 @@ def test_unwritable_path(tmp_path, image):
         write_png(tmp_path / "file" / "a.png", image)
 
 
-def test_png_data_uri(image, tmp_path):
-    address = png_data_uri(image)
+def test_webp_data_uri():
+    y, x = np.mgrid[:30, :40]
+    image = np.stack([6 * x, 8 * y, 3 * (x + y)], axis=-1).astype(np.uint8)
+    address = webp_data_uri(image)
     head, _, body = address.partition(",")
-    assert head == "data:image/png;base64" and re.fullmatch(r"[A-Za-z0-9+/=]+", body)
-    (tmp_path / "a.png").write_bytes(base64.b64decode(body))
-    np.testing.assert_array_equal(read_png(tmp_path / "a.png"), to_uint8(image))
+    assert head == "data:image/webp;base64" and re.fullmatch(r"[A-Za-z0-9+/=]+", body)
+    decoded = cv2.imdecode(np.frombuffer(base64.b64decode(body), np.uint8), cv2.IMREAD_COLOR)
+    difference = np.abs(decoded[..., ::-1].astype(int) - image)  # OpenCV stores blue first
+    assert difference.mean() < 3
+    assert len(webp_data_uri(image, quality=10)) < len(address)
 
 
 def test_colorize_depth():

@@ -204,7 +204,9 @@ def test_a_run_leaves_pictures_and_a_page_without_links(finished):
     depth = cv2.imread(str(output_dir / "renders" / "baseline" / "test" / "depth" / "0.png"))
     assert depth.shape == (plane.HEIGHT, plane.WIDTH, 3)
     page = (output_dir / "report.html").read_text()
-    assert "src='data:image/png" in page
+    assert "src='data:image/webp" in page
+    assert page.index("Close-ups have a PSNR") < page.index("type=range") < page.index("<table")
+    assert len(page) < 3e6
     # SVG names its namespaces by addresses, which nobody follows.
     links = re.findall(r"(?:src|href)=['\"]([^'\"]*)", page)
     assert links

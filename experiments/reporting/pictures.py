@@ -9,7 +9,7 @@ import numpy as np
 
 from experiments.evaluation.metrics_text import FINER, SPLIT_TITLES
 from experiments.evaluation.scores import Target
-from experiments.reporting.report import Picture
+from experiments.reporting.page import Picture
 from jaxcloseup.artifacts.images import colorize_depth, colorize_error, side_by_side, write_png
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.pseudo import (
@@ -29,6 +29,8 @@ def comparisons(
     folder: pathlib.Path,
     targets: Mapping[str, Sequence[Target]],
     images: Mapping[tuple[str, str], Mapping[str, np.ndarray]],
+    *,
+    in_report: Sequence[str] | None = None,
 ) -> list[Picture]:
     """Write `<name>.png`: the true image, every stage, and the error of the last stage.
 
@@ -39,6 +41,7 @@ def comparisons(
       folder: folder to write to.
       targets: held-out views by split.
       images: rendered colors by (stage, split), then by the view's name.
+      in_report: stages that the report shows; default: all.
 
     Returns:
       The pictures, for the report.
@@ -52,14 +55,20 @@ def comparisons(
             seen = [images[stage, split][target.name] for stage in stages]
             truth = np.asarray(target.rgb)
             error = colorize_error(np.abs(seen[-1] - truth).mean(axis=-1))
-            panels = [truth, *seen, error]
-            labels = ["truth", *stages, f"error of {stages[-1]}"]
-            image = side_by_side(map(enlarge, panels), labels=labels)
+            panels = dict(zip(["truth", *stages], [truth, *seen], strict=True))
+            panels[f"error of {stages[-1]}"] = error
             name = f"{split}_{target.name}" if target.name in written else target.name
             written.add(name)
-            write_png(folder / f"{name}.png", image)
-            pictures.append(Picture(SPLIT_TITLES[split], target.name, image))
+            write_png(folder / f"{name}.png", _row(panels))
+            left_out = set(stages) - set(in_report or stages)
+            brief = {title: panel for title, panel in panels.items() if title not in left_out}
+            section = SPLIT_TITLES[split.removesuffix(FINER)]
+            pictures.append(Picture(section, target.name, _row(brief)))
     return pictures
+
+
+def _row(panels):
+    return side_by_side(map(enlarge, panels.values()), labels=list(panels))
 
 
 def enlarge(image: np.ndarray | jax.Array) -> np.ndarray:
@@ -115,7 +124,7 @@ def label_pictures(
         panels["rendered depth"] = colorize_depth(depth, near=scene.near, far=scene.far)
         if truth is not None:
             panels["truth"] = np.asarray(truth)
-        image = side_by_side(map(enlarge, panels.values()), labels=list(panels))
+        image = _row(panels)
         write_png(folder / f"{name}.png", image)
         source = scene.names["train"][int(index)]
         pictures.append(Picture("Pseudo-labels", f"{name}, from {source}", image))

@@ -10,6 +10,8 @@ from experiments.evaluation.metrics_text import FINER
 from experiments.evaluation.scores import Target
 from experiments.reporting.pictures import comparisons, label_pictures
 from experiments.reporting.report import write_report
+from experiments.reporting.showcase import Exhibit, exhibits
+from experiments.training.programs import Programs
 from experiments.training.setup import Training, timed
 from experiments.training.stages import Outcome
 from jaxcloseup.files import write_json
@@ -30,7 +32,8 @@ def report_run(
     programs, scene = training.programs, training.programs.scene
     with timed(training.seconds, "report"):
         targets = outcome.held_out.targets
-        pictures = comparisons(output_dir / "compare", targets, outcome.images)
+        brief = list(dict.fromkeys(["baseline", list(outcome.scores)[-1]]))
+        pictures = comparisons(output_dir / "compare", targets, outcome.images, in_report=brief)
         _, _, key = jax.random.split(jax.random.key(about["seed"]), 3)
         pictures += label_pictures(
             key,
@@ -56,8 +59,26 @@ def report_run(
         "history": training.history,
     }
     write_json(output_dir / "results.json", results)
-    write_report(output_dir / "report.html", results, pictures)
+    write_report(output_dir / "report.html", results, _showcase(programs, outcome), pictures)
     return results
+
+
+def _showcase(programs: Programs, outcome: Outcome) -> list[Exhibit]:
+    """The close-ups that the page begins with, as the last stage renders them."""
+    targets, stage = outcome.held_out.targets, list(outcome.scores)[-1]
+    split = next((name for name in (f"test{FINER}", "test") if targets.get(name)), None)
+    if split is None:
+        return []
+    views = outcome.scores[stage][split]["views"]
+    return exhibits(
+        targets[split],
+        outcome.images[stage, split],
+        {name: one["psnr"] for name, one in views.items() if one["psnr"] is not None},
+        render_depth=lambda camera: label_depth(programs.render(outcome.start.state, camera)),
+        sources=outcome.start.sources,
+        photographs=programs.pyramid()[0],
+        names=programs.scene.names["train"],
+    )
 
 
 def _finer_resolution(targets: Mapping[str, Sequence[Target]]) -> list[int] | None:

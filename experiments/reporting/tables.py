@@ -5,7 +5,6 @@ The standard deviation measures how the mean varies with the seed.
 """
 
 import csv
-import html
 import io
 import itertools
 import pathlib
@@ -18,8 +17,8 @@ from rich.table import Table
 
 from experiments.evaluation.ladder import MAGNIFICATIONS, PREFIX
 from experiments.evaluation.metrics_text import SPLIT_TITLES
+from experiments.reporting.page import Picture, figures, head, table
 from experiments.reporting.plots import Curve, line_plot
-from experiments.reporting.report import STYLE, Picture, figures
 from jaxcloseup.files import write_file, write_json
 
 
@@ -184,9 +183,7 @@ def write_sweep(
     write_file(folder / "table.csv", text.getvalue().encode())
     title = f"Sweep: {about['method']}, preset {about['preset']}, {', '.join(scenes)}"
     parts = [
-        "<!doctype html><html lang=en><meta charset=utf-8>",
-        "<meta name=viewport content='width=device-width'>",
-        f"<title>{html.escape(title)}</title><style>{STYLE}</style><h1>{html.escape(title)}</h1>",
+        *head(title),
         "<p>The table shows the mean of each metric over scenes, seeds and views, and the standard "
         "deviation of PSNR over seeds (s.d.). Higher PSNR and SSIM and lower LPIPS are better. "
         "<i>control</i> continues the baseline without labels. The gain is an arm's PSNR above "
@@ -194,10 +191,7 @@ def write_sweep(
         "helps if its whole interval is above 0. n is the number of images, and skipped is the "
         "number of steps that were not finite. All arms take the same number of steps, except "
         "<i>baseline</i>, which takes none, and <i>test_time</i>, which has its own number.</p>",
-        "<div class=wide><table><tr>",
-        *(f"<th>{html.escape(cell)}" for cell in header),
-        *("<tr>" + "".join(f"<td>{html.escape(cell)}" for cell in line) for line in body),
-        "</table></div>",
+        table(header, body, names=2),
     ]
     curves = gain_curves(scenes)
     if curves:

@@ -11,9 +11,9 @@ from jaxcloseup.artifacts.images import (
     colorize_normals,
     colorize_support,
     encode_png,
-    png_data_uri,
     side_by_side,
     to_uint8,
+    webp_data_uri,
     write_png,
 )
 from jaxcloseup.artifacts.surfel_ply import read_surfels, write_surfels
@@ -29,10 +29,10 @@ __all__ = [
     "colorize_normals",
     "colorize_support",
     "encode_png",
-    "png_data_uri",
     "read_surfels",
     "side_by_side",
     "to_uint8",
+    "webp_data_uri",
     "write_png",
     "write_surfels",
     "write_video",

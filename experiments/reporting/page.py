@@ -1,0 +1,114 @@
+"""What pages share: their style, and pictures under headings."""
+
+import html
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from experiments.evaluation.metrics_text import SPLIT_TITLES
+from jaxcloseup.artifacts.images import webp_data_uri
+
+
+class Picture(NamedTuple):
+    """A picture on the page.
+
+    Attributes:
+      section: heading that groups pictures.
+      caption: text below the picture.
+      image: uint8 `[H, W, 3]`.
+    """
+
+    section: str
+    caption: str
+    image: np.ndarray
+
+
+_COMPARISON_NOTE = (
+    "Each picture shows the true image, renders in the order trained, and the error of the last "
+    "one: black is none, and bright yellow is a quarter of the range of colors, or more."
+)
+_PICTURE_NOTES = {
+    **dict.fromkeys(SPLIT_TITLES.values(), _COMPARISON_NOTE),
+    "Pseudo-labels": "Each picture shows how one label is made: colors warped backward from the "
+    "source photograph that the caption names, colors warped forward from all photographs, the "
+    "pixels where both agree (kept), the same as a mask (white), the rendered depth, and the true "
+    "image where it is known. Good labels cover much of the image and look like the true image.",
+}
+
+
+def figures(pictures: Sequence[Picture]) -> list[str]:
+    """Return the lines of a page with the pictures, under a heading for each section."""
+    parts, section = [], None
+    for picture in pictures:
+        if picture.section != section:
+            section = picture.section
+            parts.append(f"<h2>{html.escape(section)}</h2>")
+            note = _PICTURE_NOTES.get(section.split(": ")[-1])  # a sweep's begin with the scene
+            parts += [f"<p>{note}</p>"] if note else []
+        parts.append(figure(picture.image, picture.caption))
+    return parts
+
+
+def figure(image: np.ndarray, caption: str) -> str:
+    """Return an image with its caption."""
+    caption = html.escape(caption)
+    return (
+        f"<figure><img alt='{caption}' src='{webp_data_uri(image)}'>"
+        f"<figcaption>{caption}</figcaption></figure>"
+    )
+
+
+def table(header: Sequence[str], body: Sequence[Sequence[str]], *, names: int = 1) -> str:
+    """Return a table of text.
+
+    Args:
+      header: its first row.
+      body: the other rows.
+      names: number of columns, 1 or 2, that hold no numbers.
+    """
+    lines = ["".join(f"<th>{html.escape(cell)}" for cell in header)]
+    lines += ["".join(f"<td>{html.escape(cell)}" for cell in row) for row in body]
+    return f"<div class=wide><table class=names{names}><tr>" + "<tr>".join(lines) + "</table></div>"
+
+
+def folded(summary: str, parts: Sequence[str]) -> list[str]:
+    """Return parts of a page that a click unfolds; nothing for no parts."""
+    return [f"<details><summary>{summary}</summary>", *parts, "</details>"] if parts else []
+
+
+def head(title: str) -> list[str]:
+    """Return the beginning of a page, with its heading."""
+    return [
+        "<!doctype html><html lang=en><meta charset=utf-8>",
+        "<meta name=viewport content='width=device-width, initial-scale=1'>",
+        f"<title>{html.escape(title)}</title><style>{_STYLE}</style>",
+        f"<h1>{html.escape(title)}</h1>",
+    ]
+
+
+_STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 1200px; margin: 2em auto; padding: 0 1em }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums }
+th, td { padding: .25em .8em; text-align: right; border-bottom: 1px solid #ccc }
+th:first-child, td:first-child, .names2 :nth-child(2) { text-align: left; white-space: nowrap }
+.wide { overflow-x: auto }
+.verdict { font-size: 1.25em }
+.quiet, figcaption { color: #555 }
+figure { margin: 1em 0 }
+.plots, .tables { display: flex; flex-wrap: wrap; gap: 1em 3em }
+.tables > div { min-width: 0 }
+.plots svg { max-width: 100%; height: auto }
+img { display: block; width: 100% }
+details { margin: 1em 0; border-top: 1px solid #ccc; padding-top: 1em }
+summary { cursor: pointer; font-size: 1.25em; font-weight: bold }
+.pair { display: grid; gap: 0 1em;
+  grid-template-columns: repeat(auto-fit, minmax(min(100%, 340px), 1fr)) }
+.slider div { position: relative }
+.slider img + img { position: absolute; inset: 0; clip-path: inset(0 calc(100% - var(--at)) 0 0) }
+.slider input { position: absolute; inset: 0; width: 100%; height: 100%; margin: 0; opacity: 0;
+  cursor: ew-resize }
+.slider div::after { content: ""; position: absolute; top: 0; bottom: 0; left: var(--at);
+  width: 2px; margin-left: -1px; background: white; box-shadow: 0 0 3px black;
+  pointer-events: none }
+"""
