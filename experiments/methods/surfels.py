@@ -117,12 +117,14 @@ QUICK = dataclasses.replace(
 )
 
 
-# The same with windows twice as wide and high, twice the surfels, and as many steps.
+# The same with windows twice as wide and high, twice the surfels, and as many steps. A single
+# surfel without bound cost the close-ups of a scene 1.3 dB.
 STANDARD = dataclasses.replace(
     QUICK,
     field=dataclasses.replace(
         QUICK.field,
         capacity=120_000,
+        max_scale=0.5,
         raster=dataclasses.replace(QUICK.field.raster, capacity=2**18, block=128),
     ),
     coarse=dataclasses.replace(
