@@ -1,17 +1,52 @@
-"""Write whole files and strict JSON atomically, append to files, and find the cache folder."""
+"""Read and write whole files, append to files, and find the cache folder.
 
+Files and strict JSON are written atomically. Files of others are read only if they are ordinary
+ones of a stated size: a pipe or a device may never end, and a sparse file may claim terabytes.
+"""
+
+import errno
 import json
 import math
 import os
 import pathlib
+import stat
 from collections.abc import Mapping
 from typing import Any
+
+
+LARGEST = 2**30  # bytes
 
 
 def cache_folder() -> pathlib.Path:
     """The user's folder for files that a program can make again."""
     # Unlike `Path.home`, `expanduser` does not fail for a user without a home folder.
     return pathlib.Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
+
+
+def check_file(path: str | pathlib.Path, *, most: int = LARGEST) -> None:
+    """Check that a path is an ordinary file of at most `most` bytes.
+
+    Raises:
+      OSError: it is not; `strerror` is the reason.
+    """
+    held = os.stat(path)
+    if stat.S_ISDIR(held.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(held.st_mode):
+        raise OSError(errno.EINVAL, "Not an ordinary file", str(path))
+    if held.st_size > most:
+        raise OSError(errno.EFBIG, f"More than {most / 2**20:.3g} MiB", str(path))
+
+
+def read_bytes(path: str | pathlib.Path, *, most: int = LARGEST) -> bytes:
+    """Read an ordinary file of at most `most` bytes.
+
+    Raises:
+      OSError: the file is missing, unreadable, larger, or not an ordinary one; `strerror` is the
+        reason.
+    """
+    check_file(path, most=most)
+    return pathlib.Path(path).read_bytes()
 
 
 def write_file(path: str | pathlib.Path, data: bytes) -> None:

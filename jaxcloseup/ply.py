@@ -4,7 +4,7 @@ import pathlib
 
 import numpy as np
 
-from jaxcloseup.files import write_file
+from jaxcloseup.files import read_bytes, write_file
 
 
 _TYPES = {
@@ -24,32 +24,38 @@ def read_vertices(path: str | pathlib.Path) -> np.ndarray:
     """Read the vertices of a PLY file, in any encoding, with any plain properties in any order.
 
     Raises:
-      PlyError: the file is missing, is cut short, is not PLY, or its vertices have no x, y, z.
+      PlyError: the file is missing, is cut short, has more than 1 GiB, is not PLY, or its vertices
+        have no x, y, z.
     """
     path = pathlib.Path(path)
     try:
-        data = path.read_bytes()
+        data = read_bytes(path)
     except OSError as error:
         raise PlyError(f"{path} cannot be read ({error.strerror}): restore the file.") from error
-    header, end, body = data.partition(b"end_header")
-    encoding, count, properties = _parse_header(path, header if end else b"")
-    body = body.partition(b"\n")[2]
+    end = data.find(b"end_header")
+    encoding, count, properties = _parse_header(path, data[: max(end, 0)])
+    start = data.find(b"\n", end) + 1 or len(data)
     dtype = np.dtype([(name, _ORDERS[encoding] + kind) for name, kind in properties])
     short = f"{path} ends before its {count} vertices do: copy or export it again."
+    # Text has at least a digit and a separator for each number, but for the last.
+    smallest = 2 * count * len(properties) - 1 if encoding == "ascii" else count * dtype.itemsize
+    if len(data) - start < smallest:
+        raise PlyError(short)
     if encoding == "ascii":
-        rows = body.split(b"\n")[:count]
+        rows = data[start:].split(b"\n", count)[:count]
         try:
             vertices = np.array([tuple(map(float, row.split())) for row in rows], dtype)
-        except ValueError as error:
+        except (ValueError, OverflowError) as error:
             whole = all(len(row.split()) == len(properties) for row in rows)
-            words = f"{path} has words instead of numbers in its vertices: export it again."
+            words = (
+                f"{path} has words instead of numbers in its vertices, or numbers beyond their "
+                "type: export it again."
+            )
             raise PlyError(words if whole else short) from error
         if len(rows) < count:
             raise PlyError(short)
         return vertices
-    if len(body) < count * dtype.itemsize:
-        raise PlyError(short)
-    return np.frombuffer(body, dtype, count)
+    return np.frombuffer(data, dtype, count, start)
 
 
 def write_vertices(path: str | pathlib.Path, vertices: np.ndarray) -> None:

@@ -15,8 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from jaxcloseup.files import LARGEST, check_file
 
-LARGEST_FILE = 2**30  # bytes, also unpacked; the largest known file of weights has 528 MiB
+
+LARGEST_FILE = LARGEST  # bytes, also unpacked; the largest known file of weights has 528 MiB
 _TYPES = {
     "FloatStorage": np.dtype(np.float32),
     "DoubleStorage": np.dtype(np.float64),
@@ -42,9 +44,7 @@ def read_tensors(path: str | pathlib.Path) -> dict[str, np.ndarray]:
     """
     path = pathlib.Path(path)
     try:
-        # A pipe or a device may never end.
-        if path.exists() and not (path.is_file() and path.stat().st_size <= LARGEST_FILE):
-            raise ValueError(f"it is no file of at most {LARGEST_FILE >> 20} MiB")
+        check_file(path, most=LARGEST_FILE)
         read = _read_zip if zipfile.is_zipfile(path) else _read_legacy
         found = read(path)
     except OSError as error:

@@ -11,6 +11,7 @@ from tiny_capture import HEIGHT, WIDTH, frame, paper_capture, single_file, write
 from tiny_capture import write_json as write_frames
 from tiny_models import colmap_capture, image_line, llff_capture, llff_rows, write_model
 
+from jaxcloseup.captures import images
 from jaxcloseup.scenes import SceneError, load_scene
 
 
@@ -244,11 +245,11 @@ def test_unreadable_files(tmp_path, monkeypatch):
         raise PermissionError(13, "Permission denied", str(path))
 
     with monkeypatch.context() as patch:
-        patch.setattr(np, "fromfile", refuse)
+        patch.setattr(images, "read_bytes", refuse)
         with pytest.raises(
             SceneError, match=r"train/.\.png cannot be read \(Permission denied\): r"
         ):
             load_scene(tmp_path)
-    monkeypatch.setattr(pathlib.Path, "read_text", refuse)
+    monkeypatch.setattr(pathlib.Path, "read_bytes", refuse)
     with pytest.raises(SceneError, match=r"transforms_train\.json cannot be read \(Permission den"):
         load_scene(tmp_path)

@@ -14,7 +14,7 @@ MAY_IMPORT = {
     "version": set(),
     "files": set(),
     "ply": {"files"},
-    "torch_file": set(),
+    "torch_file": {"files"},
     "numerics": set(),
     "geometry": {"numerics"},
     "field": set(),

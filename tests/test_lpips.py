@@ -190,10 +190,10 @@ def test_a_pickle_cannot_change_a_tensor_after_its_check(tmp_path):
 
 
 def test_files_without_end_or_with_strange_names_are_refused(tmp_path, monkeypatch):
-    with pytest.raises(TorchFileError, match="no file of at most"):
+    with pytest.raises(TorchFileError, match="Not an ordinary file"):
         read_tensors("/dev/zero")
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(TorchFileError, match="no file of at most"):
+    with pytest.raises(TorchFileError, match="Not an ordinary file"):
         read_tensors(tmp_path / "pipe")
     whole = (0, (2,), (1,))
     with pytest.raises(TorchFileError, match="not a dictionary of tensors"):
@@ -204,7 +204,7 @@ def test_files_without_end_or_with_strange_names_are_refused(tmp_path, monkeypat
         with pytest.raises(LpipsError, match="does not hold the convolutions"):
             load_lpips("vgg", tmp_path)
     monkeypatch.setattr(torch_file, "LARGEST_FILE", 10)
-    with pytest.raises(TorchFileError, match="no file of at most"):
+    with pytest.raises(TorchFileError, match="More than "):
         read_tensors(tensor_file(tmp_path / "large.pth", whole))
 
 

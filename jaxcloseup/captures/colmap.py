@@ -80,6 +80,11 @@ def read_colmap(
         rotation = world_to_camera[:, :3].T
         lens, size = lenses[image.camera_id]
         seen = {point.point3D_id for point in image.get_observation_points2D()}
+        if absent := seen - rows.keys():
+            raise SceneError(
+                f"{source}: image {image.name!r} shows point {min(absent)}, which "
+                f"{model / f'points3D{suffix}'} lacks: export the model again."
+            )
         frames.append(
             Frame(
                 source=source,

@@ -9,9 +9,11 @@ import pathlib
 import struct
 from collections.abc import Callable
 
+from jaxcloseup.files import read_bytes
 from jaxcloseup.scene import SceneError
 
 
+LARGEST_FILE = 2**32  # bytes
 NAMES = ("cameras", "images", "points3D")
 
 
@@ -27,26 +29,28 @@ def check_files(
         ValueError or KeyError for an unknown model.
 
     Raises:
-      SceneError: names the file and the line or record in it.
+      SceneError: names the file, which has more than `LARGEST_FILE` bytes, or the line or record in
+        it.
     """
     missing = [name + suffix for name in NAMES if not (folder / (name + suffix)).is_file()]
     if missing:
         raise SceneError(f"{folder}: {', '.join(missing)} is missing: copy the whole model again.")
     for name in NAMES:
         path = folder / (name + suffix)
-        try:
-            data = path.read_bytes()
-        except OSError as error:
-            raise SceneError(
-                f"{path} cannot be read ({error.strerror}): restore the file."
-            ) from error
-        if suffix == ".bin":
-            _check_binary(path, data, count_parameters)
-        else:
-            _check_text(path, data, count_parameters)
-    for path in (folder / "rigs.bin", folder / "frames.bin"):  # optional, since COLMAP 3.12
-        if suffix == ".bin" and path.is_file():
-            _check_binary(path, path.read_bytes(), count_parameters)
+        check = _check_binary if suffix == ".bin" else _check_text
+        check(path, _read(path), count_parameters)
+    for path in (folder / f"rigs{suffix}", folder / f"frames{suffix}"):  # since COLMAP 3.12
+        if path.exists():  # pycolmap reads them, whatever they are
+            data = _read(path)
+            if suffix == ".bin":
+                _check_binary(path, data, count_parameters)
+
+
+def _read(path):
+    try:
+        return read_bytes(path, most=LARGEST_FILE)
+    except OSError as error:
+        raise SceneError(f"{path} cannot be read ({error.strerror}): restore the file.") from error
 
 
 def _check_binary(path, data, count_parameters):

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from jaxcloseup.files import read_bytes
 from jaxcloseup.scene import SceneError
 
 
@@ -13,11 +14,11 @@ def read_file(path: pathlib.Path) -> np.ndarray:
     """Read the bytes of an image file as uint8 `[N]`.
 
     Raises:
-      SceneError: the file is missing or cannot be read.
+      SceneError: the file is missing, cannot be read, or has more than 1 GiB.
     """
     try:
         # `cv2.imread` fails on non-ASCII paths on some systems; decoding from memory does not.
-        return np.fromfile(path, np.uint8)
+        return np.frombuffer(read_bytes(path), np.uint8)
     except OSError as error:
         raise SceneError(f"{path} cannot be read ({error.strerror}): restore the file.") from error
 

@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from jaxcloseup.files import read_bytes
 from jaxcloseup.scene import SceneError
 
 
+LARGEST_JSON = 2**26  # bytes; ten thousand frames take about 10 MiB
 _LARGEST = int(sys.float_info.max)  # JSON integers can exceed any float
 
 
@@ -67,6 +69,11 @@ def rigid_transform(label: str, key: str, value: Any) -> np.ndarray:
     return matrix
 
 
+def read_json(path: pathlib.Path) -> Any:
+    """Read a JSON file of at most `LARGEST_JSON` bytes; raises as `open` and `json.loads` do."""
+    return json.loads(read_bytes(path, most=LARGEST_JSON).decode("utf-8-sig"))
+
+
 def read_object(path: pathlib.Path, holds: str) -> dict[str, Any]:
     """Read the object in a JSON file.
 
@@ -78,7 +85,7 @@ def read_object(path: pathlib.Path, holds: str) -> dict[str, Any]:
       SceneError: the file cannot be read, or it does not hold a JSON object.
     """
     try:
-        fields = json.loads(path.read_text(encoding="utf-8-sig"))
+        fields = read_json(path)
     except OSError as error:
         raise SceneError(f"{path} cannot be read ({error.strerror}): restore the file.") from error
     except json.JSONDecodeError as error:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxcloseup.captures.frames import Frame
 from jaxcloseup.captures.json_fields import image_side, number, rigid_transform
 from jaxcloseup.captures.masks import list_photographs
+from jaxcloseup.files import check_file
 from jaxcloseup.scene import SceneError
 
 
@@ -26,8 +27,14 @@ def read_llff(file: pathlib.Path, photographs: pathlib.Path) -> tuple[dict[str, 
       SceneError: names the file and the row, and says what to do.
     """
     try:
-        rows = np.load(file, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+        check_file(file)
+    except OSError as error:
+        raise SceneError(f"{file} cannot be read ({error.strerror}): restore the file.") from error
+    try:
+        # Mapping compares the header's claims with the size of the file and allocates nothing.
+        with np.errstate(over="raise"):
+            rows = np.load(file, mmap_mode="r", allow_pickle=False)
+    except Exception as error:  # a damaged header can fail in any way
         raise SceneError(
             f"{file} is truncated or not a NumPy file of numbers: copy or export it again."
         ) from error

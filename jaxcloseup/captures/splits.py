@@ -1,7 +1,6 @@
 """Split the photographs of a capture into training and held-out ones."""
 
 import collections
-import json
 import pathlib
 import warnings
 from collections.abc import Callable, Sequence
@@ -12,6 +11,7 @@ import numpy as np
 from jaxcloseup.captures.depth_range import depths_in_view
 from jaxcloseup.captures.frames import Frame, frame_intrinsics
 from jaxcloseup.captures.images import read_image
+from jaxcloseup.captures.json_fields import read_json
 from jaxcloseup.scene import DuplicateFileWarning, SceneError, UnknownKeyWarning
 
 
@@ -62,7 +62,7 @@ def splits_from_file(
     if not file.is_file():
         return None
     try:
-        fields = json.loads(file.read_text(encoding="utf-8-sig"))
+        fields = read_json(file)
     except (OSError, ValueError, RecursionError) as error:
         raise SceneError(
             f"{file} is not readable as JSON ({error}): correct or remove it."
