@@ -3,9 +3,11 @@ import zlib
 
 import cv2
 import numpy as np
+import PIL.Image
 import pytest
 from tiny_capture import HEIGHT, PROPERTIES, WIDTH, vertices, write_image, write_ply
 
+from jaxcloseup.captures import images
 from jaxcloseup.captures.depth_range import near_far_from_cameras, near_far_from_points
 from jaxcloseup.captures.images import read_image
 from jaxcloseup.captures.points import read_ply_points
@@ -80,7 +82,25 @@ def test_a_header_with_a_huge_image_size(tmp_path):
     header = b"IHDR" + struct.pack(">II", 100_000, 100_000) + data[24:29]
     huge = data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:]
     (tmp_path / "a.png").write_bytes(huge)
-    with pytest.raises(SceneError, match=r"a\.png is too large to decode"):
+    with pytest.raises(SceneError, match=r"a\.png has more than 170 megapixels"):
+        read_image(tmp_path / "a.png")
+
+
+def test_small_files_of_many_pixels_are_refused_before_they_are_decoded(tmp_path, monkeypatch):
+    def refuse(*_):
+        pytest.fail("decoded")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(cv2, "imdecode", refuse)
+        patch.setattr(images, "MOST_PIXELS", WIDTH * HEIGHT - 1)
+        for suffix in (".png", ".jpg", ".bmp", ".tiff", ".webp"):
+            write_image(tmp_path / f"a{suffix}")
+            with pytest.raises(SceneError, match="megapixels and is too large to decode"):
+                read_image(tmp_path / f"a{suffix}")
+    monkeypatch.setattr(PIL.Image, "MAX_IMAGE_PIXELS", WIDTH * HEIGHT - 1)  # Pillow would warn
+    assert read_image(tmp_path / "a.png").shape == (HEIGHT, WIDTH, 3)
+    monkeypatch.setattr(PIL.Image, "MAX_IMAGE_PIXELS", 1)  # and raise
+    with pytest.raises(SceneError, match="megapixels and is too large to decode"):
         read_image(tmp_path / "a.png")
 
 

@@ -1,13 +1,22 @@
 """Decode, downscale and pad photographs and masks."""
 
+import io
+import math
 import pathlib
+import threading
+import warnings
 from collections.abc import Sequence
 
 import cv2
 import numpy as np
+import PIL.Image
 
 from jaxcloseup.files import read_bytes
 from jaxcloseup.scene import SceneError
+
+
+MOST_PIXELS = 170_000_000  # a file of 100 kB may claim a billion of them
+_filters = threading.Lock()  # filters of warnings belong to all threads
 
 
 def read_file(path: pathlib.Path) -> np.ndarray:
@@ -42,7 +51,8 @@ def read_image(
       data: bytes of the file, if already read.
 
     Raises:
-      SceneError: the file is missing, truncated, damaged or not an image of 8 or 16 bits.
+      SceneError: the file is missing, truncated, damaged, not an image of 8 or 16 bits, or has more
+        than `MOST_PIXELS`.
     """
     image, alpha = _decode(path, read_file(path) if data is None else data), None
     if image.ndim == 2:
@@ -80,15 +90,16 @@ def pad_images(images: Sequence[np.ndarray], height: int, width: int) -> np.ndar
 
 
 def _decode(path: pathlib.Path, data: np.ndarray) -> np.ndarray:
-    image, large = None, False
-    if data.size and not _is_truncated_jpeg(data.tobytes()):
+    image, large = None, _pixels(data) > MOST_PIXELS
+    if not large and data.size and not _is_truncated_jpeg(data.tobytes()):
         try:
             image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)  # ignores EXIF, keeps alpha and depth
         except cv2.error as error:
             large = "MAX_IMAGE" in str(error) or error.code == cv2.Error.StsNoMem
     if large:
         raise SceneError(
-            f"{path} is too large to decode, or its header is damaged: shrink or export it again."
+            f"{path} has more than {MOST_PIXELS / 10**6:g} megapixels and is too large to decode, "
+            "or its header is damaged: shrink or export it again."
         )
     if image is None:
         raise SceneError(
@@ -101,6 +112,20 @@ def _decode(path: pathlib.Path, data: np.ndarray) -> np.ndarray:
             f"{path} holds {image.dtype} values: export it with 8 or 16 bits per channel."
         )
     return image
+
+
+def _pixels(data: np.ndarray) -> float:
+    """Number of pixels that an image's header claims; 0 for formats that Pillow does not know."""
+    try:
+        # Pillow warns of many pixels too, and of fields that do not matter here.
+        with _filters, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with PIL.Image.open(io.BytesIO(data)) as image:
+                return math.prod(image.size)
+    except PIL.Image.DecompressionBombError:
+        return math.inf
+    except Exception:  # OpenCV tells what is wrong
+        return 0
 
 
 def _is_truncated_jpeg(data: bytes) -> bool:
