@@ -1,10 +1,13 @@
 """Flags of `experiments.run`: what they set, and one sentence for each that makes no sense."""
 
 import json
+import pathlib
 
+import numpy as np
 import pytest
 from absl import flags
 from absl.testing import flagsaver
+from tiny_capture import paper_capture, write_image
 from tiny_runs import TINY
 
 from experiments import run as program
@@ -12,6 +15,7 @@ from experiments import sweep
 from experiments.methods import METHODS
 from experiments.training import flags as training_flags
 from experiments.training.settings import plain_config, settings_of
+from jaxcloseup.scene import SceneError
 from jaxcloseup.splats.adaptive import AdaptiveConfig
 
 
@@ -58,15 +62,39 @@ def test_format_and_split_reach_the_capture(parsed_flags, capture_folder, capsys
     printed = capsys.readouterr().out
     assert "reading transforms_train.json" in printed and "every 8th of its" in printed
     assert set(training_flags.names_from_flags()) == {"method", "preset"}
-    with flagsaver.flagsaver(split="zoom", zoom=3):
+    with flagsaver.flagsaver(split="zoom", zoom=2):
         options = training_flags.load_options_from_flags(TINY)
-        assert training_flags.load(str(capture_folder), options).metadata["times_nearer"][0] == 3
-        assert training_flags.names_from_flags()["zoom"] == 3
+        assert training_flags.load(str(capture_folder), options).metadata["times_nearer"][0] == 2
+        assert training_flags.names_from_flags()["zoom"] == 2
     with (
         flagsaver.flagsaver(invert_masks=True, alpha_mode="mask"),
         pytest.raises(ValueError, match="no photograph has a mask to invert"),
     ):
         training_flags.load(str(capture_folder), training_flags.load_options_from_flags(TINY))
+
+
+def test_photographs_too_small_for_their_scores_are_refused(parsed_flags, tmp_path):
+    """The capture has 8 x 6 pixels, and the built-in scene 10 x 6."""
+    with pytest.raises(SceneError, match=r"8 x 6 pixels, but SSIM needs 11 .* --downscale"):
+        training_flags.load(str(paper_capture(tmp_path)), {})
+    write_image(tmp_path / "test/a.png", np.zeros((11, 10, 3), np.uint8))
+    for name in ("a", "b"):
+        write_image(tmp_path / f"train/{name}.png", np.zeros((40, 40, 3), np.uint8))
+    with pytest.raises(SceneError, match="10 x 11 pixels"):
+        training_flags.load(str(tmp_path), {})
+    write_image(tmp_path / "test/a.png", np.zeros((11, 11, 3), np.uint8))
+    assert training_flags.load(str(tmp_path), {}).name == tmp_path.name
+
+
+@pytest.mark.parametrize("scene", [".", "..", "../here/", "../here", "inside/.."])
+def test_results_stay_in_their_folder(tmp_path, monkeypatch, scene):
+    (tmp_path / "here" / "inside").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "here")
+    folder = training_flags.choose_output_dir(None, scene, "nerf")
+    name = (tmp_path if scene == ".." else tmp_path / "here").name
+    assert folder.parent == pathlib.Path("outputs", name, "nerf")
+    folder = training_flags.choose_output_dir(None, "table", "nerf")
+    assert folder.parent == pathlib.Path("outputs", "table", "nerf")
 
 
 def test_a_format_that_is_not_there_is_one_sentence(parsed_flags, capture_folder, tmp_path):

@@ -15,7 +15,8 @@ from experiments.training.settings import with_settings
 from jaxcloseup.captures.formats import FORMATS
 from jaxcloseup.captures.photo_reading import ALPHA_MODES
 from jaxcloseup.captures.splits import SPLITS
-from jaxcloseup.scene import Scene
+from jaxcloseup.metrics import SSIM_TAPS
+from jaxcloseup.scene import Scene, SceneError
 from jaxcloseup.scenes import load_scene
 
 
@@ -118,9 +119,17 @@ def load(name: str, options: Mapping[str, Any]) -> Scene:
     """A built-in scene or a capture; prints what was read of it.
 
     Raises:
-      SceneError: one sentence that says what to do.
+      SceneError: one sentence that says what to do, also of photographs too small for SSIM.
     """
     scene = load_scene(name, **options)
+    own = (scene.train.cameras.width, scene.train.cameras.height)
+    sizes = scene.metadata.get("sizes", {"train": [own]})
+    width, height = min((size for part in sizes.values() for size in part), key=min)
+    if min(width, height) < SSIM_TAPS:
+        raise SceneError(
+            f"{name}: a photograph has {width} x {height} pixels, but SSIM needs {SSIM_TAPS} a "
+            "side: choose a smaller --downscale or --zoom, or larger photographs."
+        )
     for note in scene.metadata.get("notes", ()):
         print(note)
     return scene
@@ -139,5 +148,6 @@ def choose_output_dir(
         return pathlib.Path(folder)
     if folder is None:
         stamp = datetime.datetime.now().strftime("%Y-%m-%d_%H%M%S")
-        folder = os.path.join("outputs", pathlib.Path(scene).name, method, stamp)
+        own_name = os.path.basename(os.path.realpath(scene))  # of `..` too
+        folder = os.path.join("outputs", own_name, method, stamp)
     return check_unused(folder)
