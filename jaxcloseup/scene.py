@@ -1,6 +1,7 @@
 """`Scene`, the record that every loader returns, with its errors and warnings."""
 
 import dataclasses
+import unicodedata
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -11,12 +12,33 @@ from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.photographs import Views
 
 
+def printable(text: str) -> str:
+    """Escape what a terminal would obey or that no file holds: names in files may say anything."""
+    return "".join(
+        character.encode("unicode_escape").decode() if is_control(character) else character
+        for character in text
+    )
+
+
+def is_control(character: str) -> bool:
+    """Whether a character controls, formats or breaks lines, or is half of another."""
+    return unicodedata.category(character) in ("Cc", "Cf", "Cs", "Zl", "Zp")
+
+
 class SceneError(ValueError):
-    """The scene cannot be loaded; the message is one sentence that says what to do."""
+    """The scene cannot be loaded; the message is one printable sentence that says what to do."""
+
+    def __init__(self, message: str):
+        """Escape what names from files bring into the message."""
+        super().__init__(printable(message))
 
 
 class SceneWarning(UserWarning):
     """The scene was loaded, but something in its files looks like a mistake."""
+
+    def __init__(self, message: str):
+        """Escape what names from files bring into the message."""
+        super().__init__(printable(message))
 
 
 class UnknownKeyWarning(SceneWarning):

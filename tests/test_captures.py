@@ -17,7 +17,12 @@ from tiny_capture import (
 )
 
 from jaxcloseup import scenes
-from jaxcloseup.scene import DuplicateFileWarning, ImageSizeWarning, NearFarWarning
+from jaxcloseup.scene import (
+    DuplicateFileWarning,
+    ImageSizeWarning,
+    NearFarWarning,
+    UnknownKeyWarning,
+)
 from jaxcloseup.scenes import SceneError, load_scene
 
 
@@ -222,6 +227,36 @@ def test_names_are_unique(tmp_path):
     with pytest.warns(DuplicateFileWarning, match=r"lists 1 photographs more than once: c0/x\.png"):
         names = load_scene(tmp_path).names["train"]
     assert names == ["c0_x", "c1_x", "c1_x_2", "c1_x_3", "c0_x_2"]
+
+
+def test_names_become_names_of_files(tmp_path):
+    """Long names are cut and stay apart; control characters reach neither terminals nor files."""
+    long = [f"{'ä' * 120}{i}.png" for i in range(2)]
+    listed = [*long, "a\n\x1b[31m.png", "b\udcff.png", "c\u202e.png", "写真 1.png"]
+    for name in listed:
+        write_image(tmp_path / name)
+    write_json(tmp_path / "transforms_train.json", [frame(name) for name in listed])
+    names = load_scene(tmp_path).names["train"]
+    assert names[2:] == ["a__[31m", "b_", "c_", "写真 1"] and names[0] != names[1]
+    assert all(name.startswith("ä" * 50) and len(name.encode()) <= 120 for name in names[:2])
+    write_json(tmp_path / "transforms_train.json", [frame(name) for name in listed[1:]])
+    assert load_scene(tmp_path).names["train"] == names[1:]
+
+
+def test_messages_hold_no_control_characters(tmp_path):
+    write_image(tmp_path / "a.png")
+    listed = "b\n\x1b[31m\udcff\u2028.png"
+    write_json(tmp_path / "transforms_train.json", [frame("a.png"), frame(listed)])
+    with pytest.raises(SceneError) as error:
+        load_scene(tmp_path)
+    assert r"(b\n\x1b[31m\udcff\u2028.png)" in str(error.value)
+    write_json(tmp_path / "transforms_train.json", [{**frame("a.png"), "\x1b]0;": 1}])
+    with pytest.warns(UnknownKeyWarning, match=r"ignored: \\x1b\]0;\."):
+        load_scene(tmp_path)
+    folder = tmp_path / "c\n"
+    single_file(folder, 10)
+    scene = load_scene(folder)
+    assert scene.name == r"c\n" and not any("\n" in note for note in scene.metadata["notes"])
 
 
 def test_points_come_with_the_capture(capture):

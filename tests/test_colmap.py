@@ -294,7 +294,7 @@ def test_closest_of_plush_are_nearer(shared, tmp_path):
     ratios = scene.metadata["times_nearer"]
     assert len(ratios) == 10 and min(ratios) > 1.5
     assert "test is the 10 nearest of 97 photographs, 1.9" in scene.metadata["notes"][1]
-    with pytest.raises(SceneError, match=r"closest needs points.*load the COLMAP model"):
+    with pytest.raises(SceneError, match=r"closest needs points.*COLMAP model \(--format=colmap\)"):
         load_scene(folder, split="closest")
     # A truncated file of the real model.
     shutil.copytree(folder / "sparse", tmp_path / "sparse", copy_function=shutil.copyfile)

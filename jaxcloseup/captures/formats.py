@@ -13,7 +13,7 @@ from jaxcloseup.captures.points import read_ply_points
 from jaxcloseup.captures.reduced_photos import attach_reduced
 from jaxcloseup.captures.splits import divide, splits_from_fields, splits_from_file, warn_duplicates
 from jaxcloseup.captures.transforms import read_transforms
-from jaxcloseup.scene import SceneError
+from jaxcloseup.scene import SceneError, printable
 
 
 FORMATS = ("transforms", "colmap", "llff")
@@ -111,7 +111,7 @@ def read_listing(
         frames=frames,
         points=points[keep],
         rgb=rgb[keep],
-        notes=tuple(notes),
+        notes=tuple(map(printable, notes)),
         times_nearer=division.times_nearer,
     )
 

@@ -19,7 +19,7 @@ from jaxcloseup.captures.splits import unique_names
 from jaxcloseup.captures.triangulation import triangulate
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.photographs import Views
-from jaxcloseup.scene import NearFarWarning, Scene, SceneError
+from jaxcloseup.scene import NearFarWarning, Scene, SceneError, printable
 
 
 _MIN_POINTS = 100  # fewer triangulated points say too little about where the scene is
@@ -99,7 +99,7 @@ def _load(listing: Listing, reading: Reading) -> Scene:
         metadata["corners"] = [photo.corner for photo in parts["test"]]
         names["test"] = [f"{name}_zoom{reading.zoom}" for name in names["test"]]
     return Scene(
-        name=listing.folder.resolve().name,
+        name=printable(listing.folder.resolve().name),
         train=views["train"],
         test=views.get("test"),
         test_far=views.get("test_far"),
@@ -160,7 +160,7 @@ def _with_points(
     )
     if len(points) < _MIN_POINTS:
         return listing
-    note = (
+    note = printable(
         f"{listing.folder.resolve().name} has no points: {len(points)} were triangulated from "
         f"features of its {count} training photographs"
     )

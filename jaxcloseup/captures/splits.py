@@ -1,6 +1,7 @@
 """Split the photographs of a capture into training and held-out ones."""
 
 import collections
+import hashlib
 import pathlib
 import warnings
 from collections.abc import Callable, Sequence
@@ -12,11 +13,12 @@ from jaxcloseup.captures.depth_range import depths_in_view
 from jaxcloseup.captures.frames import Frame, frame_intrinsics
 from jaxcloseup.captures.images import read_image
 from jaxcloseup.captures.json_fields import read_json
-from jaxcloseup.scene import DuplicateFileWarning, SceneError, UnknownKeyWarning
+from jaxcloseup.scene import DuplicateFileWarning, SceneError, UnknownKeyWarning, is_control
 
 
 TEST_EVERY = 8
 CLOSEST_SHARE = 0.1
+_LONGEST_NAME = 120  # bytes; files of renders add to it, and may have 255
 SPLITS = ("given", "every8", "closest", "zoom")
 _LISTS = {"train": "train_filenames", "test": "test_filenames", "test_far": "val_filenames"}
 _SPLIT_FILE_KEYS = {"train", "test", "test_far", "unused"}
@@ -127,17 +129,29 @@ def divide(
 
 
 def unique_names(files: Sequence[pathlib.Path]) -> list[str]:
-    """Name each file by its stem; prefix the folder's name, then number, where names clash."""
+    """Name each file by its stem; prefix the folder's name, then number, where names clash.
+
+    Names are of printable characters, and longer ones than `_LONGEST_NAME` end in a hash.
+    """
     stems = [file.stem for file in files]
     names = []
     for file, stem in zip(files, stems, strict=True):
-        name = base = stem if stems.count(stem) == 1 else f"{file.parent.name}_{stem}"
+        name = base = _name(stem if stems.count(stem) == 1 else f"{file.parent.name}_{stem}")
         repeat = 1
         while name in names:
             repeat += 1
             name = f"{base}_{repeat}"
         names.append(name)
     return names
+
+
+def _name(text: str) -> str:
+    plain = "".join("_" if is_control(character) else character for character in text)
+    data = plain.encode()
+    if len(data) <= _LONGEST_NAME:
+        return plain
+    digest = hashlib.sha256(data).hexdigest()[:8]
+    return f"{data[: _LONGEST_NAME - 9].decode(errors='ignore')}_{digest}"
 
 
 def warn_duplicates(folder: pathlib.Path, splits: dict[str, list[Frame]]) -> None:
@@ -175,8 +189,9 @@ def _closest(name: str, frames: Sequence[Frame], points: np.ndarray) -> Division
     sizes = [_size_of_pixel(frame, points) for frame in frames]
     if not np.isfinite(sizes).any():
         raise SceneError(
-            f"{name}: split closest needs points that the photographs see, and the capture has "
-            "none: load the COLMAP model, or give ply_file_path."
+            f"{name}: split closest needs points that the photographs see, and the capture lists "
+            "none: read its COLMAP model (--format=colmap), give ply_file_path, or choose "
+            "--split=zoom, which needs no points."
         )
     nearest = np.argsort(sizes, kind="stable")[: max(1, round(CLOSEST_SHARE * len(frames)))]
     held_out = sorted(nearest.tolist())
