@@ -33,13 +33,13 @@ def read_llff(file: pathlib.Path, photographs: pathlib.Path) -> tuple[dict[str, 
     try:
         # Mapping compares the header's claims with the size of the file and allocates nothing.
         with np.errstate(over="raise"):
-            rows = np.load(file, mmap_mode="r", allow_pickle=False)
+            rows = np.lib.format.open_memmap(file, mode="r")
     except Exception as error:  # a damaged header can fail in any way
         raise SceneError(
             f"{file} is truncated or not a NumPy file of numbers: copy or export it again."
         ) from error
-    if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
-        shape = " x ".join(map(str, getattr(rows, "shape", ()))) or "nothing"
+    if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
+        shape = " x ".join(map(str, rows.shape)) or "nothing"
         raise SceneError(
             f"{file} has shape {shape} instead of N x 17, one row per photograph: export it again."
         )
