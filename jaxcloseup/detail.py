@@ -26,7 +26,8 @@ from jaxcloseup.pyramids import Pyramid
 CONTRAST = 2.5
 TENTHS = 10
 _NEAREST, _FARTHEST = -1.0, 3.0  # log2 of how much finer views are than photographs can imitate
-_KNOTS = 12  # of the monotone curve, each with an equal share of the evidence
+FEATURES = 14  # that tell how far to trust a residual
+KNOTS = 12  # of the monotone curve, each with an equal share of the evidence
 _RIDGE = 1e-2
 FOLDS = 5
 
@@ -215,15 +216,15 @@ def _monotone(regressed, power, product):
     order = np.argsort(regressed, kind="stable")
     regressed, power, product = regressed[order], power[order], product[order]
     reached = np.cumsum(power)
-    knot = np.minimum((reached / max(reached[-1], 1e-12) * _KNOTS).astype(int), _KNOTS - 1)
-    mass, x, y = (np.bincount(knot, c, _KNOTS) for c in (power, power * regressed, product))
+    knot = np.minimum((reached / max(reached[-1], 1e-12) * KNOTS).astype(int), KNOTS - 1)
+    mass, x, y = (np.bincount(knot, c, KNOTS) for c in (power, power * regressed, product))
     known = mass > 0
     if not known.any():
-        return np.zeros(_KNOTS), np.zeros(_KNOTS)
+        return np.zeros(KNOTS), np.zeros(KNOTS)
     x, y = x[known] / mass[known], y[known] / mass[known]
     y = np.clip(isotonic_regression(y, weights=mass[known]).x, 0, 1)
     # Always as many knots, so that nothing recompiles.
-    at, index = np.linspace(0, len(x) - 1, _KNOTS), np.arange(len(x))
+    at, index = np.linspace(0, len(x) - 1, KNOTS), np.arange(len(x))
     return np.interp(at, index, x), np.interp(at, index, y)
 
 

@@ -2,6 +2,8 @@
 
 import dataclasses
 import functools
+import io
+import json
 from types import SimpleNamespace
 
 import jax
@@ -153,6 +155,46 @@ def test_detail_is_kept_with_its_state_and_made_again_for_another(rendered, foun
     path.write_bytes(path.read_bytes()[:100])
     find_detail(programs, other, path)
     assert len(made) == 2
+
+
+def test_damaged_detail_is_made_again(rendered, found, monkeypatch, capsys):
+    programs, state, path = rendered
+    path.unlink()
+    made = []
+    monkeypatch.setattr(training_detail, "make_detail", lambda *_: made.append(1) or found)
+    find_detail(programs, state, path)
+    whole = path.read_bytes()
+    assert "damaged" not in capsys.readouterr().out
+    with np.load(path) as kept:
+        arrays = dict(kept)
+    about = json.loads(str(arrays["about"]))
+
+    def changed(**changes):
+        file = io.BytesIO()
+        kept = {name: array for name, array in (arrays | changes).items() if array is not None}
+        np.savez(file, **kept)
+        return file.getvalue()
+
+    middle = len(whole) // 2
+    damages = [b"", whole[:100], whole[:-9], b"x" * 100]
+    damages += [whole[:middle] + bytes(9) + whole[middle + 9 :], changed(actual=None)]
+    damages += [changed(trust=arrays["trust"][:, 1:]), changed(values=arrays["values"] * 1.0)]
+    damages += [changed(coefficients=arrays["coefficients"][1:]), changed(about="{}")]
+    damages += [changed(about=json.dumps(about | {"sizes": [3]})), changed(other=np.zeros(3))]
+    damages += [changed(values=np.array([{}], object))]
+    for count, damaged in enumerate(damages, 2):
+        path.write_bytes(damaged)
+        again, _ = find_detail(programs, state, path)
+        assert len(made) == count and capsys.readouterr().out.count("is damaged") == 1
+        jax.tree.map(np.testing.assert_array_equal, again, found[0])
+    find_detail(programs, state, path)
+    assert len(made) == count
+    path.unlink()
+    path.mkdir()
+    find_detail(programs, state, path)
+    out = capsys.readouterr().out
+    assert len(made) == count + 1 and out.count("is damaged") == out.count("made again next") == 1
+    path.rmdir()
 
 
 def test_an_enlarged_render_stays_in_its_place():

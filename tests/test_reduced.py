@@ -1,5 +1,8 @@
 """Already shrunk photographs in `images_2`, and the cache of photographs shrunk here."""
 
+import hashlib
+import io
+
 import cv2
 import numpy as np
 import pytest
@@ -134,7 +137,7 @@ def test_the_cache_returns_what_was_made(capture, cache, decoded, options):
     assert first.metadata == again.metadata
 
 
-def test_damaged_cache_files_are_made_again(capture, cache, decoded):
+def test_damaged_cache_files_are_made_again(capture, cache, decoded, caplog):
     expected = load(capture, downscale=2)
     for path in sorted(cache.iterdir()):
         whole = path.read_bytes()
@@ -142,10 +145,18 @@ def test_damaged_cache_files_are_made_again(capture, cache, decoded):
         damages += [
             whole[:i] + bytes([whole[i] ^ 1]) + whole[i + 1 :] for i in range(0, len(whole), 97)
         ]
+        for arrays in ({"other": np.zeros(3)}, {"rgb0": np.zeros((3, 4)), "mask0": np.zeros(2)}):
+            file = io.BytesIO()
+            np.savez(file, **arrays)
+            damages.append(hashlib.sha256(file.getbuffer()).digest() + file.getvalue())
+        damages.append(hashlib.sha256(b"x").digest() + b"x")
         for damaged in damages:
             path.write_bytes(damaged)
             decoded.clear()
+            caplog.clear()
             found = load(capture, downscale=2)
+            assert [record.levelname for record in caplog.records] == ["WARNING"]
+            assert "is damaged" in caplog.text
             assert len(decoded) == 1 and path.read_bytes() == whole
             np.testing.assert_array_equal(found[0], expected[0])
             np.testing.assert_array_equal(found[1], expected[1])

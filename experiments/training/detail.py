@@ -21,7 +21,9 @@ from experiments.training.manifest import hash_data
 from experiments.training.programs import Programs, describe_photographs
 from experiments.training.residuals import Window, render_residuals, reproduced
 from jaxcloseup.detail import (
+    FEATURES,
     FOLDS,
+    KNOTS,
     TENTHS,
     Detail,
     Detailed,
@@ -34,7 +36,7 @@ from jaxcloseup.detail import (
     reliability,
 )
 from jaxcloseup.field import Rendering
-from jaxcloseup.files import write_file
+from jaxcloseup.files import read_bytes, write_file
 from jaxcloseup.gather import GatherSources, gather, gather_sources
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.label_rules import label_depth
@@ -46,6 +48,7 @@ from jaxcloseup.train import TrainState
 LEFT_OUT = 20  # photographs that teach the weights
 _RECIPE = 2  # a change of how detail is made raises it, so that kept detail is made again
 _TEXTS = ("key", "about")
+_LARGEST = 2**32  # bytes of a file that keeps detail
 
 _add = jax.jit(add_detail)
 
@@ -199,17 +202,43 @@ def _save(path, key, detail, about):
     write_file(path, file.getvalue())
 
 
+def _check(arrays, about, sizes, cameras):
+    """Raise unless a file holds what `_save` writes for these cameras."""
+    count, pixels = cameras.intrinsics.shape[0], sum(height * width for height, width in sizes)
+    depths = (count, cameras.height, cameras.width)
+    shapes = {
+        **{"values": (count, pixels, 3), "intrinsics": (count, len(sizes), 4)},
+        **{"inverse_depth": depths, "trust": depths, "finer": ()},
+        **{"coefficients": (FEATURES,), "regressed": (KNOTS,), "actual": (KNOTS,)},
+    }
+    expected = {name: (shape, np.dtype(np.float32)) for name, shape in shapes.items()}
+    expected["values"] = shapes["values"], np.dtype(np.int8)
+    if {name: (array.shape, array.dtype) for name, array in arrays.items()} != expected:
+        raise ValueError("other arrays")
+    if set(about) != {"divisor", "sizes", "reliability"}:
+        raise ValueError("another record")
+
+
 def _load(path, key, cameras):
-    """The kept detail and its record; None where there is none, or that of another state."""
+    """The kept detail and its record; None where there is none, or that of another state.
+
+    A damaged file is reported and counts as none.
+    """
     try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as kept:
+        data = io.BytesIO(read_bytes(path, most=_LARGEST))
+        with np.load(data, allow_pickle=False) as kept:
             if str(kept["key"]) != key:
                 return None
             about = json.loads(str(kept["about"]))
-            arrays = {name: jnp.asarray(kept[name]) for name in kept if name not in _TEXTS}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            arrays = {name: kept[name] for name in kept if name not in _TEXTS}
+        sizes = tuple((int(height), int(width)) for height, width in about["sizes"])
+        _check(arrays, about, sizes, cameras)
+    except FileNotFoundError:
         return None
-    sizes = tuple(map(tuple, about["sizes"]))
+    except Exception as error:  # damage can fail in any way
+        print(f"{path} is damaged ({type(error).__name__}): the detail is made again")
+        return None
+    arrays = {name: jnp.asarray(array) for name, array in arrays.items()}
     residuals = Pyramid(arrays["values"], arrays["intrinsics"], sizes)
     sources = GatherSources(cameras, arrays["inverse_depth"], arrays["trust"])
     weights = DetailWeights(*(arrays[name] for name in ("coefficients", "regressed", "actual")))

@@ -168,8 +168,8 @@ def _read_photo(
         # point that defaults to its middle never equals a given one.
         size = frame.size or (2**30, 2**30)
         key += frame_intrinsics(frame, *size, half_pixel=reading.half_pixel).tolist()
-    arrays = cached(repr(key), lambda: _pack(make()))
-    return _unpack(frame, arrays)
+    count = 2 if closeup else 1
+    return cached(repr(key), lambda: _pack(make()), functools.partial(_unpack, frame, count))
 
 
 @functools.cache
@@ -188,11 +188,14 @@ def _pack(photos: Sequence[Photo]) -> dict[str, np.ndarray]:
     }
 
 
-def _unpack(frame: Frame, arrays: dict[str, np.ndarray]) -> list[Photo]:
-    names = Photo._fields[1:]
+def _unpack(frame: Frame, count: int, arrays: dict[str, np.ndarray]) -> list[Photo]:
+    """The `count` photographs that `_pack` packed; raises for other arrays."""
     photos = []
-    for i in range(len(arrays) // len(names)):
-        rgb, mask, *pairs = (arrays[f"{name}{i}"] for name in names)
+    for i in range(count):
+        rgb, mask, *pairs = (arrays[f"{name}{i}"] for name in Photo._fields[1:])
+        images = rgb.dtype == mask.dtype == np.uint8 and rgb.shape == (*mask.shape, 3)
+        if not (images and mask.ndim == 2 and all(pair.shape == (2,) for pair in pairs)):
+            raise ValueError("other arrays")
         photos.append(Photo(frame, rgb, mask, *(tuple(pair.tolist()) for pair in pairs)))
     return photos
 
