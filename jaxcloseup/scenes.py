@@ -51,6 +51,9 @@ def load_scene(
     that neighboring training photographs share. `near` and `far` come from the file, or else are
     estimated; the loader warns unless it estimates them from a COLMAP model's points.
 
+    Everything is stored as float32. Lenses and positions that no scene has beside it are refused,
+    and absurdly far points are dropped with a warning (see `captures/scale.py` for the bounds).
+
     Args:
       name_or_path: one of `PROCEDURAL_SCENES`, or a folder; `./table` always names a folder.
       downscale: positive integer factor by which to shrink photographs, by averaging areas. For 2,

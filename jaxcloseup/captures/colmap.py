@@ -14,6 +14,7 @@ from jaxcloseup.captures.colmap_checks import check_files
 from jaxcloseup.captures.distortion import read_distortion
 from jaxcloseup.captures.frames import Frame, check_photographs
 from jaxcloseup.captures.json_fields import number
+from jaxcloseup.captures.scale import plausible
 from jaxcloseup.scene import SceneError
 
 
@@ -72,18 +73,22 @@ def read_colmap(
     images = [image for image in reconstruction.images.values() if image.has_pose]
     images.sort(key=lambda image: image.name)
     _check_names(source, [image.name for image in images])
+    table = model / f"points3D{suffix}"
     numbers = sorted(reconstruction.points3D)
-    rows = {point: row for row, point in enumerate(numbers)}
+    xyz = np.array([reconstruction.points3D[i].xyz for i in numbers], np.float64).reshape(-1, 3)
+    keep = plausible(table, xyz, np.stack([image.projection_center() for image in images]))
+    kept = [point for point, good in zip(numbers, keep, strict=True) if good]
+    known, rows = set(numbers), {point: row for row, point in enumerate(kept)}
     frames = []
     for image in images:
         world_to_camera = image.cam_from_world().matrix()
         rotation = world_to_camera[:, :3].T
         lens, size = lenses[image.camera_id]
         seen = {point.point3D_id for point in image.get_observation_points2D()}
-        if absent := seen - rows.keys():
+        if absent := seen - known:
             raise SceneError(
-                f"{source}: image {image.name!r} shows point {min(absent)}, which "
-                f"{model / f'points3D{suffix}'} lacks: export the model again."
+                f"{source}: image {image.name!r} shows point {min(absent)}, which {table} lacks: "
+                "export the model again."
             )
         frames.append(
             Frame(
@@ -95,14 +100,13 @@ def read_colmap(
                 size=size,
                 lens=(lens, {}),
                 distortion=read_distortion(f"{cameras}: camera {image.camera_id}", lens),
-                seen=np.array(sorted(rows[point] for point in seen), np.int64),
+                seen=np.array(sorted(rows[point] for point in seen & rows.keys()), np.int64),
             )
         )
     check_photographs(source, frames)
-    points = [reconstruction.points3D[i] for i in numbers]
-    xyz = np.array([point.xyz for point in points], np.float32).reshape(-1, 3)
-    rgb = np.array([point.color for point in points], np.float32).reshape(-1, 3) / 255
-    return source, frames, (xyz, rgb)
+    rgb = [reconstruction.points3D[i].color for i in kept]
+    rgb = np.array(rgb, np.float32).reshape(-1, 3) / 255
+    return source, frames, (xyz[keep].astype(np.float32), rgb)
 
 
 def _lens(file: pathlib.Path, camera: Any) -> tuple[dict[str, Any], tuple[int, int]]:

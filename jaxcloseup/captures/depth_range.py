@@ -68,14 +68,17 @@ def near_far_from_cameras(camtoworld: np.ndarray) -> tuple[float, float]:
     camera positions (or times 1 if that is 0).
     """
     axes, positions = camtoworld[:, :, 2], camtoworld[:, :, 3]
+    # Positions are stored as float32, which cannot tell smaller distances from 0.
+    smallest = np.finfo(np.float32).eps * float(np.abs(positions).max())
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # projects onto the image plane
     total = across.mean(0)
     # The smallest eigenvalue is about the mean squared sine of the angle between the axes.
     if np.linalg.eigvalsh(total)[0] > 1e-4:
         subject = np.linalg.solve(total, np.einsum("vij,vj->i", across, positions) / len(axes))
         depths = np.einsum("vi,vi->v", axes, subject - positions)
-        if (depths > 0).mean() > 0.5:
-            depths = depths[depths > 0]
+        if (depths > smallest).mean() > 0.5:
+            depths = depths[depths > smallest]
             return 0.1 * float(depths.min()), 4 * float(depths.max())
-    spread = float(np.linalg.norm(positions - positions.mean(0), axis=-1).max()) or 1.0
+    spread = float(np.linalg.norm(positions - positions.mean(0), axis=-1).max())
+    spread = spread if spread > smallest else 1.0
     return 0.1 * spread, 100 * spread

@@ -11,6 +11,7 @@ from jaxcloseup.captures.llff import read_llff
 from jaxcloseup.captures.masks import attach_masks
 from jaxcloseup.captures.points import read_ply_points
 from jaxcloseup.captures.reduced_photos import attach_reduced
+from jaxcloseup.captures.scale import check_positions, plausible
 from jaxcloseup.captures.splits import divide, splits_from_fields, splits_from_file, warn_duplicates
 from jaxcloseup.captures.transforms import read_transforms
 from jaxcloseup.scene import SceneError, printable
@@ -82,6 +83,7 @@ def read_listing(
     content = {"transforms": _read_transforms, "colmap": _read_model, "llff": _read_llff}[kind](
         folder, path / name
     )
+    check_positions(content.frames)
     scene = folder.resolve().name
     rejected = " or ".join(_describe(*other, path) for other in others)
     note = f"{scene}: reading {_describe(kind, name, path)}" + (
@@ -150,7 +152,7 @@ def _read_transforms(folder: pathlib.Path, file: pathlib.Path) -> _Content:
         fields = read["train"][0]
         given = {split: frames for split, (_, frames) in read.items()}
         frames = [frame for members in given.values() for frame in members]
-    return _Content(file, fields, frames, given, _read_ply(file, fields))
+    return _Content(file, fields, frames, given, _read_ply(file, fields, frames))
 
 
 def _read_model(folder: pathlib.Path, model: pathlib.Path) -> _Content:
@@ -160,10 +162,12 @@ def _read_model(folder: pathlib.Path, model: pathlib.Path) -> _Content:
 
 def _read_llff(folder: pathlib.Path, file: pathlib.Path) -> _Content:
     fields, frames = read_llff(file, folder / "images")
-    return _Content(file, fields, frames, None, _read_ply(file, fields))
+    return _Content(file, fields, frames, None, _read_ply(file, fields, frames))
 
 
-def _read_ply(file: pathlib.Path, fields: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+def _read_ply(
+    file: pathlib.Path, fields: dict[str, Any], frames: list[Frame]
+) -> tuple[np.ndarray, np.ndarray]:
     folder, named = file.parent, fields.get("ply_file_path")
     if named and not (folder / str(named)).is_file():
         raise SceneError(
@@ -171,7 +175,9 @@ def _read_ply(file: pathlib.Path, fields: dict[str, Any]) -> tuple[np.ndarray, n
         )
     ply = folder / str(named or "points3d.ply")
     if ply.is_file():
-        return read_ply_points(ply)
+        points, rgb = read_ply_points(ply)
+        keep = plausible(ply, points, np.stack([frame.camtoworld[:, 3] for frame in frames]))
+        return points[keep], rgb[keep]
     return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
 
 

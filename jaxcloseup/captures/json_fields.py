@@ -17,16 +17,28 @@ _LARGEST = int(sys.float_info.max)  # JSON integers can exceed any float
 
 
 def number(label: str, key: str, value: Any, *, above: float = -math.inf) -> float:
-    """Return `value` as a float; raise `SceneError` unless it is finite and exceeds `above`."""
+    """Return `value` as a float.
+
+    Raises:
+      SceneError: as float32, which stores it, the number is not finite or does not exceed `above`.
+    """
     if isinstance(value, int) and abs(value) > _LARGEST:
         raise SceneError(
             f"{label}: {key} has {len(str(value))} digits, too many for a number: correct it."
         )
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise SceneError(f"{label}: {key} must be a finite number, got {value!r}: correct it.")
-    if value <= above:
+    stored = _as_float32(float(value))
+    if not np.isfinite(stored):
+        raise SceneError(f"{label}: {key} is too large for 32 bits, {value:.3g}: correct it.")
+    if stored <= above:
         raise SceneError(f"{label}: {key} must be greater than {above:g}, got {value}: correct it.")
     return float(value)
+
+
+def _as_float32(value: float | np.ndarray) -> np.ndarray:
+    with np.errstate(over="ignore", under="ignore"):
+        return np.asarray(value).astype(np.float32)
 
 
 def image_side(label: str, key: str, value: Any) -> int:
@@ -45,8 +57,10 @@ def affine_transform(label: str, key: str, value: Any) -> np.ndarray:
         matrix = np.zeros(())
     if matrix.shape not in ((3, 4), (4, 4)):
         raise SceneError(f"{label}: {key} must be a 4x4 matrix of numbers: correct it.")
-    if not np.isfinite(matrix).all():
-        raise SceneError(f"{label}: {key} holds a value that is not finite: remove or correct it.")
+    if not np.isfinite(_as_float32(matrix)).all():
+        raise SceneError(
+            f"{label}: {key} holds a value that is not finite in 32 bits: remove or correct it."
+        )
     if len(matrix) == 4 and not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
         raise SceneError(
             f"{label}: {key} must end in the row 0, 0, 0, 1: correct it; it may be transposed."

@@ -15,6 +15,7 @@ from jaxcloseup.captures.images import pad_images
 from jaxcloseup.captures.json_fields import affine_transform, number
 from jaxcloseup.captures.photo_checks import check_sizes, check_weights
 from jaxcloseup.captures.photo_reading import Photo, Reading, read_photos
+from jaxcloseup.captures.scale import LENGTH, check_positions
 from jaxcloseup.captures.splits import unique_names
 from jaxcloseup.captures.triangulation import triangulate
 from jaxcloseup.geometry.cameras import Camera
@@ -74,6 +75,7 @@ def _load(listing: Listing, reading: Reading) -> Scene:
     if not len(listing.points):
         listing = _with_points(listing, parts["train"], camtoworld, intrinsics)
     near, far = _near_far(listing, camtoworld, intrinsics, sizes)
+    check_positions([photo.frame for photo in photos], far=far)
 
     width, height = sizes.max(0).tolist()
     ends = np.cumsum([len(members) for members in parts.values()])[:-1]
@@ -196,4 +198,9 @@ def _near_far(
             )
     if near >= far:
         raise SceneError(f"{label}: near {near:.4g} is not less than far {far:.4g}: correct them.")
+    if near < 1 / LENGTH or far > LENGTH:
+        raise SceneError(
+            f"{label}: near {near:.4g} and far {far:.4g} must lie between {1 / LENGTH:g} and "
+            f"{LENGTH:g}: correct them."
+        )
     return near, far

@@ -17,6 +17,7 @@ from jaxcloseup.captures.distortion import Remap, undistort, undistortion_map
 from jaxcloseup.captures.frames import Frame, frame_intrinsics
 from jaxcloseup.captures.images import downscale_image, read_file, read_image, read_mask
 from jaxcloseup.captures.photo_cache import cached, content_hash
+from jaxcloseup.captures.scale import check_lens
 from jaxcloseup.scene import SceneError
 
 
@@ -133,11 +134,15 @@ def _memory() -> int:
 def _resized_intrinsics(
     frame: Frame, stored: tuple[int, int], wanted: tuple[float, float], half_pixel: bool
 ) -> np.ndarray:
-    """Compute fx, fy, cx, cy for the photograph of size `stored` resized to `wanted`."""
+    """Compute fx, fy, cx, cy for the photograph of size `stored` resized to `wanted`.
+
+    Raises:
+      SceneError: no lens of such a photograph has these intrinsics.
+    """
     size = frame.size or stored
-    return frame_intrinsics(frame, *size, half_pixel=half_pixel) * np.tile(
-        np.divide(wanted, size), 2
-    )
+    intrinsics = frame_intrinsics(frame, *size, half_pixel=half_pixel)
+    check_lens(frame.label, intrinsics, *size)
+    return intrinsics * np.tile(np.divide(wanted, size), 2)
 
 
 def _one_at_a_time(function: Callable[..., Remap]) -> Callable[..., Remap]:

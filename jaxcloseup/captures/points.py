@@ -23,8 +23,9 @@ def read_ply_points(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
         vertices = read_vertices(path)
     except PlyError as error:
         raise SceneError(str(error)) from error
-    points = np.stack([vertices[axis] for axis in "xyz"], -1).astype(np.float32)
-    rgb = _colors(vertices)
+    with np.errstate(over="ignore"):  # too large for float32 becomes infinite
+        points = np.stack([vertices[axis] for axis in "xyz"], -1).astype(np.float32)
+        rgb = _colors(vertices)
     finite = np.isfinite(points).all(-1) & np.isfinite(rgb).all(-1)
     if not finite.all():
         count, dropped = len(vertices), (~finite).sum()

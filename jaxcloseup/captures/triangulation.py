@@ -88,7 +88,8 @@ def _neighbors(camtoworld: np.ndarray) -> Iterator[tuple[int, int]]:
     axes, positions = camtoworld[:, :, 2], camtoworld[:, :, 3]
     away = np.linalg.norm(positions[:, None] - positions, axis=-1)
     # Rotation in place shows no depth, and a view is not its own neighbor.
-    fit = (axes @ axes.T > _MIN_AXIS_COSINE) & (away > 1e-6 * away.max())
+    smallest = np.finfo(np.float32).eps * np.abs(positions).max()  # as positions are stored
+    fit = (axes @ axes.T > _MIN_AXIS_COSINE) & (away > max(1e-6 * away.max(), smallest))
     order = np.argsort(np.where(fit, away, np.inf), axis=1, kind="stable")[:, :_NEIGHBORS]
     pairs = {
         (min(i, j), max(i, j)) for i, row in enumerate(order.tolist()) for j in row if fit[i, j]

@@ -1,0 +1,85 @@
+"""Bounds on what a capture's numbers may be beside each other, since they are stored as float32.
+
+They are far beyond any lens and any scene. What exceeds them is a mistake in a file, or coordinates
+of a map whose origin is thousands of kilometers away.
+"""
+
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaxcloseup.captures.frames import Frame
+from jaxcloseup.scene import PointsWarning, SceneError
+
+
+FOCAL = (0.01, 1e4)  # focal length in multiples of the photograph's longer side
+CENTER = 100  # distance of the principal point from the middle, likewise
+LENGTH = 1e12  # any distance, and 1 / the smallest one: squares and cubes stay finite
+ORIGIN = 1e4  # distance of cameras from the origin, in multiples of the scene's size
+STRAY = 1e5  # distance of points from the cameras, in multiples of what is usual
+
+
+def check_lens(label: str, intrinsics: np.ndarray, width: int, height: int) -> None:
+    """Raise unless fx, fy, cx, cy `[4]`, in pixels, fit a photograph of this size."""
+    side, (low, high) = max(width, height), FOCAL
+    for focal in intrinsics[:2]:
+        if not low * side <= focal <= high * side:
+            raise SceneError(
+                f"{label}: a focal length of {focal:.4g} pixels is not between {low:g} and "
+                f"{high:g} times the longer side of {width} x {height} pixels: correct it."
+            )
+    x, y = intrinsics[2:]
+    if max(abs(x - width / 2), abs(y - height / 2)) > CENTER * side:
+        raise SceneError(
+            f"{label}: the principal point {x:.4g}, {y:.4g} lies more than {CENTER} times the "
+            f"longer side outside {width} x {height} pixels: correct cx and cy."
+        )
+
+
+def check_positions(frames: Sequence[Frame], *, far: float = np.inf) -> None:
+    """Raise if float32 cannot tell a camera's position from others so far from the origin.
+
+    Args:
+      frames: photographs of the capture.
+      far: upper bound of z-depth, which is as large as the scene; infinity checks `LENGTH` alone.
+    """
+    positions = np.stack([frame.camtoworld[:, 3] for frame in frames])
+    away = np.abs(positions).max(-1)
+    size = max(far, np.median(np.abs(positions - np.median(positions, 0)).max(-1)))
+    worst = int(np.argmax(away))
+    if not away[worst] <= min(LENGTH, ORIGIN * size):
+        beside = f" of a scene {size:.3g} large" if ORIGIN * size < LENGTH else ""
+        raise SceneError(
+            f"{frames[worst].label}: its camera lies {away[worst]:.3g} from the origin{beside}, "
+            "too far for numbers of 32 bits: correct its pose, or shift the origin to the cameras."
+        )
+
+
+def plausible(label: object, points: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """Whether points are finite as float32 and not absurdly far away; warns of those that are not.
+
+    Points are too far at `STRAY` times the cameras' spread, or their own median distance if that is
+    larger, so that cameras at one place keep their points.
+
+    Args:
+      label: what holds the points.
+      points: `[P, 3]` world points, P may be 0.
+      positions: `[V, 3]` positions of cameras.
+
+    Returns:
+      `[P]` bool.
+    """
+    center = np.median(positions, 0)
+    finite = (np.abs(points) <= np.finfo(np.float32).max).all(-1)
+    away = np.abs(np.where(finite[:, None], points, 0) - center).max(-1)
+    usual = np.median(away[finite]) if finite.any() else 0.0
+    keep = finite & (away <= STRAY * max(usual, np.abs(positions - center).max()))
+    if not keep.all():
+        warnings.warn(
+            f"{label}: {np.sum(~keep)} of {len(keep)} points are not finite, or {STRAY:g} times "
+            "farther from the cameras than is usual, and were dropped.",
+            PointsWarning,
+            stacklevel=2,
+        )
+    return keep
