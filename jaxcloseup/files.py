@@ -35,7 +35,7 @@ def check_file(path: str | pathlib.Path, *, most: int = LARGEST) -> None:
     if not stat.S_ISREG(held.st_mode):
         raise OSError(errno.EINVAL, "Not an ordinary file", str(path))
     if held.st_size > most:
-        raise OSError(errno.EFBIG, f"More than {most / 2**20:.3g} MiB", str(path))
+        raise OSError(errno.EFBIG, f"More than {most / 2**20:g} MiB", str(path))
 
 
 def read_bytes(path: str | pathlib.Path, *, most: int = LARGEST) -> bytes:

@@ -49,7 +49,7 @@ def with_mask(folder):
     write_json(folder / "transforms_train.json", frames)
 
 
-PIPE, LARGE = "Not an ordinary file", "More than"
+PIPE, LARGE = "Not an ordinary file", r"More than (64|1024|4096) MiB"
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ def test_devices_folders_and_large_files(tmp_path):
         check_file(tmp_path)
     (tmp_path / "a").write_bytes(b"12345")
     assert read_bytes(tmp_path / "a", most=5) == b"12345"
-    with pytest.raises(OSError, match=LARGE):
+    with pytest.raises(OSError, match=r"More than 3\.8147e-06 MiB"):
         read_bytes(tmp_path / "a", most=4)
 
 
