@@ -1,7 +1,10 @@
 """Flags of `experiments.run`: what they set, and one sentence for each that makes no sense."""
 
 import json
+import os
 import pathlib
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -10,6 +13,7 @@ from absl.testing import flagsaver
 from tiny_capture import paper_capture, write_image
 from tiny_runs import TINY
 
+from experiments import __main__ as command
 from experiments import run as program
 from experiments import sweep
 from experiments.methods import METHODS
@@ -33,6 +37,34 @@ def test_help_lists_the_flags_that_programs_share():
     for module in (program, sweep):
         assert shared <= {flag.name for flag in keys[module.__name__]}
     assert "preset" in shared
+
+
+def test_the_command_knows_all_programs(monkeypatch, capsys):
+    folder = pathlib.Path(command.__file__).parent
+    others = {"command_line"}
+    found = {path.stem for path in folder.glob("[a-z]*.py")} - others
+    assert set(command.PROGRAMS) == found
+    for words in ([], ["--help"]):
+        monkeypatch.setattr("sys.argv", ["jaxcloseup", *words])
+        command.main()
+        said = capsys.readouterr().out
+        assert all(f"  {name} " in said for name in found)
+    monkeypatch.setattr("sys.argv", ["jaxcloseup", "train"])
+    with pytest.raises(SystemExit, match="jaxcloseup: train is not a program: choose run, sweep"):
+        command.main()
+
+
+def test_the_command_runs_a_program_from_any_folder(tmp_path):
+    root = pathlib.Path(command.__file__).parents[1]
+    done = subprocess.run(
+        [sys.executable, "-m", "experiments", "evaluate", "--help"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(root)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "Score a folder of rendered images" in done.stdout and "--renders" in done.stdout
 
 
 def test_nothing_to_resume_is_one_sentence(parsed_flags, tmp_path):

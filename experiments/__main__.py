@@ -1,0 +1,39 @@
+"""The command `jaxcloseup`: its first word names a program, and the rest are the program's flags.
+
+    jaxcloseup run --scene=table
+
+is `python -m experiments.run --scene=table`, from any folder.
+"""
+
+import runpy
+import sys
+
+
+PROGRAMS = {
+    "run": "train on one scene, fine-tune on pseudo-labeled close-ups, evaluate, report",
+    "sweep": "the same for several arms, seeds and scenes, and compare them",
+    "render": "render a camera path of a run, or fine-tune for target cameras",
+    "view": "look at a run in a browser, and choose close-ups there",
+    "evaluate": "score a folder of images against another",
+    "bench": "measure speed and quality",
+}
+
+
+def main() -> None:
+    """Run the program that the command line names."""
+    name, *rest = sys.argv[1:] or ["--help"]
+    if name in ("-h", "--help", "help"):
+        width = max(map(len, PROGRAMS))
+        print(
+            "usage: jaxcloseup PROGRAM [--flag=value ...]; `jaxcloseup PROGRAM --help` has flags\n"
+        )
+        print("\n".join(f"  {program:{width}}  {what}" for program, what in PROGRAMS.items()))
+        return
+    if name not in PROGRAMS:
+        sys.exit(f"jaxcloseup: {name} is not a program: choose {', '.join(PROGRAMS)}")
+    sys.argv[1:] = rest
+    runpy.run_module(f"experiments.{name}", run_name="__main__", alter_sys=True)
+
+
+if __name__ == "__main__":
+    main()
