@@ -14,9 +14,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
+import numpy as np
 from absl import app, flags
 
 from experiments.command_line import make_output_dir, set_up
+from experiments.evaluation.metrics_text import FINER
 from experiments.evaluation.scores import NO_PERCEPTUAL, Perceptual, find_perceptual
 from experiments.methods import Preset
 from experiments.reporting.report import print_results
@@ -32,8 +34,9 @@ from experiments.training.manifest import (
 )
 from experiments.training.programs import Programs
 from experiments.training.settings import plain_config
-from experiments.training.setup import Training, identity_of, timed_compiling
-from experiments.training.stages import STAGES, run_stages
+from experiments.training.setup import Training, identity_of, timed, timed_compiling
+from experiments.training.stages import STAGES, Outcome, run_stages
+from experiments.viewing.approach import approach
 from jaxcloseup.artifacts.checkpoints import CheckpointError, Checkpoints
 from jaxcloseup.scene import Scene, SceneError
 
@@ -98,10 +101,21 @@ def run(
     write_dataparser_transforms(output_dir, scene)
     with timed_compiling(training.seconds):
         outcome = run_stages(training, seed, output_dir, to_run=to_run, perceptual=perceptual)
-    results = report_run(output_dir, training, outcome, about)
+    results = report_run(output_dir, training, outcome, about, dolly=_dolly(training, outcome))
     print(f"compiling took {training.seconds['compile']:.0f} s of the run")
     write_manifest(output_dir, manifest, training.seconds)
     return results
+
+
+def _dolly(training: Training, outcome: Outcome) -> list[np.ndarray]:
+    """Frames of a camera that comes near, for the report; none without close-ups."""
+    targets = outcome.held_out.targets
+    views = targets.get(f"test{FINER}") or targets.get("test")
+    if not views:
+        return []
+    with timed(training.seconds, "dolly"):
+        far = training.programs.scene.far
+        return approach(views, outcome.start.sources, outcome.render, far=far)
 
 
 def main(argv: list[str]) -> None:

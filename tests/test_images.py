@@ -1,9 +1,11 @@
 import base64
+import io
 import re
 
 import cv2
 import jax.numpy as jnp
 import numpy as np
+import PIL.Image
 import pytest
 
 from jaxcloseup.artifacts.images import (
@@ -11,6 +13,7 @@ from jaxcloseup.artifacts.images import (
     colorize_error,
     colorize_normals,
     colorize_support,
+    encode_webp_animation,
     side_by_side,
     to_uint8,
     webp_data_uri,
@@ -80,6 +83,17 @@ def test_webp_data_uri():
     difference = np.abs(decoded[..., ::-1].astype(int) - image)  # OpenCV stores blue first
     assert difference.mean() < 3
     assert len(webp_data_uri(image, quality=10)) < len(address)
+
+
+def test_webp_animation():
+    frames = [np.full((20, 30, 3), (40 * i, 100, 200), np.uint8) for i in range(5)]
+    data = encode_webp_animation(frames, fps=10)
+    with PIL.Image.open(io.BytesIO(data)) as shown:
+        assert (shown.n_frames, shown.size, shown.info["loop"]) == (5, (30, 20), 0)
+        for i in range(5):
+            shown.seek(i)
+            assert shown.info["duration"] == 100
+            assert np.abs(np.asarray(shown.convert("RGB"), int) - frames[i]).max() < 12
 
 
 def test_colorize_depth():

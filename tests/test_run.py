@@ -1,4 +1,6 @@
+import base64
 import dataclasses
+import io
 import json
 import re
 
@@ -6,6 +8,7 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
+import PIL.Image
 import plane
 import pytest
 from tiny_runs import TINY, TINY_SURFELS
@@ -21,6 +24,7 @@ from experiments.training.loop import TrainingError, run_stage
 from experiments.training.programs import Programs
 from experiments.training.setup import initial_points
 from experiments.training.stored_run import choose_stage, load_run_scene, read_run, restore
+from experiments.viewing.approach import FRAMES
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.artifacts.images import to_uint8
 from jaxcloseup.artifacts.surfel_ply import read_surfels
@@ -207,6 +211,11 @@ def test_a_run_leaves_pictures_and_a_page_without_links(finished):
     assert "src='data:image/webp" in page
     assert page.index("Close-ups have a PSNR") < page.index("type=range") < page.index("<table")
     assert len(page) < 3e6
+    animation = (output_dir / "dolly.webp").read_bytes()
+    assert base64.b64encode(animation).decode() in page
+    with PIL.Image.open(io.BytesIO(animation)) as shown:
+        assert shown.size == (plane.WIDTH, plane.HEIGHT)
+        assert shown.n_frames == 2 * FRAMES - 2  # there and back
     # SVG names its namespaces by addresses, which nobody follows.
     links = re.findall(r"(?:src|href)=['\"]([^'\"]*)", page)
     assert links

@@ -1,5 +1,6 @@
 """The report of a run: tables for the terminal, and one self-contained page, pictures first."""
 
+import base64
 import html
 import json
 import pathlib
@@ -69,6 +70,8 @@ def write_report(
     results: Mapping[str, Any],
     shown: Sequence[Exhibit],
     pictures: Sequence[Picture],
+    *,
+    dolly: bytes = b"",
 ) -> None:
     """Write the page, which needs no other file.
 
@@ -77,6 +80,7 @@ def write_report(
       results: what `results.json` holds.
       shown: close-ups to begin with.
       pictures: further pictures, grouped by section.
+      dolly: a WebP of a camera that comes near; empty: none.
     """
     size, finer = (results[key] for key in ("resolution", "finer_resolution"))
     sizes = f"{size[0]} x {size[1]} pixels" + (f" and {finer[0]} x {finer[1]}" if finer else "")
@@ -87,6 +91,7 @@ def write_report(
         f"{html.escape(results['preset'])}, seed {results['seed']}; held-out views are scored at "
         f"{sizes}, on 8-bit images.</p>",
         *_exhibition(shown, list(results["stages"])[-1]),
+        *_moving(dolly),
         "<h2>Scores</h2>",
         "<div class=tables>",
         *(
@@ -111,6 +116,14 @@ def write_report(
     config = html.escape(json.dumps({k: results[k] for k in ("config", "versions")}, indent=1))
     parts += folded("Configuration", [f"<pre>{config}</pre>", "</html>"])
     write_file(path, "\n".join(parts).encode())
+
+
+def _moving(dolly):
+    if not dolly:
+        return []
+    text = "from where a photograph was taken towards what a close-up shows, and back"
+    source = f"data:image/webp;base64,{base64.b64encode(dolly).decode()}"
+    return [f"<figure><img alt='{text}' src='{source}'><figcaption>{text}</figcaption></figure>"]
 
 
 def _exhibition(shown, stage):

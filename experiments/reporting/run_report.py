@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
+import numpy as np
 
 from experiments.evaluation.metrics_text import FINER
 from experiments.evaluation.scores import Target
@@ -14,20 +15,33 @@ from experiments.reporting.showcase import Exhibit, exhibits
 from experiments.training.programs import Programs
 from experiments.training.setup import Training, timed
 from experiments.training.stages import Outcome
-from jaxcloseup.files import write_json
+from jaxcloseup.artifacts.images import encode_webp_animation
+from jaxcloseup.files import write_file, write_json
 from jaxcloseup.label_rules import label_depth
 
 
+_FPS = 12
+
+
 def report_run(
-    output_dir: pathlib.Path, training: Training, outcome: Outcome, about: Mapping[str, Any]
+    output_dir: pathlib.Path,
+    training: Training,
+    outcome: Outcome,
+    about: Mapping[str, Any],
+    *,
+    dolly: Sequence[np.ndarray] = (),
 ) -> dict[str, Any]:
-    """Write `results.json`, `compare/`, `labels/` and `report.html`; return the results.
+    """Write `results.json`, `dolly.webp`, `compare/`, `labels/` and `report.html`.
 
     Args:
       output_dir: folder of the run.
       training: the training, with the seconds and the history of its stages.
       outcome: what the stages produced.
       about: "method", "preset", "seed", "config" and "versions".
+      dolly: frames, uint8 `[H, W, 3]`, of a camera that comes near.
+
+    Returns:
+      What `results.json` holds.
     """
     programs, scene = training.programs, training.programs.scene
     with timed(training.seconds, "report"):
@@ -59,7 +73,12 @@ def report_run(
         "history": training.history,
     }
     write_json(output_dir / "results.json", results)
-    write_report(output_dir / "report.html", results, _showcase(programs, outcome), pictures)
+    moving = b""
+    if dolly:
+        moving = encode_webp_animation([*dolly, *dolly[-2:0:-1]], fps=_FPS)  # there and back
+        write_file(output_dir / "dolly.webp", moving)
+    shown = _showcase(programs, outcome)
+    write_report(output_dir / "report.html", results, shown, pictures, dolly=moving)
     return results
 
 

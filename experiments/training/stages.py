@@ -2,7 +2,7 @@
 
 import functools
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -24,6 +24,8 @@ from experiments.training.setup import (
     start_labels,
     timed,
 )
+from jaxcloseup.field import Rendering
+from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.label_rules import label_depth
 from jaxcloseup.photographs import Views
 from jaxcloseup.pseudo import LabelSources, PseudoSettings, label_sources
@@ -46,6 +48,7 @@ class Outcome(NamedTuple):
       audit: labels against the truth, by the depth they are made from; empty on captures.
       left_out: `error_curve` of labels of left-out photographs.
       detail: what `find_detail` says of the stage that got detail, with its `stage`; None without.
+      render: `camera -> Rendering` as the last stage renders.
     """
 
     start: LabelStart
@@ -57,6 +60,7 @@ class Outcome(NamedTuple):
     audit: Mapping[str, Any]
     left_out: Mapping[str, Any] | None
     detail: Mapping[str, Any] | None
+    render: Callable[[Camera], Rendering]
 
 
 def run_stages(
@@ -129,21 +133,21 @@ def run_stages(
         steps = programs.method.target_steps(preset.field, len(scene.test))
         names = "test_time", "test_time_control"
         fine_tune(*names, "target_views", labels, settings, steps=steps)
-    detail = None
+    detail, render = None, functools.partial(programs.render, latest[1])
     if "detail" in to_run:
-        detail = add_detail_stage(training, scorer, output_dir, *latest)
+        detail, render = add_detail_stage(training, scorer, output_dir, *latest)
     with timed(training.seconds, "audit"):
         audit, left_out = audit_all(programs, start, held_out.exact, settings, seed)
     return Outcome(
         *(start, settings, gate, held_out, scorer.scores, scorer.images),
-        *(audit, left_out, detail),
+        *(audit, left_out, detail, render),
     )
 
 
 def add_detail_stage(
     training: Training, scorer: Scorer, output_dir: pathlib.Path, stage: str, state: TrainState
-) -> dict[str, Any]:
-    """Score the renders of a stage again with the detail of the photographs; return its record."""
+) -> tuple[dict[str, Any], Callable[[Camera], Rendering]]:
+    """Score the renders of a stage again with the photographs' detail; its record, and them."""
     programs = training.programs
     with timed(training.seconds, "detail"):
         detail, about = find_detail(programs, state, detail_path(output_dir, stage))
@@ -153,7 +157,7 @@ def add_detail_stage(
         return rendering._replace(rgb=detailed(programs, detail, camera, rendering).rgb)
 
     scorer.score("detail", state, render)
-    return {"stage": stage, **about}
+    return {"stage": stage, **about}, render
 
 
 def closeup_labels(

@@ -59,6 +59,21 @@ def webp_data_uri(image: Image, *, quality: int = 90) -> str:
     return "data:image/webp;base64," + base64.b64encode(data.tobytes()).decode()
 
 
+def encode_webp_animation(frames: Sequence[Image], *, fps: float, quality: int = 80) -> bytes:
+    """Encode frames of one size as the bytes of a WebP that plays for ever.
+
+    Args:
+      frames: at least one image.
+      fps: frames per second.
+      quality: WebP's, 1 to 100.
+    """
+    animation = cv2.Animation()
+    animation.frames = [np.ascontiguousarray(to_uint8(frame)[..., ::-1]) for frame in frames]
+    animation.durations = np.full(len(frames), round(1000 / fps), np.int32)
+    options = [cv2.IMWRITE_WEBP_QUALITY, quality]
+    return cv2.imencodeanimation(".webp", animation, options)[1].tobytes()
+
+
 def colorize_depth(
     depth: Image,
     *,
