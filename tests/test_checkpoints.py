@@ -1,7 +1,9 @@
 """Checkpoints: saved states load exactly, partial ones are ignored, other runs are refused."""
 
 import contextlib
+import json
 import resource
+import shutil
 
 import jax
 import jax.numpy as jnp
@@ -100,3 +102,57 @@ def test_a_state_of_another_structure_is_refused(tmp_path):
     checkpoints.save("baseline", 3, state(3), {})
     with pytest.raises(CheckpointError, match="does not hold this run's state"):
         checkpoints.load("baseline", {"step": jnp.int32(0)})
+
+
+def noise(value):
+    return {"noise": jax.random.normal(jax.random.key(value), (100_000,))}
+
+
+def overwrite(folder):
+    """Eight bytes in the middle of the largest file."""
+    file = max(
+        (path for path in folder.rglob("*") if path.is_file()), key=lambda p: p.stat().st_size
+    )
+    data = bytearray(file.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 8] = b"\xff" * 8
+    file.write_bytes(data)
+
+
+def test_a_damaged_state_is_refused_and_an_earlier_one_loads(tmp_path):
+    checkpoints = Checkpoints(tmp_path, RUN)
+    for step in (2, 4):
+        checkpoints.save("baseline", step, noise(step), {})
+    overwrite(tmp_path / "baseline" / "4")
+    with pytest.raises(
+        CheckpointError, match=r"baseline/4 .*: remove it to resume from an earlier"
+    ):
+        Checkpoints(tmp_path, RUN).load("baseline", noise(0))
+    shutil.rmtree(tmp_path / "baseline" / "4")
+    step, found, progress = Checkpoints(tmp_path, RUN).load("baseline", noise(0))
+    assert step == 2 and progress == {}
+    np.testing.assert_array_equal(found["noise"], noise(2)["noise"])
+
+
+@pytest.mark.parametrize("change", [{"growth": 8}, {"crc32": 3}])
+def test_edited_progress_is_refused(tmp_path, change):
+    Checkpoints(tmp_path, RUN).save("baseline", 2, state(2), {"growth": 1})
+    file = tmp_path / "baseline" / "2" / "progress" / "metadata"
+    file.write_text(json.dumps(json.loads(file.read_text()) | change))
+    with pytest.raises(CheckpointError, match="its files were changed or damaged"):
+        Checkpoints(tmp_path, RUN).load("baseline", state(0))
+
+
+def test_a_checkpoint_without_a_checksum_loads(tmp_path):
+    Checkpoints(tmp_path, RUN).save("baseline", 2, state(2), {"growth": 1})
+    file = tmp_path / "baseline" / "2" / "progress" / "metadata"
+    file.write_text(json.dumps({"growth": 1}))
+    step, _, progress = Checkpoints(tmp_path, RUN).load("baseline", state(0))
+    assert step == 2 and progress == {"growth": 1}
+
+
+def test_a_state_that_is_not_finite_is_refused(tmp_path):
+    bad = noise(0)["noise"].at[7].set(jnp.nan)
+    Checkpoints(tmp_path, RUN).save("baseline", 2, {"noise": bad}, {})
+    with pytest.raises(CheckpointError, match=r"'noise'.* is not finite"):
+        Checkpoints(tmp_path, RUN).load("baseline", noise(0))

@@ -2,18 +2,25 @@
 
 Orbax writes to a temporary folder and renames it, so a crash never leaves half a checkpoint. With
 several hosts, the first one writes and all read; each host holds the whole state.
+
+A checksum beside each state reveals damage; checkpoints of earlier versions have none.
 """
 
 import json
 import pathlib
+import zlib
 from collections.abc import Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import orbax.checkpoint as ocp
 
 from jaxcloseup.files import write_file
+
+
+_CHECKSUM = "crc32"  # entry of the progress item
 
 
 class CheckpointError(Exception):
@@ -69,8 +76,10 @@ class Checkpoints:
         """
         if jax.process_index() > 0:
             return
+        plain = _plain(state)
+        marked = {**progress, _CHECKSUM: _checksum(plain, progress)}
         items = ocp.args.Composite(
-            state=ocp.args.StandardSave(_plain(state)), progress=ocp.args.JsonSave(dict(progress))
+            state=ocp.args.StandardSave(plain), progress=ocp.args.JsonSave(marked)
         )
         try:
             self._manager(stage).save(step, args=items, force=True)
@@ -92,7 +101,8 @@ class Checkpoints:
           stored_as: names of fields in `like` whose checkpoint has other names, to these.
 
         Raises:
-          CheckpointError: the checkpoint cannot be read, or its state differs from `like`.
+          CheckpointError: the checkpoint cannot be read, its bytes were changed, or its state
+            differs from `like` or is not finite.
         """
         manager = self._manager(stage)
         step = manager.latest_step()
@@ -110,7 +120,8 @@ class Checkpoints:
                 plain = jax.tree_util.tree_map_with_path(
                     lambda path, _: _follow(found["state"], path, stored_as), like
                 )
-        except (ValueError, KeyError, OSError) as error:
+            progress = _checked(plain, found["progress"])
+        except (ValueError, KeyError, TypeError, OSError) as error:
             raise CheckpointError(
                 f"{self.folder / stage / str(step)} does not hold this run's state "
                 f"({str(error).splitlines()[0]}): remove it to resume from an earlier one."
@@ -120,7 +131,7 @@ class Checkpoints:
             plain,
             like,
         )
-        return step, state, found["progress"]
+        return step, state, progress
 
     def _manager(self, stage):
         if stage not in self._managers:
@@ -158,6 +169,27 @@ def _plain(state):
     return jax.device_get(
         jax.tree.map(lambda leaf: jax.random.key_data(leaf) if _is_key(leaf) else leaf, state)
     )
+
+
+def _checked(plain, marked):
+    """The progress without its checksum; a ValueError if the state is not what was saved."""
+    if not isinstance(marked, dict):
+        raise ValueError("its progress is not an object")
+    progress = {name: value for name, value in marked.items() if name != _CHECKSUM}
+    if marked.get(_CHECKSUM, found := _checksum(plain, progress)) != found:
+        raise ValueError("its files were changed or damaged after they were written")
+    for path, leaf in jax.tree_util.tree_leaves_with_path(plain):
+        if jnp.issubdtype(leaf.dtype, jnp.inexact) and not np.isfinite(leaf).all():
+            raise ValueError(f"{jax.tree_util.keystr(path)} is not finite")
+    return progress
+
+
+def _checksum(plain, progress):
+    """CRC-32 of the arrays' bytes and the progress: fast, and no change of few bytes escapes it."""
+    value = zlib.crc32(json.dumps(progress, sort_keys=True).encode())
+    for leaf in jax.tree.leaves(plain):
+        value = zlib.crc32(np.ascontiguousarray(leaf).reshape(-1).view(np.uint8), value)
+    return value
 
 
 def _follow(tree, path, stored_as):
