@@ -36,7 +36,6 @@ from experiments.viewing.frames import render_shots
 from jaxcloseup.artifacts.checkpoints import CheckpointError
 from jaxcloseup.artifacts.video import write_video
 from jaxcloseup.label_rules import label_depth
-from jaxcloseup.photographs import camera_at
 from jaxcloseup.scene import SceneError
 
 
@@ -129,7 +128,7 @@ def _render() -> None:
         shots = _resized(camera_paths.orbit(scene, FLAGS.frames, up=_up()))
     elif chosen == "from":
         index = camera_paths.find_view(scene, FLAGS["from"].value)
-        view = camera_at(scene.train.cameras, index)
+        view = scene.camera("train", index)
         pixel = _pixel()
         row, column = camera_paths.check_pixel(view, pixel)
 

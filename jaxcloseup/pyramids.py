@@ -86,7 +86,8 @@ def scene_pyramid(scene: Scene, *, finest: int = 1, budget: int = BUDGET) -> tup
     factor = max(finest, math.ceil(math.sqrt(pixels * _BYTES_PER_PIXEL / budget)))
     if scene.photographs_at is None or factor >= coarse:
         return photograph_pyramid(train), coarse
-    return photograph_pyramid(scene.photographs_at(factor), train), factor
+    finer, _ = scene.photographs_at(factor)
+    return photograph_pyramid(finer, train), factor
 
 
 def photograph_pyramid(views: Views, coarsest: Views | None = None) -> Pyramid:

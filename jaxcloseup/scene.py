@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from jaxcloseup.geometry.cameras import Camera
-from jaxcloseup.photographs import Views
+from jaxcloseup.photographs import Views, camera_at
 
 
 def printable(text: str) -> str:
@@ -93,7 +93,8 @@ class Scene:
       metadata: extra facts from the loader, such as source paths and downscale.
       surface: renders a `Camera` to its exact `Surface`; None for photographed scenes.
       photographs_at: reads the photographs of a split again at 1 / n of their own size, given n
-        and the split, "train" by default; None where they have no finer size to be read at.
+        and the split, "train" by default, and returns `Views` and what `sizes` says of these; None
+        where they have no finer size to be read at.
     """
 
     name: str
@@ -107,4 +108,15 @@ class Scene:
     names: dict[str, list[str]]
     metadata: dict[str, Any] = dataclasses.field(default_factory=dict)
     surface: Callable[[Camera], Surface] | None = None
-    photographs_at: Callable[..., Views] | None = None
+    photographs_at: Callable[..., tuple[Views, list[tuple[int, int]]]] | None = None
+
+    def sizes(self, split: str) -> list[tuple[int, int]]:
+        """Width and height of each photograph of a split, without its padding."""
+        views = getattr(self, split)
+        padded = views.cameras.width, views.cameras.height
+        return self.metadata.get("sizes", {}).get(split) or [padded] * len(views)
+
+    def camera(self, split: str, index: int) -> Camera:
+        """The camera of one photograph, without the padding at its right and its bottom."""
+        width, height = self.sizes(split)[index]
+        return camera_at(getattr(self, split).cameras, index).replace(width=width, height=height)

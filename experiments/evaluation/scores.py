@@ -57,13 +57,14 @@ NO_PERCEPTUAL = Perceptual({}, dict.fromkeys(BACKBONES, "LPIPS was not requested
 
 
 class Target(NamedTuple):
-    """A held-out view.
+    """A held-out view of `[H, W]` pixels, the photograph's own size.
 
     Attributes:
       name: name of its photograph.
-      camera: its camera.
+      camera: its camera; padded at the right and the bottom, as all views of its split are, so that
+        they share what is compiled.
       rgb: `[H, W, 3]` the photograph, float in [0, 1].
-      weight: `[H, W]` weights; 0 in padding.
+      weight: `[H, W]` weights.
       seen: `[H, W]` number of training photographs that saw the surface at each pixel.
       surface: the exact surface, or None where it is unknown.
       landmarks: visible points of the capture, or None where the exact surface is known.
@@ -90,7 +91,7 @@ def make_targets(
     split: str,
     train_depths: jax.Array,
     render: Callable[[Camera], Rendering],
-    views: Views | None = None,
+    finer: tuple[Views, Sequence[tuple[int, int]]] | None = None,
 ) -> list[Target]:
     """Return the held-out views of a split, with the number of photographs that saw each pixel.
 
@@ -102,21 +103,23 @@ def make_targets(
       split: name of the split.
       train_depths: `[V, H, W]` depths of the training views.
       render: `camera -> Rendering` of the baseline.
-      views: the split's photographs of another size; by default those of the scene.
+      finer: the split's photographs of another size, as `Scene.photographs_at` returns them; by
+        default those of the scene.
     """
-    views = getattr(scene, split) if views is None else views
+    views, sizes = finer or (getattr(scene, split), scene.sizes(split))
     surface = scene.surface  # is compiled; within jit, its textures would be constants
     count = jax.jit(count_seen)
     targets = []
-    for i, name in enumerate(scene.names[split]):
+    for i, (name, (width, height)) in enumerate(zip(scene.names[split], sizes, strict=True)):
         camera = camera_at(views.cameras, i)
+        own = camera.replace(width=width, height=height)
         exact = surface(camera) if surface else None
-        landmarks = None if exact else find_landmarks(camera, scene.points)
+        landmarks = None if exact else find_landmarks(own, scene.points)
         depth = exact.depth if exact else render(camera).depth
         pixels = pixel_grid(camera.height, camera.width)
-        seen = count(camera, pixels, depth, scene.train, train_depths)
-        rgb = to_float(jnp.asarray(views.rgb[i]))
-        weight = jnp.asarray(views.weight[i])
+        seen = count(camera, pixels, depth, scene.train, train_depths)[:height, :width]
+        rgb = to_float(jnp.asarray(views.rgb[i, :height, :width]))
+        weight = jnp.asarray(views.weight[i, :height, :width])
         targets.append(Target(name, camera, rgb, weight, seen, exact, landmarks))
     return targets
 
@@ -144,18 +147,18 @@ def targets_by_split(
     targets = {split: make_targets(scene, split, seen_from, render) for split in splits}
     for split in splits if finer is not None and scene.photographs_at else ():
         try:
-            views = scene.photographs_at(finer, split)
+            photographs = scene.photographs_at(finer, split)
         except SceneError as error:  # such as full-size photographs that were not kept
             print(f"views are scored at the size of training alone: {error}")
             break
-        targets[split + FINER] = make_targets(scene, split, seen_from, render, views)
+        targets[split + FINER] = make_targets(scene, split, seen_from, render, photographs)
     return targets
 
 
 def score(
     rendering: Rendering, target: Target, perceptual: Perceptual = NO_PERCEPTUAL
 ) -> dict[str, float | str | None]:
-    """Return the metrics of one view on 8-bit colors, cropped to its photograph.
+    """Return the metrics of one view on 8-bit colors, cropped to the pixels that count.
 
     Args:
       rendering: the rendered view, `[H, W]`.
@@ -256,10 +259,23 @@ def evaluate(
     targets: Sequence[Target],
     perceptual: Perceptual = NO_PERCEPTUAL,
 ) -> tuple[dict[str, Any], dict[str, Rendering]]:
-    """Render and score every target; return the summary and the renderings by name."""
-    renderings = {target.name: jax.device_get(render(target.camera)) for target in targets}
+    """Render and score every target; return the summary and the renderings by name.
+
+    Renderings have their photograph's own size, and no `aux`.
+    """
+    renderings = {
+        target.name: without_padding(jax.device_get(render(target.camera)), *target.weight.shape)
+        for target in targets
+    }
     scores = {t.name: score(renderings[t.name], t, perceptual) for t in targets}
     return summarize(scores), renderings
+
+
+def without_padding(rendering: Rendering, height: int, width: int) -> Rendering:
+    """The upper left `height` x `width` pixels of a rendering: padding is at the other sides."""
+    images = {name: getattr(rendering, name) for name in ("rgb", "depth", "alpha", "normal")}
+    cut = {name: image[:height, :width] for name, image in images.items() if image is not None}
+    return rendering._replace(**cut, aux=())
 
 
 def _as_8_bits(image, truth):
@@ -291,7 +307,7 @@ def _ssim(image, truth, *, weight):
 
 
 def _frame(weight: np.ndarray) -> tuple[slice, slice]:
-    """Return the smallest rectangle with all weight: photographs are padded at two sides."""
+    """Return the smallest rectangle with all weight: masks may leave a part of a photograph."""
     rows, columns = np.nonzero(weight.any(axis=1))[0], np.nonzero(weight.any(axis=0))[0]
     if not len(rows):
         return slice(None), slice(None)

@@ -104,18 +104,23 @@ def label_pictures(
     """
     label_image = jax.jit(label_pixels)
     sample = jax.jit(sample_virtual_camera)
-    shots: list[tuple[str, Camera, jax.Array, Any, Any]] = []
+    sizes = scene.sizes("train")
+    shots: list[tuple[str, Camera, jax.Array, Any, Any, tuple[int, int]]] = []
     for i, one in enumerate(jax.random.split(key, SHOWN_LABELS)):
         camera, index = sample(one, sources, settings)
         truth = scene.surface(camera).rgb if scene.surface else None
-        shots.append((f"virtual_{i}", camera, render_depth(camera), index, truth))
+        # A virtual camera has the lens of its source, and as many pixels.
+        shots.append(
+            (f"virtual_{i}", camera, render_depth(camera), index, truth, sizes[int(index)])
+        )
     nearest = jax.jit(best_source)
     for target in targets[:SHOWN_LABELS]:
         depth = render_depth(target.camera)
         index = nearest(target.camera, sources.views, sources.depths, depth=depth)
-        shots.append((f"closeup_{target.name}", target.camera, depth, index, target.rgb))
+        own = target.rgb.shape[1::-1]
+        shots.append((f"closeup_{target.name}", target.camera, depth, index, target.rgb, own))
     pictures = []
-    for name, camera, depth, index, truth in shots:
+    for name, camera, depth, index, truth, (width, height) in shots:
         pixels = pixel_grid(camera.height, camera.width)
         label = label_image(camera, pixels, depth, index, sources, settings)
         kept = np.where(label.weight[..., None] > 0, label.rgb, 0)
@@ -124,7 +129,7 @@ def label_pictures(
         panels["rendered depth"] = colorize_depth(depth, near=scene.near, far=scene.far)
         if truth is not None:
             panels["truth"] = np.asarray(truth)
-        image = _row(panels)
+        image = _row({title: panel[:height, :width] for title, panel in panels.items()})
         write_png(folder / f"{name}.png", image)
         source = scene.names["train"][int(index)]
         pictures.append(Picture("Pseudo-labels", f"{name}, from {source}", image))

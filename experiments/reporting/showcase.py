@@ -72,11 +72,13 @@ def exhibits(
         depth = render_depth(target.camera)
         view = int(nearest(target.camera, sources.views, sources.depths, depth=depth))
         camera = photographs.camera(camera_at(sources.views.cameras, view), view, 0)
-        place = find_place(target.camera, depth, camera)
+        height, width = target.weight.shape
+        own = target.camera.replace(height=height, width=width)  # without padding
+        place = find_place(own, depth[:height, :width], camera)
         cutout, pixel = None, float("nan")
         if place is not None:
             pixel = 1 / np.sqrt(abs(np.linalg.det(place[:, :2])))
-            cutout = cut_out(photographs, view, place, target.camera)
+            cutout = cut_out(photographs, view, place, own)
         images = map(to_uint8, (renders[name], np.asarray(target.rgb)))
         found.append(Exhibit(name, psnr[name], *images, names[view], cutout, pixel))
     return found

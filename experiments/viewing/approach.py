@@ -47,7 +47,8 @@ def approach(
     view = int(jax.jit(best_source)(camera, sources.views, sources.depths, depth=depth))
     # The lens of the close-up gives all frames one shape, so nothing is compiled for them.
     start = camera.replace(camtoworld=sources.views.cameras.camtoworld[view])
-    row, column = camera.height // 2, camera.width // 2
+    height, width = target.weight.shape  # without padding
+    row, column = height // 2, width // 2
     middle = pixels_to_points(camera, jnp.array([column + 0.5, row + 0.5]), depth[row, column])
     pixel, distance = points_to_pixels(start, middle)
     if not (depth[row, column] > 0 and distance > 0):
@@ -61,4 +62,4 @@ def approach(
         frames=FRAMES,
     )
     cameras = track(named_cameras(shots), description="   a dolly")
-    return [to_uint8(np.asarray(render(one).rgb)) for _, one in cameras]
+    return [to_uint8(np.asarray(render(one).rgb)[:height, :width]) for _, one in cameras]

@@ -34,11 +34,14 @@ class Shots(NamedTuple):
       cameras: `[Q]` stacked cameras.
       names: file name of each camera's images, without ending.
       fps: frames per second that the camera path asks for, or None.
+      sizes: width and height of each photograph whose view this is, without its padding; None where
+        no image is padded.
     """
 
     cameras: Camera
     names: list[str]
     fps: float | None = None
+    sizes: list[tuple[int, int]] | None = None
 
 
 def view_shots(scene: Scene, split: str) -> Shots:
@@ -52,7 +55,7 @@ def view_shots(scene: Scene, split: str) -> Shots:
         raise CameraError(
             f"--views={split}: {scene.name} has no such split: choose " + ", ".join(scene.names)
         )
-    return Shots(views.cameras, list(scene.names[split]))
+    return Shots(views.cameras, list(scene.names[split]), sizes=scene.sizes(split))
 
 
 def read_camera_path(path: pathlib.Path) -> Shots:
@@ -164,8 +167,9 @@ def orbit(scene: Scene, frames: int, *, up: Sequence[float] | None = None) -> Sh
     for angle in np.arange(frames) * (2 * np.pi / frames):
         position = radius * (np.cos(angle) * east + np.sin(angle) * north) + height * up
         poses.append(look_at(center + position, center, up))
-    intrinsics = np.tile(np.asarray(cameras.intrinsics[0]), (frames, 1))
-    return Shots(_stack(poses, intrinsics, cameras.height, cameras.width), _numbered(frames))
+    first = scene.camera("train", 0)
+    intrinsics = np.tile(np.asarray(first.intrinsics), (frames, 1))
+    return Shots(_stack(poses, intrinsics, first.height, first.width), _numbered(frames))
 
 
 def focus_point(

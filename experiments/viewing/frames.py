@@ -53,13 +53,14 @@ def render_shots(
     # Three frames set the depth colors of all frames, so that videos do not flicker.
     some = [programs.render(state, cameras[i][1]) for i in {0, len(cameras) // 2, len(cameras) - 1}]
     limits = depth_range([label_depth(one, near=0, far=scene.far) for one in some], scene)
+    sizes = shots.sizes or [(shots.cameras.width, shots.cameras.height)] * len(cameras)
     images: dict[str, Image] = {}
-    for name, camera in cameras:
+    for (name, camera), (width, height) in zip(cameras, sizes, strict=True):
         images = render_pictures(
             programs, state, camera, sources=sources, detail=detail, limits=limits
         )
         for kind, image in images.items():
-            write_png(output_dir / kind / f"{name}.png", image)
+            write_png(output_dir / kind / f"{name}.png", image[:height, :width])
     return [output_dir / kind for kind in images]
 
 

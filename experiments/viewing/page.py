@@ -30,7 +30,6 @@ from experiments.viewing.server import Server
 from jaxcloseup.artifacts.images import encode_png, to_uint8
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.label_rules import label_depth
-from jaxcloseup.photographs import camera_at
 from jaxcloseup.train import TrainState
 
 
@@ -142,12 +141,12 @@ class Viewer:
             scene.add_point_cloud("/points", points, rgb, point_size=size)
 
     def _add_photograph(self, index):
-        views = self._scene.train
-        photograph = to_uint8(views.rgb[index])
+        camera = self._scene.camera("train", index)
+        photograph = to_uint8(self._scene.train.rgb[index, : camera.height, : camera.width])
         height = max(1, round(_THUMBNAIL * photograph.shape[0] / photograph.shape[1]))
         photograph = cv2.resize(photograph, (_THUMBNAIL, height), interpolation=cv2.INTER_AREA)
         name = f"/cameras/{self._scene.names['train'][index]}"
-        frustum = self._add_frustum(name, camera_at(views.cameras, index), photograph)
+        frustum = self._add_frustum(name, camera, photograph)
         frustum.on_click(lambda event: self._visit(event.client, index))
         return frustum
 
@@ -202,7 +201,7 @@ class Viewer:
         self._visited = time.monotonic()
         for i, frustum in enumerate(self._frustums):
             frustum.visible = i != index
-        _bring(client, camera_at(self._scene.train.cameras, index), self._distance)
+        _bring(client, self._scene.camera("train", index), self._distance)
 
     def _on_click(self, event):
         # Viser reports a click on a training camera a second time, as a click on the scene.
@@ -241,7 +240,7 @@ class Viewer:
         if not ranks.any():
             raise ViewError("No photograph shows that point: click somewhere else.")
         best = int(ranks.argmax())
-        self._aim = camera_at(views.cameras, best), point
+        self._aim = self._scene.camera("train", best), point
         self._place(client)
         shown = f"{np.count_nonzero(ranks)} of {len(ranks)} photographs show that point"
         return f"{shown}; the close-up camera starts from {self._scene.names['train'][best]}"
@@ -294,9 +293,9 @@ class Viewer:
         return self._detail
 
     def _seen_by(self, client):
-        """Return a visitor's camera, with the photographs' image size."""
+        """Return a visitor's camera, with the first photograph's image size."""
         rotation = SO3(client.camera.wxyz).as_matrix()
-        like = self._scene.train.cameras
+        like = self._scene.camera("train", 0)
         return viewer_camera(rotation, client.camera.position, client.camera.fov, like)
 
 

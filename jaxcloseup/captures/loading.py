@@ -116,13 +116,16 @@ def _load(listing: Listing, reading: Reading) -> Scene:
     )
 
 
-def _read_at(listing: Listing, reading: Reading, factor: int, split: str = "train") -> Views:
+def _read_at(
+    listing: Listing, reading: Reading, factor: int, split: str = "train"
+) -> tuple[Views, list[tuple[int, int]]]:
     """Read the photographs of a split again, at 1 / `factor` of their own size."""
     frames = [frame._replace(reduced=None) for frame in listing.frames[split]]
     photos = read_photos({split: frames}, reading._replace(downscale=factor))[split]
     intrinsics = np.stack([photo.intrinsics(reading.half_pixel) for photo in photos])
-    width, height = np.array([photo.size for photo in photos]).max(0).tolist()
-    return _padded(photos, intrinsics, height, width)
+    sizes = [photo.size for photo in photos]
+    width, height = np.array(sizes).max(0).tolist()
+    return _padded(photos, intrinsics, height, width), sizes
 
 
 def _padded(photos: Sequence[Photo], intrinsics: np.ndarray, height: int, width: int) -> Views:

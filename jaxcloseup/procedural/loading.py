@@ -93,8 +93,9 @@ def procedural_scene(
     def surface(camera: Camera) -> Surface:
         return _render_surface(_world(name), camera)
 
-    def photographs_at(factor: int, split: str = "train") -> Views:
-        return getattr(procedural_scene(name, downscale=factor), split)
+    def photographs_at(factor: int, split: str = "train") -> tuple[Views, list[tuple[int, int]]]:
+        finer = procedural_scene(name, downscale=factor)
+        return getattr(finer, split), finer.sizes(split)
 
     return Scene(
         name=name,
