@@ -1,9 +1,12 @@
 """Flags and setup that the programs of `experiments` share."""
 
+import contextlib
 import logging
+import os
 import pathlib
 import sys
 import warnings
+from typing import Any
 
 import jax
 from absl import flags
@@ -11,6 +14,13 @@ from absl import flags
 from jaxcloseup.files import cache_folder
 
 
+try:
+    import fcntl
+except ImportError:  # not a Unix: nothing is locked
+    fcntl = None
+
+
+LOCK = ".lock"  # in a folder that a program trains in
 FLAGS = flags.FLAGS
 flags.DEFINE_string(
     "lpips_weights",
@@ -63,7 +73,7 @@ def check_unused(folder: str | pathlib.Path) -> pathlib.Path:
       FileExistsError: the folder holds files, or the path is a file.
     """
     path = pathlib.Path(folder)
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+    if path.exists() and (not path.is_dir() or any(one.name != LOCK for one in path.iterdir())):
         raise FileExistsError(
             f"--output_dir={folder} already exists and is not empty: name a new folder, or remove "
             "it first"
@@ -71,16 +81,40 @@ def check_unused(folder: str | pathlib.Path) -> pathlib.Path:
     return path
 
 
-def make_output_dir(folder: pathlib.Path) -> None:
-    """Create the output folder and its parents if they do not exist.
+def lock_output_dir(folder: pathlib.Path) -> contextlib.AbstractContextManager[Any]:
+    """Create the output folder, and keep other processes from training in it.
+
+    Returns:
+      A context, which holds the lock until it is left or the process ends, in whatever way. Where
+      files cannot be locked it holds nothing.
 
     Raises:
-      OSError: the folder cannot be created.
+      OSError: the folder cannot be created or written, or another process trains in it.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        file = (folder / LOCK).open("a+")
     except OSError as error:
         raise OSError(
-            f"--output_dir={folder} cannot be created ({error.strerror}): name a folder where you "
-            "may write"
+            f"--output_dir={folder} cannot be created or written ({error.strerror}): name a folder "
+            "where you may write"
         ) from error
+    if fcntl is None:
+        return file
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        with file:
+            file.seek(0)
+            holder = file.read(20).strip() or "unknown"
+        raise OSError(
+            f"--output_dir={folder} is in use by the process {holder}: wait until it ends, or name "
+            "another folder"
+        ) from None
+    except OSError:  # a file system without locks
+        return file
+    with contextlib.suppress(OSError):  # on a full disk the lock holds too
+        file.truncate(0)
+        file.write(str(os.getpid()))
+        file.flush()
+    return file

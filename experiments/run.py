@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from absl import app, flags
 
-from experiments.command_line import make_output_dir, set_up
+from experiments.command_line import lock_output_dir, set_up
 from experiments.evaluation.metrics_text import FINER
 from experiments.evaluation.scores import NO_PERCEPTUAL, Perceptual, find_perceptual
 from experiments.methods import Preset
@@ -133,22 +133,23 @@ def main(argv: list[str]) -> None:
         load_options = training_flags.load_options_from_flags(preset)
         scene = training_flags.load(FLAGS.scene, load_options)
         perceptual = find_perceptual(FLAGS.lpips_weights)
-        make_output_dir(output_dir)
+        lock = lock_output_dir(output_dir)
     except (SceneError, OSError, ValueError) as error:
         sys.exit(f"experiments.run: {error}")
     try:
-        results = run(
-            scene,
-            preset,
-            FLAGS.seed,
-            output_dir,
-            names=training_flags.names_from_flags(),
-            to_run=FLAGS.stages,
-            save_every=FLAGS.save_every,
-            perceptual=perceptual,
-            load_options=load_options,
-            tensorboard=FLAGS.tensorboard,
-        )
+        with lock:
+            results = run(
+                scene,
+                preset,
+                FLAGS.seed,
+                output_dir,
+                names=training_flags.names_from_flags(),
+                to_run=FLAGS.stages,
+                save_every=FLAGS.save_every,
+                perceptual=perceptual,
+                load_options=load_options,
+                tensorboard=FLAGS.tensorboard,
+            )
     except (TrainingError, CheckpointError, OSError) as error:
         sys.exit(f"experiments.run: {error}")
     print_results(results)

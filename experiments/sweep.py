@@ -7,6 +7,7 @@ numbers, so that they differ by their settings alone. Interrupted, the same comm
 goes on to the same tables.
 """
 
+import contextlib
 import json
 import os
 import pathlib
@@ -17,7 +18,7 @@ from typing import Any
 import jax
 from absl import app, flags
 
-from experiments.command_line import make_output_dir, set_up
+from experiments.command_line import lock_output_dir, set_up
 from experiments.evaluation.scores import Perceptual, find_perceptual
 from experiments.methods import Preset
 from experiments.reporting.page import Picture
@@ -132,14 +133,15 @@ def main(argv: list[str]) -> None:
         load_options = training_flags.load_options_from_flags(preset)
         scenes = [training_flags.load(name, load_options) for name in FLAGS.scenes]
         _check_scenes(scenes, output_dir)
-        make_output_dir(output_dir)
+        lock = lock_output_dir(output_dir) if first else contextlib.nullcontext()
     except (SceneError, OSError, ValueError) as error:
         sys.exit(f"experiments.sweep: {error}")
     if hosts is not None:
         # Hosts that are done wait for the first one, which writes the tables.
         jax.distributed.initialize(*hosts, shutdown_timeout_seconds=HOSTS_WAIT)
     try:
-        found = sweep_scenes(scenes, preset, output_dir, load_options, perceptual, first=first)
+        with lock:
+            found = sweep_scenes(scenes, preset, output_dir, load_options, perceptual, first=first)
     except (TrainingError, CheckpointError, OSError) as error:
         if hosts is None:
             sys.exit(f"experiments.sweep: {error}")

@@ -16,11 +16,15 @@ from tiny_runs import TINY
 from experiments import __main__ as command
 from experiments import run as program
 from experiments import sweep
+from experiments.command_line import LOCK, check_unused, lock_output_dir
 from experiments.methods import METHODS
 from experiments.training import flags as training_flags
 from experiments.training.settings import plain_config, settings_of
 from jaxcloseup.scene import SceneError
 from jaxcloseup.splats.adaptive import AdaptiveConfig
+
+
+ROOT = pathlib.Path(__file__).parents[1]
 
 
 @pytest.fixture
@@ -159,6 +163,38 @@ def test_a_folder_that_cannot_be_made_is_one_sentence(parsed_flags, capture_fold
         ),
     ):
         program.main(["run"])
+
+
+@pytest.mark.parametrize("module", [program, sweep])
+def test_a_folder_that_another_process_trains_in_is_refused(
+    parsed_flags, capture_folder, tmp_path, module
+):
+    (tmp_path / "checkpoints").mkdir()
+    scene = {"scene": str(capture_folder), "scenes": [str(capture_folder)], "downscale": 1}
+    with (
+        lock_output_dir(tmp_path),
+        flagsaver.flagsaver(**scene, output_dir=str(tmp_path), resume=True, arms=["control"]),
+        pytest.raises(SystemExit) as error,
+    ):
+        module.main(["run"])
+    assert error.value.code == (
+        f"{module.__name__}: --output_dir={tmp_path} is in use by the process {os.getpid()}: wait "
+        "until it ends, or name another folder"
+    )
+    assert not list((tmp_path / "checkpoints").iterdir())
+
+
+def test_a_dead_process_leaves_no_lock(tmp_path):
+    code = (
+        "import os, pathlib, sys\n"
+        "from experiments.command_line import lock_output_dir\n"
+        "lock = lock_output_dir(pathlib.Path(sys.argv[1]))\n"
+        "os._exit(0)"
+    )
+    subprocess.run([sys.executable, "-c", code, tmp_path], check=True, cwd=ROOT)
+    assert check_unused(tmp_path) == tmp_path  # although the file of the lock is there
+    with lock_output_dir(tmp_path):
+        assert (tmp_path / LOCK).read_text() == str(os.getpid())
 
 
 def test_flags_override_the_preset(parsed_flags):
