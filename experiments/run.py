@@ -48,7 +48,13 @@ for _name in ("output_dir", "lpips_weights", "compilation_cache"):
 flags.DEFINE_string(
     "scene", "table", "a built-in scene (counter, table, room, bench, stairs) or a folder"
 )
-flags.DEFINE_integer("seed", 0, "random seed; the same seed gives the same metrics", lower_bound=0)
+flags.DEFINE_integer(
+    "seed",
+    0,
+    "random seed; the same seed gives the same metrics",
+    lower_bound=0,
+    upper_bound=2**63 - 1,
+)
 flags.DEFINE_integer(
     "save_every", 1000, "steps between checkpoints; each stage's end is kept too", lower_bound=1
 )

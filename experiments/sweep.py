@@ -8,7 +8,6 @@ goes on to the same tables.
 """
 
 import contextlib
-import json
 import os
 import pathlib
 import sys
@@ -32,6 +31,7 @@ from experiments.training.manifest import NAME as MANIFEST
 from experiments.training.manifest import about_scene, versions, write_manifest
 from experiments.training.programs import HOSTS_WAIT
 from experiments.training.settings import plain_config
+from experiments.training.stored_run import RunError, read_fields
 from experiments.training.sweep import run_sweep
 from jaxcloseup.artifacts.checkpoints import CheckpointError
 from jaxcloseup.label_rules import LABEL_RULES, pool_label_loss
@@ -104,7 +104,7 @@ def _check_scenes(captures: Sequence[Scene], output_dir: pathlib.Path) -> None:
         raise ValueError(f"--scenes={given} has two of one name: sweep them one at a time")
     kept = output_dir / MANIFEST
     if FLAGS.resume and kept.exists():
-        before = json.loads(kept.read_bytes())["scenes"]
+        before = read_fields(kept, {"scenes": dict})["scenes"]
         if set(before) != names:
             raise ValueError(
                 f"--scenes={given} are not those of {output_dir}, {','.join(before)}: resume it as "
@@ -134,7 +134,7 @@ def main(argv: list[str]) -> None:
         scenes = [training_flags.load(name, load_options) for name in FLAGS.scenes]
         _check_scenes(scenes, output_dir)
         lock = lock_output_dir(output_dir) if first else contextlib.nullcontext()
-    except (SceneError, OSError, ValueError) as error:
+    except (RunError, SceneError, OSError, ValueError) as error:
         sys.exit(f"experiments.sweep: {error}")
     if hosts is not None:
         # Hosts that are done wait for the first one, which writes the tables.

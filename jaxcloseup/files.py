@@ -1,4 +1,4 @@
-"""Read and write whole files, append to files, and find the cache folder.
+"""Read and write whole files and JSON, append to files, and find the cache folder.
 
 Files and strict JSON are written atomically. Files of others are read only if they are ordinary
 ones of a stated size: a pipe or a device may never end, and a sparse file may claim terabytes.
@@ -47,6 +47,22 @@ def read_bytes(path: str | pathlib.Path, *, most: int = LARGEST) -> bytes:
     """
     check_file(path, most=most)
     return pathlib.Path(path).read_bytes()
+
+
+def read_object(path: str | pathlib.Path) -> dict[str, Any]:
+    """Read a JSON file that holds an object.
+
+    Raises:
+      OSError: the file cannot be read.
+      ValueError: it holds no object; the message says what is wrong.
+    """
+    try:
+        found = json.loads(read_bytes(path))
+    except RecursionError:
+        raise ValueError("it is nested too deep") from None
+    if not isinstance(found, dict):
+        raise ValueError("it is not an object")
+    return found
 
 
 def write_file(path: str | pathlib.Path, data: bytes) -> None:

@@ -13,6 +13,7 @@ MODULES = sorted([*PACKAGE.rglob("*.py"), *EXPERIMENTS.rglob("*.py")])
 MAY_IMPORT = {
     "version": set(),
     "files": set(),
+    "memory": set(),
     "ply": {"files"},
     "torch_file": {"files"},
     "numerics": set(),
@@ -37,7 +38,7 @@ MAY_IMPORT = {
         *("numerics", "geometry", "field", "photographs"),
         *("draws", "pseudo", "label_rules", "rendered_loss", "pyramids", "windows"),
     },
-    "captures": {"files", "ply", "numerics", "geometry", "photographs", "scene"},
+    "captures": {"files", "memory", "ply", "numerics", "geometry", "photographs", "scene"},
     "procedural": {"files", "numerics", "geometry", "photographs", "scene"},
     "scenes": {"captures", "procedural", "scene"},
     "artifacts": {"files", "ply", "numerics", "geometry", "photographs", "splats"},

@@ -45,7 +45,7 @@ def test_photographs_are_never_all_in_memory_at_full_size(tmp_path, monkeypatch)
 def test_photographs_that_exceed_memory_are_refused_before_they_are_read(tmp_path, monkeypatch):
     write_photographs(tmp_path, 9, 400, 300)
     (tmp_path / "008.jpg").write_bytes(b"never read")
-    monkeypatch.setattr(photo_reading, "_memory", lambda: 2 * 2**20)
+    monkeypatch.setattr(photo_reading, "installed_memory", lambda: 2 * 2**20)
     with pytest.raises(SceneError, match=r"9 photographs of 400 x 300 pixels need .* at least 3"):
         load_scene(tmp_path)
     (tmp_path / "008.jpg").write_bytes((tmp_path / "007.jpg").read_bytes())

@@ -234,7 +234,7 @@ def parsed_flags():
         ({"method": "nerf", "arms": ["expected_depth=1"]}, "nerf has no setting expected_depth"),
         ({"arms": ["expected_depth=2"]}, "expected_depth must be true or false or none"),
         ({"arms": ["depth_error=-1"]}, "depth_error is a share"),
-        ({"set": ["capacity=0"]}, "--set=capacity=0: capacity must be between 1 and inf"),
+        ({"set": ["capacity=0"]}, "--set=capacity=0: capacity must be between 1 and 100000000"),
         ({"arms": ["label=warp+depth_error=0+expected_depth=1"]}, "do not go together"),
         ({"scenes": ["nowhere"]}, "nowhere"),
     ],

@@ -12,7 +12,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from jaxcloseup.artifacts.images import Image, encode_png
-from jaxcloseup.files import append_file, strict, write_file
+from jaxcloseup.files import append_file, read_bytes, strict, write_file
+
+
+_RATES = ("steps_per_second", "seconds")
 
 
 def check_tensorboard() -> None:
@@ -49,12 +52,12 @@ class TrainLog:
 
     def begin(self, stage: str, history: Sequence[Mapping[str, Any]]) -> None:
         """Start a stage, or resume it after the chunks of `history`."""
-        old = self._file.read_bytes() if self._file.exists() else b""
+        old = read_bytes(self._file) if self._file.exists() else b""
         stages: dict[str, list[Mapping[str, Any]]] = {}
         for line in filter(None, map(_parse, old.splitlines())):
             stages.setdefault(line["stage"], []).append(line)
         logged = {line["step"]: line for line in stages.get(stage, ())}
-        rates = {"steps_per_second": None, "seconds": None}
+        rates = dict.fromkeys(_RATES)
         stages[stage] = [
             {"stage": stage, **entry}
             | {key: logged.get(entry["step"], rates)[key] for key in rates}
@@ -151,12 +154,14 @@ class _EventFile:
 
 
 def _parse(text):
-    """Parse a line of the log; None for a truncated one."""
+    """Parse a line of the log; None for a truncated or damaged one."""
     try:
         line = json.loads(text)
-        return line if {"stage", "step", "steps_per_second", "seconds"} <= line.keys() else None
-    except (ValueError, AttributeError):
+        kinds = {"stage": str, "step": int, **dict.fromkeys(_RATES, float | int | None)}
+        whole = all(isinstance(line[name], kind) for name, kind in kinds.items())
+    except (ValueError, KeyError, TypeError, RecursionError):
         return None
+    return line if whole else None
 
 
 def _format(line):

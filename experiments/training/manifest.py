@@ -2,7 +2,6 @@
 
 import contextlib
 import hashlib
-import json
 import pathlib
 import platform
 import subprocess
@@ -14,7 +13,7 @@ import jax
 import numpy as np
 
 import jaxcloseup
-from jaxcloseup.files import write_json
+from jaxcloseup.files import read_object, write_json
 from jaxcloseup.scenes import Scene
 
 
@@ -41,8 +40,8 @@ def write_manifest(
     commit, changed = git_commit(pathlib.Path(jaxcloseup.__file__).parent)
     before = None
     with contextlib.suppress(OSError, ValueError):
-        before = json.loads((folder / NAME).read_bytes())["git_commit"]
-    if None not in (before, commit) and before != commit:
+        before = read_object(folder / NAME).get("git_commit")
+    if isinstance(before, str) and commit not in (None, before):
         warnings.warn(
             f"{folder} was started by commit {before[:9]} and continues with {commit[:9]}: start a "
             "new run if the changes between them matter",

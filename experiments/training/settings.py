@@ -6,6 +6,7 @@ hold it (`field`, `train` or `labels`): `capacity`, `density.growth`, `rgb_toler
 
 import dataclasses
 import math
+import sys
 import types
 import typing
 from collections.abc import Mapping, Sequence
@@ -17,17 +18,24 @@ from jaxcloseup.splats.rasterize import COMPOSITORS
 
 
 _GROUPS = ("field", "train", "labels")
-# Other numbers lie between 0 and infinity.
+_MOST = 2**31 - 1  # what an int32 counts
+# Other whole numbers lie between 0 and _MOST, other numbers between 0 and infinity.
 BOUNDS = {
-    "label_loss_weight": (0, 1),
     "magnification": (1, math.inf),
-    **dict.fromkeys(("num_sources", "baseline_steps", "closeup_steps", "downscale"), (1, math.inf)),
-    **dict.fromkeys(
-        ("num_rays", "num_label_rays", "num_windows", "chunk", "capacity"), (1, math.inf)
-    ),
-    **dict.fromkeys(("finest", "steps"), (1, math.inf)),
-    **dict.fromkeys(("width", "num_coarse", "num_fine"), (1, math.inf)),
-    **dict.fromkeys(("whole_share", "initial_opacity", "ssim_weight", "background"), (0, 1)),
+    "capacity": (1, 10**8),
+    "sh_degree": (0, 3),
+    "depth": (1, 64),  # layers
+    "tile": (1, 64),
+    **dict.fromkeys(("position_octaves", "direction_octaves"), (0, 64)),
+    **dict.fromkeys(("baseline_steps", "closeup_steps", "target_steps", "steps"), (1, _MOST)),
+    **dict.fromkeys(("steps_per_target", "means_lr_steps", "lr_decay_steps"), (1, _MOST)),
+    **dict.fromkeys(("every", "sh_every", "reset_every"), (1, _MOST)),
+    **dict.fromkeys(("downscale", "score_downscale", "finest", "num_sources"), (1, _MOST)),
+    **dict.fromkeys(("num_rays", "num_label_rays", "num_windows"), (1, _MOST)),
+    **dict.fromkeys(("width", "direction_width", "num_coarse", "num_fine"), (1, _MOST)),
+    **dict.fromkeys(("chunk", "block"), (1, _MOST)),
+    **dict.fromkeys(("label_loss_weight", "ssim_weight", "whole_share", "background"), (0, 1)),
+    **dict.fromkeys(("initial_opacity", "min_opacity", "reset_opacity"), (0, 1)),
 }
 _CHOICES = {
     "label": ("warp", "residual"),
@@ -80,12 +88,12 @@ def _leaves(record, before=()):
         value, path = getattr(record, field.name), (*before, field.name)
         if dataclasses.is_dataclass(value):
             yield from _leaves(value, path)
-        elif _is_plain(kinds[field.name]):
+        elif is_plain(kinds[field.name]):
             yield path, kinds[field.name], value
 
 
-def _is_plain(kind):
-    """Whether texts can give its values; records come with a preset."""
+def is_plain(kind: Any) -> bool:
+    """Whether settings can have values of this type; records come with a preset."""
     kinds = {typing.get_origin(choice) or choice for choice in _choices(kind)}
     return kinds <= {int, float, bool, str, tuple, type(None)}
 
@@ -119,7 +127,9 @@ def with_settings(preset: Preset, given: Sequence[str], *, flag: str = "--set=")
             raise ValueError(f"{flag}{text} sets {name} twice: leave one out")
         changed.add(name)
         try:
-            preset = _replaced(preset, known[name].path, _parse(name, value, known[name].kind))
+            kind = known[name].kind
+            value = check_value(name, _parse(value, kind), kind)
+            preset = _replaced(preset, known[name].path, value)
         except ValueError as error:
             raise ValueError(f"{flag}{text}: {name} must be {error}") from None
     return preset
@@ -131,44 +141,69 @@ def _replaced(record, path, value):
     return dataclasses.replace(record, **{path[0]: value})
 
 
-def _parse(name, text, kind):
-    """The value of a text, or a ValueError that says what it must be."""
+def _parse(text, kind):
+    """The value of a text; the text itself where it is no such value."""
     kinds = _choices(kind)
     if type(None) in kinds and text.lower() == "none":
         return None
     (kind,) = (choice for choice in kinds if choice is not type(None))
+    if kind is bool:
+        return _TRUTH.get(text.lower(), text)
+    try:
+        if typing.get_origin(kind) is tuple:
+            return tuple(map(float, text.split(":")))
+        return kind(text)
+    except ValueError:
+        return text
+
+
+def check_value(name: str, value: Any, kind: Any) -> Any:
+    """The value of a setting, with whole numbers as floats where these are wanted.
+
+    Args:
+      name: of the setting.
+      value: as `--set` or the JSON of a stored run gives it.
+      kind: as in `Setting`.
+
+    Raises:
+      ValueError: the setting has no such value; the message says what it must be.
+    """
+    kinds, name = _choices(kind), name.rpartition(".")[2]
+    if value is None and type(None) in kinds:
+        return None
+    (kind,) = (choice for choice in kinds if choice is not type(None))
     or_none = " or none" if len(kinds) > 1 else ""
     if kind is str:
-        choices = _CHOICES[name.rpartition(".")[2]]
-        if text not in choices:
-            raise ValueError(" or ".join(choices))
-        return text
+        if value not in _CHOICES[name]:
+            raise ValueError(" or ".join(_CHOICES[name]))
+        return value
     if kind is bool:
-        if text.lower() not in _TRUTH:
+        if not isinstance(value, bool):
             raise ValueError(f"true or false{or_none}")
-        return _TRUTH[text.lower()]
-    low, high = BOUNDS.get(name.rpartition(".")[2], (0, math.inf))
-    between = f"between {low:g} and {high:g}{or_none}"
+        return value
+    low, high = BOUNDS.get(name, (0, _MOST if kind is int else math.inf))
+    between = f"between {low} and {high}{or_none}"
     if typing.get_origin(kind) is tuple:
-        return _range(text, low, high, between, rising=name == "magnification")
-    try:
-        number = kind(text)
-    except ValueError:
+        rising = name == "magnification"
+        if not (isinstance(value, tuple) and len(value) == 2 and all(map(_is_number, value))):
+            raise ValueError(f"two numbers {between}, as in 2:4")
+        inside = all(low <= number <= high for number in value)
+        if not inside or (rising and value[0] > value[1]):
+            raise ValueError(f"two numbers {between}, as in 2:4{', rising' if rising else ''}")
+        return tuple(map(float, value))
+    if not _is_number(value) or (kind is int and not isinstance(value, int)):
         what = "a whole number" if kind is int else "a number"
-        raise ValueError(f"{what} {between}") from None
-    if not low <= number <= high:
+        raise ValueError(f"{what} {between}")
+    if not low <= value <= high:
         raise ValueError(between)
-    return number
+    return kind(value)
 
 
-def _range(text, low, high, between, *, rising):
-    try:
-        first, second = map(float, text.split(":"))
-    except ValueError:
-        raise ValueError(f"two numbers {between}, as in 2:4") from None
-    if not (low <= first <= high and low <= second <= high) or (rising and first > second):
-        raise ValueError(f"two numbers {between}, as in 2:4{', rising' if rising else ''}")
-    return first, second
+def _is_number(value):
+    """Whether a value is a number that a float can hold; JSON has no limit."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return isinstance(value, float) or abs(value) <= sys.float_info.max
 
 
 def describe_settings(methods: Mapping[str, Method]) -> str:

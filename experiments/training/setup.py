@@ -17,7 +17,7 @@ import jaxcloseup
 from experiments.methods import LabelConfig, Preset, pseudo_settings
 from experiments.training.detail import detailed_views, find_detail
 from experiments.training.logs import TrainLog
-from experiments.training.loop import run_stage
+from experiments.training.loop import TrainingError, run_stage
 from experiments.training.manifest import hash_data, hash_targets
 from experiments.training.programs import Programs
 from experiments.training.settings import plain_config
@@ -25,6 +25,7 @@ from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.label_rules import LABEL_RULES, label_depth
+from jaxcloseup.memory import installed_memory
 from jaxcloseup.photographs import Views, camera_at
 from jaxcloseup.pseudo import (
     LabelSources,
@@ -140,13 +141,29 @@ def identity_of(scene: Scene, preset: Preset, names: Mapping[str, str]) -> dict[
 
 
 def initial_state(programs: Programs, seed: int) -> TrainState:
-    """The state before the first step of a seed's baseline."""
+    """The state before the first step of a seed's baseline.
+
+    Raises:
+      TrainingError: it does not fit into memory.
+    """
+    state_shapes(programs)
     return _initial_state(programs)(*_initial_data(programs, seed))
 
 
 def state_shapes(programs: Programs) -> TrainState:
-    """The structure of a state, with shapes and types in place of arrays."""
-    return jax.eval_shape(_initial_state(programs), *_initial_data(programs, seed=0))
+    """The structure of a state, with shapes and types in place of arrays.
+
+    Raises:
+      TrainingError: such a state does not fit into memory.
+    """
+    shapes = jax.eval_shape(_initial_state(programs), *_initial_data(programs, seed=0))
+    needed = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(shapes))
+    if needed > (held := installed_memory()):
+        raise TrainingError(
+            f"what is trained takes {needed / 2**30:.1f} GiB, but this computer has "
+            f"{held / 2**30:.1f}: choose fewer surfels or a smaller network with --set"
+        )
+    return shapes
 
 
 def _initial_state(programs):

@@ -2,11 +2,12 @@
 
 import dataclasses
 import math
+import typing
 from collections.abc import Mapping
 from typing import Any
 
 from experiments.methods import METHODS, Preset
-from experiments.training.settings import plain_config
+from experiments.training.settings import check_value, is_plain, plain_config
 
 
 def preset_from_config(
@@ -25,11 +26,12 @@ def preset_from_config(
       The preset, and the absent settings by name with the values they have.
 
     Raises:
-      ValueError: the configuration has another form; names the field.
+      ValueError: the configuration has another form, or a value that `--set` would refuse; names
+        the field.
     """
     if "method" not in stored:
         stored = from_version_0_1(stored, method)
-    if stored["method"] not in METHODS:
+    if stored["method"] not in list(METHODS):  # which may be anything
         raise ValueError(f"there is no method {stored['method']}")
     records: dict[str, set[type]] = {}
     for preset in METHODS[stored["method"]].presets.values():
@@ -61,12 +63,6 @@ def _remove(config, name):
 
 
 def _rebuild(value, name, records, absent):
-    if value == "inf":
-        return math.inf
-    if isinstance(value, list):
-        return tuple(_rebuild(inner, name, records, absent) for inner in value)
-    if not isinstance(value, Mapping):
-        return value
     if name not in records:
         raise ValueError(f"{name} holds fields")
     # The run stored one of these records: the one that shares most fields with it.
@@ -74,13 +70,39 @@ def _rebuild(value, name, records, absent):
     choice = max(choices, key=lambda record: len(_names(record) & set(value)))
     if unknown := sorted(set(value) - _names(choice)):
         raise ValueError(f"{name} has {', '.join(unknown)}, which this version does not know")
-    known = {k: _rebuild(v, f"{name}.{k}", records, absent) for k, v in value.items()}
+    known, kinds = {}, typing.get_type_hints(choice)
     for field in dataclasses.fields(choice):
-        if field.name not in value:
-            if field.default is dataclasses.MISSING:
-                raise ValueError(f"{name} lacks {field.name}")
-            absent[f"{name}.{field.name}"] = field.default
+        path = f"{name}.{field.name}"
+        if field.name in value:
+            known[field.name] = _value(value[field.name], path, kinds[field.name], records, absent)
+        elif field.default is dataclasses.MISSING:
+            raise ValueError(f"{name} lacks {field.name}")
+        else:
+            absent[path] = field.default
     return choice(**known)
+
+
+def _value(value, name, kind, records, absent):
+    """The value of a field: a record, or what `check_value` lets through."""
+    if isinstance(value, Mapping):
+        return _rebuild(value, name, records, absent)
+    if name == "config.method":
+        return value
+    if is_plain(kind):
+        value = _plain(value)
+        try:
+            return check_value(name, value, kind)
+        except ValueError as error:
+            raise ValueError(f"{name} must be {error}") from None
+    if value is None and type(None) in typing.get_args(kind):
+        return None
+    raise ValueError(f"{name} must hold fields")
+
+
+def _plain(value):
+    if isinstance(value, list):
+        return tuple(map(_plain, value))
+    return math.inf if value == "inf" else value
 
 
 def _names(record):

@@ -1,6 +1,5 @@
 """A stored run, finished or cut off, loaded again: its scene, its preset, a stage's state."""
 
-import json
 import pathlib
 import warnings
 from collections.abc import Mapping, Sequence
@@ -11,11 +10,13 @@ import jax.numpy as jnp
 
 from experiments.methods import Preset
 from experiments.training import manifest
+from experiments.training.loop import TrainingError
 from experiments.training.programs import Programs
 from experiments.training.settings import with_settings
 from experiments.training.setup import state_shapes
 from experiments.training.stored_config import preset_from_config
 from jaxcloseup.artifacts.checkpoints import Checkpoints
+from jaxcloseup.files import read_object
 from jaxcloseup.scene import Scene
 from jaxcloseup.scenes import load_scene
 from jaxcloseup.train import TrainState
@@ -25,6 +26,14 @@ from jaxcloseup.train import TrainState
 _BY_DEFAULT = ("closeup", "control", "baseline")
 # Names of a state's arrays that version 0.1.0 spelled otherwise.
 _OLD_NAMES = {"regularize": "regularise", "image_offset": "probe"}
+
+
+# What rendering needs of the files of a run.
+_FIELDS = {
+    manifest.NAME: {"scene": str, "load_options": dict, "data_sha256": str},
+    "checkpoints/run.json": {"config": dict, "resolution": list, "seed": int},
+}
+_WORDS = {str: "a text", dict: "an object", list: "a list", int: "a whole number from 0 on"}
 
 
 class RunError(Exception):
@@ -61,16 +70,19 @@ def read_run(folder: pathlib.Path) -> StoredRun:
     """
     if not folder.is_dir():
         raise RunError(f"--run={folder} is not a folder: name that of a run of experiments.run")
-    about, identity = (_read_json(folder, name) for name in (manifest.NAME, "checkpoints/run.json"))
+    about, identity = (_read_json(folder, name) for name in _FIELDS)
     if "scene" not in about or "config" not in identity:
         raise RunError(f"--run={folder} is of a sweep or unknown: name a run of experiments.run")
+    for fields, (name, kinds) in zip((about, identity), _FIELDS.items(), strict=True):
+        _check_fields(folder / name, fields, kinds)
     version = identity.get("version")
     try:
         preset, absent = preset_from_config(identity["config"], identity.get("method"))
     except ValueError as error:
         raise RunError(
             f"--run={folder} was trained by version {version}, whose configuration this version "
-            f"cannot read ({error}): render it with version {version}"
+            f"cannot read ({error}): render it with version {version}, or restore "
+            "checkpoints/run.json from a copy of the run"
         ) from None
     if absent:
         values = ", ".join(f"{name}={value}" for name, value in absent.items())
@@ -145,11 +157,15 @@ def restore(run: StoredRun, scene: Scene, stage: str) -> tuple[Programs, TrainSt
     """The programs of a run, with the room that its images needed, and a stage's newest state.
 
     Raises:
-      RunError: there is no such state, or a changed setting does not fit it.
+      RunError: there is no such state, it does not fit into memory, or a changed setting does not
+        fit it.
       CheckpointError: the state has another form.
     """
     programs = Programs(run.preset, scene)
-    shapes = state_shapes(programs)
+    try:
+        shapes = state_shapes(programs)
+    except TrainingError as error:
+        raise RunError(f"--run={run.folder}: {error}") from None
     if run.preset != run.trained and shapes != state_shapes(Programs(run.trained, scene)):
         raise RunError(
             f"--set changes the shape of what was trained: --run={run.folder} was trained with "
@@ -167,17 +183,34 @@ def restore(run: StoredRun, scene: Scene, stage: str) -> tuple[Programs, TrainSt
     return programs, state
 
 
-def _read_json(folder, name):
+def read_fields(path: pathlib.Path, kinds: Mapping[str, type]) -> dict[str, Any]:
+    """Read the object in a JSON file that has these fields, of these types.
+
+    Raises:
+      RunError: the file cannot be read, or a field is missing or of another type.
+    """
     try:
-        found = json.loads((folder / name).read_bytes())
-        if not isinstance(found, dict):
-            raise ValueError("not an object")
-    except FileNotFoundError:
-        raise RunError(
-            f"--run={folder} has no {name}: name the folder of a run of experiments.run"
-        ) from None
+        found = read_object(path)
     except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
         raise RunError(
-            f"{folder / name} cannot be read ({error}): restore it from a copy of the run"
+            f"{path} cannot be read ({reason}): restore it from a copy of the run"
         ) from None
+    _check_fields(path, found, kinds)
     return found
+
+
+def _check_fields(path, found, kinds):
+    for name, kind in kinds.items():
+        value = found.get(name)
+        fits = isinstance(value, kind) and not isinstance(value, bool)
+        if not fits or (kind is int and not 0 <= value < 2**63):
+            raise RunError(
+                f"{path}: {name} must be {_WORDS[kind]}: restore the file from a copy of the run"
+            )
+
+
+def _read_json(folder, name):
+    if not (folder / name).exists():
+        raise RunError(f"--run={folder} has no {name}: name the folder of a run of experiments.run")
+    return read_fields(folder / name, {})

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
-from jaxcloseup.files import write_file
+from jaxcloseup.files import read_object, write_file
 
 
 _CHECKSUM = "crc32"  # entry of the progress item
@@ -50,7 +50,7 @@ class Checkpoints:
             write_file(path, json.dumps(identity, indent=1).encode())
             return
         try:
-            kept = json.loads(path.read_bytes())
+            kept = read_object(path)
         except (OSError, ValueError) as error:
             raise CheckpointError(
                 f"{path} cannot be read ({error}): start a new run in another output folder."

@@ -1,7 +1,6 @@
 """Read photographs, a few at a time: decode, mask, undistort, downscale and crop them."""
 
 import concurrent.futures
-import contextlib
 import functools
 import math
 import os
@@ -18,6 +17,7 @@ from jaxcloseup.captures.frames import Frame, frame_intrinsics
 from jaxcloseup.captures.images import downscale_image, read_file, read_image, read_mask
 from jaxcloseup.captures.photo_cache import cached, content_hash
 from jaxcloseup.captures.scale import check_lens
+from jaxcloseup.memory import installed_memory
 from jaxcloseup.scene import SceneError
 
 
@@ -113,7 +113,7 @@ def read_photos(splits: Mapping[str, Sequence[Frame]], reading: Reading) -> dict
 def _check_memory(photo: Photo, count: int, reading: Reading) -> None:
     """Raise before reading `count` photographs of this size that would not fit into memory."""
     needed = _BYTES_PER_PIXEL * count * photo.mask.size
-    if needed > (held := _memory()):
+    if needed > (held := installed_memory()):
         width, height = photo.size
         smallest = math.ceil(reading.downscale * math.sqrt(needed / held))
         raise SceneError(
@@ -121,14 +121,6 @@ def _check_memory(photo: Photo, count: int, reading: Reading) -> None:
             f"{needed / 2**30:.1f} GiB, but this computer has {held / 2**30:.1f}: choose a "
             f"downscale of at least {smallest}."
         )
-
-
-def _memory() -> int:
-    """Memory of this computer, or of the container, in bytes."""
-    held = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    with contextlib.suppress(OSError, ValueError):  # the file says "max" without a limit
-        held = min(held, int(pathlib.Path("/sys/fs/cgroup/memory.max").read_text()))
-    return held
 
 
 def _resized_intrinsics(
