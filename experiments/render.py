@@ -60,19 +60,27 @@ flags.DEFINE_list(
 flags.DEFINE_string("from", None, "training view from which to render a dolly towards --pixel")
 flags.DEFINE_list("pixel", None, "x,y: pixel of the --from view, at the view's training size")
 flags.DEFINE_float("magnification", 4.0, "how many times nearer to the surface a dolly ends")
-flags.DEFINE_integer("frames", 60, "number of frames of an orbit or a dolly", lower_bound=1)
+flags.DEFINE_integer(
+    "frames",
+    60,
+    "number of frames of an orbit or a dolly",
+    lower_bound=1,
+    upper_bound=100_000,
+)
 flags.DEFINE_float("fps", None, "frames per second of the video; default: the camera path's, or 30")
 flags.DEFINE_integer(
     "width",
     None,
     "frame width of an orbit or a dolly in pixels; default: from --height, or the training views'",
     lower_bound=1,
+    upper_bound=2**31 - 1,
 )
 flags.DEFINE_integer(
     "height",
     None,
     "frame height of an orbit or a dolly in pixels; default: from --width, or the training views'",
     lower_bound=1,
+    upper_bound=2**31 - 1,
 )
 flags.DEFINE_bool("fine_tune", False, "first fine-tune for exactly the cameras that are rendered")
 flags.DEFINE_integer(
@@ -131,6 +139,7 @@ def _render() -> None:
         view = scene.camera("train", index)
         pixel = _pixel()
         row, column = camera_paths.check_pixel(view, pixel)
+        camera_paths.resized(view, FLAGS.width, FLAGS.height)  # refuses what is too large
 
     programs, state = restore(record, scene, stage)
     if chosen == "from":

@@ -161,6 +161,11 @@ FLAT = np.eye(4).ravel().tolist()
     [
         ({"render_height": None}, "render_height is missing"),
         ({"render_width": 31.5}, "render_width must be a whole number"),
+        (
+            {"render_height": 1e9},
+            "render_width and render_height: frames of 32 x 1000000000 pixels",
+        ),
+        ({"render_height": 1e300}, "render_height must be a whole number of pixels, not 1e"),
         ({"render_height": "tall"}, "render_height must be a finite number"),
         ({"camera_path": None}, "camera_path must be a list"),
         ({"camera_path": []}, "camera_path must be a list of at least one camera"),

@@ -130,6 +130,14 @@ MISTAKES = {
         {"set": ["capacity=9"]},
         "--set changes the shape .*--run=.* was trained with other",
     ),
+    "too large": (
+        {"views": None, "orbit": True, "width": 100_000, "height": 100_000},
+        r"--width and --height: frames of 100000 x 100000 pixels need 3725.3 GiB, but this .* has",
+    ),
+    "too large a dolly": (
+        {"views": None, "from": "0", "pixel": ["16", "12"], "width": 100_000},
+        r"--width and --height: frames of 100000 x 75000 pixels need",
+    ),
     "no camera path": ({"views": None, "camera_path": "no.json"}, "no.json cannot be read"),
 }
 

@@ -15,12 +15,15 @@ import numpy as np
 from jaxcloseup.captures.json_fields import number, read_object, rigid_transform
 from jaxcloseup.geometry.cameras import Camera, pixels_to_points
 from jaxcloseup.geometry.poses import closeup_position
+from jaxcloseup.memory import installed_memory
 from jaxcloseup.photographs import Views, camera_at
 from jaxcloseup.scenes import Scene, SceneError
 
 
 OPENGL = np.diag([1.0, -1, -1])  # y and z change sign between the OpenGL and OpenCV frames
 _RIGID = 1e-3
+_LARGEST = 2**31 - 1  # side of an image
+_BYTES_PER_PIXEL = 400  # half of what rendering surfels took
 
 
 class CameraError(Exception):
@@ -76,6 +79,7 @@ def read_camera_path(path: pathlib.Path) -> Shots:
     if kind != "perspective":
         raise CameraError(f"{path}: camera_type is {kind!r}: make it perspective")
     height, width = (_size(path, fields, key) for key in ("render_height", "render_width"))
+    check_memory(width, height, f"{path}: render_width and render_height")
     entries = fields.get("camera_path")
     if not isinstance(entries, list) or not entries:
         raise CameraError(f"{path}: camera_path must be a list of at least one camera")
@@ -262,6 +266,9 @@ def resized(camera: Camera, width: int | None, height: int | None) -> Camera:
       camera: one camera, or stacked cameras.
       width: new width in pixels; None keeps the aspect ratio.
       height: new height in pixels; None keeps the aspect ratio.
+
+    Raises:
+      CameraError: such an image does not fit into memory.
     """
     if width is None and height is None:
         return camera
@@ -269,10 +276,30 @@ def resized(camera: Camera, width: int | None, height: int | None) -> Camera:
         width = max(1, round(height * camera.width / camera.height))
     if height is None:
         height = max(1, round(width * camera.height / camera.width))
+    check_memory(width, height, "--width and --height")
     x, y = width / camera.width, height / camera.height
     scale = jnp.array([x, y, x, y], jnp.float32)
     scale = scale.reshape((1,) * (camera.intrinsics.ndim - 1) + (4,))
     return camera.replace(intrinsics=camera.intrinsics * scale, height=height, width=width)
+
+
+def check_memory(width: int, height: int, given_by: str) -> None:
+    """Raise before rendering images that would not fit into memory.
+
+    Args:
+      width: of the images, in pixels.
+      height: of the images.
+      given_by: what sets their size, for the message.
+
+    Raises:
+      CameraError: they would not.
+    """
+    needed = _BYTES_PER_PIXEL * width * height
+    if needed > (held := installed_memory()):
+        raise CameraError(
+            f"{given_by}: frames of {width} x {height} pixels need {needed / 2**30:.1f} GiB, but "
+            f"this computer has {held / 2**30:.1f}: choose smaller ones"
+        )
 
 
 def named_cameras(shots: Shots) -> list[tuple[str, Camera]]:
@@ -348,6 +375,6 @@ def _number(label, fields, key):
 
 def _size(path, fields, key):
     value = _number(str(path), fields, key)
-    if value < 1 or value != int(value):
+    if not 1 <= value <= _LARGEST or value != int(value):
         raise CameraError(f"{path}: {key} must be a whole number of pixels, not {value:g}")
     return int(value)
