@@ -1,1 +1,55 @@
-"""Scripts driven by absl flags; run from the root of the checkout."""
+"""Scripts driven by absl flags; run from the root of the checkout.
+
+Ctrl-C ends a program at once, also while it imports or compiles: files are written under other
+names first, so nothing is half-written, and `--resume` goes on from the last checkpoint. Python
+itself would wait until a step or a compilation ends, and raise an exception wherever it is then.
+"""
+
+import os
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable
+
+
+STOPPED = 130  # exit code after Ctrl-C
+_say: Callable[[], str] = lambda: "stopped"  # noqa: E731
+
+
+def when_stopped(say: Callable[[], str]) -> None:
+    """Set what Ctrl-C does before it ends the program: return the rest of its last sentence."""
+    global _say
+    _say = say
+
+
+def _watch(wakeups: socket.socket, program: str) -> None:
+    """End the program at the first SIGINT; other signals wake the thread too."""
+    while wakeups.recv(1) != bytes([signal.SIGINT]):
+        pass
+    try:
+        sentence = _say()
+    except Exception:
+        sentence = "stopped"
+    # What was printed before comes first, unless nobody reads it.
+    flush = threading.Thread(target=sys.stdout.flush, daemon=True)
+    flush.start()
+    flush.join(timeout=1)
+    shown = "\033[?25h\n" if sys.stderr.isatty() else ""  # progress bars hide the cursor
+    os.write(2, f"{shown}{program}: {sentence}\n".encode())
+    os._exit(STOPPED)
+
+
+def _handle_ctrl_c() -> None:
+    wakeups, wakes = socket.socketpair()
+    wakes.setblocking(False)
+    signal.signal(signal.SIGINT, lambda *_: None)
+    signal.set_wakeup_fd(wakes.detach(), warn_on_full_buffer=False)
+    program = sys.orig_argv[-len(sys.argv)]  # between -m and the program's own arguments
+    threading.Thread(target=_watch, args=(wakeups, program), daemon=True).start()
+
+
+# So `python -m` calls a program while it imports this package. A shell that starts programs in the
+# background lets them ignore Ctrl-C.
+if sys.argv[:1] == ["-m"] and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    _handle_ctrl_c()

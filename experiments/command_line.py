@@ -4,6 +4,7 @@ import contextlib
 import logging
 import os
 import pathlib
+import shlex
 import sys
 import warnings
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import jax
 from absl import flags
 
+import experiments
 from jaxcloseup.files import cache_folder
 
 
@@ -21,6 +23,7 @@ except ImportError:  # not a Unix: nothing is locked
 
 
 LOCK = ".lock"  # in a folder that a program trains in
+CHECKPOINTS = "checkpoints"  # its folder that can be resumed from
 FLAGS = flags.FLAGS
 flags.DEFINE_string(
     "lpips_weights",
@@ -118,3 +121,28 @@ def lock_output_dir(folder: pathlib.Path) -> contextlib.AbstractContextManager[A
         file.write(str(os.getpid()))
         file.flush()
     return file
+
+
+def prepare_to_stop(folder: pathlib.Path, program: str | None = None) -> None:
+    """Let Ctrl-C remove unfinished files from an output folder, and print how to resume.
+
+    Args:
+      folder: the output folder.
+      program: name of a program that resumes training in it; None cannot be resumed.
+    """
+    arguments = sys.argv[1:]
+    if FLAGS.output_dir is None:
+        arguments += [f"--output_dir={folder}"]
+
+    def say():
+        for part in folder.rglob(f".*.{os.getpid()}.part*"):
+            part.unlink(missing_ok=True)
+        if program is None:
+            return "stopped"
+        if not (folder / CHECKPOINTS).is_dir():
+            return "stopped before training began: give the same command again"
+        resume = [] if "--resume" in arguments else ["--resume"]
+        command = shlex.join(["python", "-m", program, *arguments, *resume])
+        return f"stopped: resume it with {command}"
+
+    experiments.when_stopped(say)

@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 from absl import app, flags
 
-from experiments.command_line import check_unused, set_up
+from experiments.command_line import check_unused, prepare_to_stop, set_up
 from experiments.training.detail import detail_path, find_detail
 from experiments.training.fine_tuning import fine_tune
 from experiments.training.loop import TrainingError
@@ -123,6 +123,7 @@ def _render() -> None:
     record, stage = run_from_flags()
     stamp = datetime.datetime.now().strftime("%Y-%m-%d_%H%M%S")
     output_dir = check_unused(FLAGS.output_dir or record.folder / "videos" / stamp)
+    prepare_to_stop(output_dir)
     file = FLAGS.target or FLAGS.camera_path
     shots = camera_paths.read_camera_path(pathlib.Path(file)) if file else None
     file = FLAGS.camera_transform

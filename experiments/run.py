@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from absl import app, flags
 
-from experiments.command_line import lock_output_dir, set_up
+from experiments.command_line import lock_output_dir, prepare_to_stop, set_up
 from experiments.evaluation.metrics_text import FINER
 from experiments.evaluation.scores import NO_PERCEPTUAL, Perceptual, find_perceptual
 from experiments.methods import Preset
@@ -136,6 +136,7 @@ def main(argv: list[str]) -> None:
         output_dir = training_flags.choose_output_dir(
             FLAGS.output_dir, FLAGS.scene, FLAGS.method, resume=FLAGS.resume
         )
+        prepare_to_stop(output_dir, "experiments.run")
         load_options = training_flags.load_options_from_flags(preset)
         scene = training_flags.load(FLAGS.scene, load_options)
         perceptual = find_perceptual(FLAGS.lpips_weights)

@@ -17,7 +17,7 @@ from typing import Any
 import jax
 from absl import app, flags
 
-from experiments.command_line import lock_output_dir, set_up
+from experiments.command_line import lock_output_dir, prepare_to_stop, set_up
 from experiments.evaluation.scores import Perceptual, find_perceptual
 from experiments.methods import Preset
 from experiments.reporting.page import Picture
@@ -129,6 +129,7 @@ def main(argv: list[str]) -> None:
             output_dir = training_flags.choose_output_dir(
                 FLAGS.output_dir, "sweep", FLAGS.method, resume=FLAGS.resume
             )
+        prepare_to_stop(output_dir, "experiments.sweep")
         perceptual = find_perceptual(FLAGS.lpips_weights)
         load_options = training_flags.load_options_from_flags(preset)
         scenes = [training_flags.load(name, load_options) for name in FLAGS.scenes]

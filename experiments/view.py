@@ -8,7 +8,6 @@ it. The run's own renderer makes the pictures below the buttons. All visitors sh
 camera and one picture. The program needs the extra "viewer".
 """
 
-import contextlib
 import sys
 
 from absl import app, flags
@@ -58,10 +57,8 @@ def main(argv: list[str]) -> None:
     except (RunError, server.ServeError, SceneError, CheckpointError, OSError) as error:
         sys.exit(f"experiments.view: {error}")
     print(f"open http://{FLAGS.host}:{FLAGS.port} in a browser; press Ctrl-C to stop", flush=True)
-    with contextlib.suppress(KeyboardInterrupt):
-        while True:
-            viewer.work()
-    viser_server.stop()
+    while True:
+        viewer.work()
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from typing import Any
 
 from absl import flags
 
-from experiments.command_line import check_unused
+from experiments.command_line import CHECKPOINTS, check_unused
 from experiments.methods import METHODS, Preset
 from experiments.training import set_flag
 from experiments.training.settings import with_settings
@@ -140,7 +140,7 @@ def choose_output_dir(
 ) -> pathlib.Path:
     """The output folder; never one that holds something, unless its training is to be resumed."""
     if resume:
-        if folder is None or not (pathlib.Path(folder) / "checkpoints").is_dir():
+        if folder is None or not (pathlib.Path(folder) / CHECKPOINTS).is_dir():
             raise FileNotFoundError(
                 f"--resume finds no run in --output_dir={folder or ''}: name the folder of one "
                 "that was cut off"
@@ -150,4 +150,9 @@ def choose_output_dir(
         stamp = datetime.datetime.now().strftime("%Y-%m-%d_%H%M%S")
         own_name = os.path.basename(os.path.realpath(scene))  # of `..` too
         folder = os.path.join("outputs", own_name, method, stamp)
+    if (pathlib.Path(folder) / CHECKPOINTS).is_dir():
+        raise FileExistsError(
+            f"--output_dir={folder} already exists and is not empty: resume its training with "
+            "--resume, or name a new folder"
+        )
     return check_unused(folder)
