@@ -40,16 +40,20 @@ def _watch(wakeups: socket.socket, program: str) -> None:
     os._exit(STOPPED)
 
 
-def _handle_ctrl_c() -> None:
+def end_at_ctrl_c(program: str) -> None:
+    """End the program at Ctrl-C from now on, with a sentence that begins with its name.
+
+    A shell that starts programs in the background lets them ignore Ctrl-C, and so does this.
+    """
+    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        return
     wakeups, wakes = socket.socketpair()
     wakes.setblocking(False)
     signal.signal(signal.SIGINT, lambda *_: None)
     signal.set_wakeup_fd(wakes.detach(), warn_on_full_buffer=False)
-    program = sys.orig_argv[-len(sys.argv)]  # between -m and the program's own arguments
     threading.Thread(target=_watch, args=(wakeups, program), daemon=True).start()
 
 
-# So `python -m` calls a program while it imports this package. A shell that starts programs in the
-# background lets them ignore Ctrl-C.
-if sys.argv[:1] == ["-m"] and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-    _handle_ctrl_c()
+# So `python -m` calls a program while it imports this package.
+if sys.argv[:1] == ["-m"]:
+    end_at_ctrl_c(sys.orig_argv[-len(sys.argv)])  # what is between -m and the program's arguments

@@ -8,6 +8,8 @@ is `python -m experiments.run --scene=table`, from any folder.
 import runpy
 import sys
 
+from experiments import end_at_ctrl_c
+
 
 PROGRAMS = {
     "run": "train on one scene, fine-tune on pseudo-labeled close-ups, evaluate, report",
@@ -31,6 +33,7 @@ def main() -> None:
         return
     if name not in PROGRAMS:
         sys.exit(f"jaxcloseup: {name} is not a program: choose {', '.join(PROGRAMS)}")
+    end_at_ctrl_c(f"experiments.{name}")
     sys.argv[1:] = rest
     runpy.run_module(f"experiments.{name}", run_name="__main__", alter_sys=True)
 

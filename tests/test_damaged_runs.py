@@ -111,7 +111,7 @@ def test_a_file_that_does_not_end_is_not_read(kept, tmp_path, make):
     copy_of(kept, tmp_path, None, None)
     (tmp_path / RUN).unlink()
     make(tmp_path / RUN)
-    message = r"run\.json cannot be read \(.*(Not an ordinary file|More than 1024 MiB)"
+    message = r"run\.json cannot be read \((Not an ordinary file|More than 1024 MiB)"
     with pytest.raises(RunError, match=message):
         read_run(tmp_path)
     with pytest.raises(CheckpointError, match=message):
@@ -174,6 +174,15 @@ def test_damaged_lines_of_the_log_are_left_out(tmp_path):
     file.write_text("\n".join([*lines, NESTED]))
     TrainLog(tmp_path).begin("control", [])
     assert list(map(json.loads, file.read_text().splitlines())) == [good]
+
+
+def test_a_log_that_is_a_pipe_is_one_sentence(tmp_path):
+    (tmp_path / "stats").mkdir()
+    pipe(tmp_path / "stats" / "train.jsonl")
+    with pytest.raises(
+        OSError, match=r"^/.*train\.jsonl cannot be read .* regular file\): remove it"
+    ):
+        TrainLog(tmp_path).begin("control", [])
 
 
 def test_every_preset_is_within_the_bounds_of_settings():

@@ -51,8 +51,12 @@ class TrainLog:
         self._step, self._seconds, self._start = 0, 0.0, 0.0
 
     def begin(self, stage: str, history: Sequence[Mapping[str, Any]]) -> None:
-        """Start a stage, or resume it after the chunks of `history`."""
-        old = read_bytes(self._file) if self._file.exists() else b""
+        """Start a stage, or resume it after the chunks of `history`.
+
+        Raises:
+          OSError: the log cannot be read or written.
+        """
+        old = self._read()
         stages: dict[str, list[Mapping[str, Any]]] = {}
         for line in filter(None, map(_parse, old.splitlines())):
             stages.setdefault(line["stage"], []).append(line)
@@ -103,6 +107,14 @@ class TrainLog:
                 for key, value in metrics.items()
             }
             self._events.write(self._step, numbers, images)
+
+    def _read(self):
+        try:
+            return read_bytes(self._file) if self._file.exists() else b""
+        except OSError as error:
+            raise OSError(
+                f"{self._file} cannot be read ({error.strerror}): remove it to log anew"
+            ) from error
 
     def _open(self, stage):
         self._stage = stage

@@ -192,7 +192,7 @@ def read_fields(path: pathlib.Path, kinds: Mapping[str, type]) -> dict[str, Any]
     try:
         found = read_object(path)
     except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
+        reason = getattr(error, "strerror", None) or error
         raise RunError(
             f"{path} cannot be read ({reason}): restore it from a copy of the run"
         ) from None

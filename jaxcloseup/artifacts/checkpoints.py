@@ -52,8 +52,9 @@ class Checkpoints:
         try:
             kept = read_object(path)
         except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or error
             raise CheckpointError(
-                f"{path} cannot be read ({error}): start a new run in another output folder."
+                f"{path} cannot be read ({reason}): start a new run in another output folder."
             ) from error
         for name in sorted(kept.keys() | identity.keys()):
             if kept.get(name) != identity.get(name):
