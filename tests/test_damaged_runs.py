@@ -180,7 +180,7 @@ def test_a_log_that_is_a_pipe_is_one_sentence(tmp_path):
     (tmp_path / "stats").mkdir()
     pipe(tmp_path / "stats" / "train.jsonl")
     with pytest.raises(
-        OSError, match=r"^/.*train\.jsonl cannot be read .* regular file\): remove it"
+        OSError, match=r"^/.*train\.jsonl cannot be read .* ordinary file\): remove it"
     ):
         TrainLog(tmp_path).begin("control", [])
 

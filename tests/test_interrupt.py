@@ -73,6 +73,14 @@ def test_imports_are_interrupted(start, program, imported):
     assert f"experiments.{program}: stopped\n" in err
 
 
+def test_the_command_is_interrupted(start):
+    begin = "import sys; sys.argv = ['jaxcloseup', 'run']; import experiments.__main__ as command"
+    process = start("-X", "importtime", "-c", f"{begin}; command.main()")
+    wait_for(process.stderr, " jax")
+    _, err = stop(process)
+    assert "experiments.run: stopped\n" in err
+
+
 def test_a_run_is_interrupted_and_resumes(start, capture_folder, tmp_path):
     """First between two checkpoints, then while it compiles."""
     out = tmp_path / "a run"
