@@ -6,7 +6,9 @@ and ratios. Absolute times depend on the machine and its load; ratios carry over
 
 import importlib
 
-from absl import app, flags
+from absl import flags
+
+from experiments.command_line import start
 
 
 SUITES = ("nerf", "warp", "labels", "splats", "sweep", "resume", "detail", "scales", "gpu")
@@ -26,4 +28,4 @@ def _known(values: dict[str, list[str]]) -> bool:
 
 
 if __name__ == "__main__":
-    app.run(main)
+    start(main)

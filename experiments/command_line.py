@@ -1,16 +1,18 @@
 """Flags and setup that the programs of `experiments` share."""
 
 import contextlib
+import functools
 import logging
 import os
 import pathlib
 import shlex
 import sys
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import jax
-from absl import flags
+from absl import app, flags
 
 import experiments
 from jaxcloseup.files import cache_folder
@@ -42,6 +44,26 @@ flags.DEFINE_string(
     "folder for results; default: outputs/<scene>/<method>/<date_time>, and for "
     "experiments.render <run>/videos/<date_time>",
 )
+
+
+def start(main: Callable[[list[str]], None]) -> None:
+    """Run a program; `--help` and `-h` print its flags, and a wrong flag is one sentence."""
+    if {"-h", "--help"} & set(sys.argv[1:]):
+        try:
+            app.run(main, argv=[sys.argv[0], "--help"])
+        except SystemExit:
+            sys.exit(0)
+    call = functools.partial
+    app.run(call(_in_a_sentence, main), flags_parser=call(_in_a_sentence, FLAGS))
+
+
+def _in_a_sentence(call, words):
+    """Call with the command line's words; what is wrong with them is one sentence."""
+    try:
+        return call(words)
+    except (flags.Error, app.UsageError) as error:
+        program = pathlib.Path(words[0]).stem
+        sys.exit(f"experiments.{program}: {' '.join(str(error).split())} (--help lists the flags)")
 
 
 def set_up() -> None:

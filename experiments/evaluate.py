@@ -15,7 +15,7 @@ from absl import app, flags
 from rich.console import Console
 from rich.table import Table
 
-from experiments.command_line import set_up
+from experiments.command_line import set_up, start
 from experiments.evaluation.metrics_text import COLUMNS, format_metric
 from experiments.evaluation.scores import Perceptual, find_perceptual, score_image, summarize
 from jaxcloseup.captures.images import read_image, read_mask
@@ -147,4 +147,4 @@ def main(argv: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    app.run(main)
+    start(main)

@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 from absl import app, flags
 
-from experiments.command_line import check_unused, prepare_to_stop, set_up
+from experiments.command_line import check_unused, prepare_to_stop, set_up, start
 from experiments.training.detail import detail_path, find_detail
 from experiments.training.fine_tuning import fine_tune
 from experiments.training.loop import TrainingError
@@ -242,4 +242,4 @@ def _images(folder: pathlib.Path, shots: Shots) -> Iterator[np.ndarray]:
 
 
 if __name__ == "__main__":
-    app.run(main)
+    start(main)

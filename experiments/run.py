@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from absl import app, flags
 
-from experiments.command_line import lock_output_dir, prepare_to_stop, set_up
+from experiments.command_line import lock_output_dir, prepare_to_stop, set_up, start
 from experiments.evaluation.metrics_text import FINER
 from experiments.evaluation.scores import NO_PERCEPTUAL, Perceptual, find_perceptual
 from experiments.methods import Preset
@@ -169,4 +169,4 @@ def _known(values: dict[str, list[str]]) -> bool:
 
 
 if __name__ == "__main__":
-    app.run(main)
+    start(main)

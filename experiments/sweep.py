@@ -17,7 +17,7 @@ from typing import Any
 import jax
 from absl import app, flags
 
-from experiments.command_line import lock_output_dir, prepare_to_stop, set_up
+from experiments.command_line import lock_output_dir, prepare_to_stop, set_up, start
 from experiments.evaluation.scores import Perceptual, find_perceptual
 from experiments.methods import Preset
 from experiments.reporting.page import Picture
@@ -204,4 +204,4 @@ def sweep_scenes(
 
 
 if __name__ == "__main__":
-    app.run(main)
+    start(main)

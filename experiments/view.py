@@ -12,7 +12,7 @@ import sys
 
 from absl import app, flags
 
-from experiments.command_line import set_up
+from experiments.command_line import set_up, start
 from experiments.training.detail import detail_path
 from experiments.training.stored_run import RunError, load_run_scene, restore
 from experiments.viewing.flags import run_from_flags
@@ -62,4 +62,4 @@ def main(argv: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    app.run(main)
+    start(main)

@@ -60,15 +60,24 @@ def test_the_command_knows_all_programs(monkeypatch, capsys):
 
 def test_the_command_runs_a_program_from_any_folder(tmp_path):
     root = pathlib.Path(command.__file__).parents[1]
-    done = subprocess.run(
-        [sys.executable, "-m", "experiments", "evaluate", "--help"],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(root)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+
+    def call(*words):
+        return subprocess.run(
+            [sys.executable, "-m", "experiments", "evaluate", *words],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": str(root)},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+
+    done = call("-h")
+    assert done.returncode == 0
     assert "Score a folder of rendered images" in done.stdout and "--renders" in done.stdout
+    done = call("--render=a")
+    assert done.returncode == 1
+    assert done.stderr.startswith("experiments.evaluate: Unknown command line flag 'render'")
+    assert done.stderr.endswith("(--help lists the flags)\n") and done.stderr.count("\n") == 1
 
 
 def test_nothing_to_resume_is_one_sentence(parsed_flags, tmp_path):
@@ -266,7 +275,8 @@ def test_help_lists_every_setting(parsed_flags):
     shown = flags.FLAGS["set"].help
     for method in METHODS.values():
         for name in settings_of(method.presets["quick"]):
-            assert name in shown
+            assert name in shown or (name.startswith("coarse.") and "coarse model" in shown)
+    assert "coarse.capacity" not in shown  # the coarse model has all settings of surfels again
 
 
 def test_surfels_can_be_cloned_and_split(parsed_flags):

@@ -24,6 +24,7 @@ BOUNDS = {
     "magnification": (1, math.inf),
     "capacity": (1, 10**8),
     "sh_degree": (0, 3),
+    "max_scale": (1e-6, math.inf),
     "depth": (1, 64),  # layers
     "tile": (1, 64),
     **dict.fromkeys(("position_octaves", "direction_octaves"), (0, 64)),
@@ -220,8 +221,12 @@ def describe_settings(methods: Mapping[str, Method]) -> str:
     shared = [name for name in first if name in shared and first[name].path[0] != "field"]
     parts = ["settings of every method: " + ", ".join(shared)]
     for name, settings in by_method.items():
-        own = (f"{key}={_text(s.value)}" for key, s in settings.items() if key not in shared)
-        parts.append(f"settings of {name}, with the values of its first preset: " + ", ".join(own))
+        own = {key: s for key, s in settings.items() if key not in shared}
+        coarse = [key for key in own if key.startswith("coarse.")]
+        texts = [f"{key}={_text(s.value)}" for key, s in own.items() if key not in coarse]
+        # The coarse model has all settings of the field again.
+        texts += ["coarse.steps and the other settings of the coarse model"] if coarse else []
+        parts.append(f"settings of {name}, with its first preset's values: " + ", ".join(texts))
     return "; ".join(parts)
 
 
