@@ -24,6 +24,7 @@ class Picture(NamedTuple):
     image: np.ndarray
 
 
+_SMALL = 70  # quality of pictures that are many
 _COMPARISON_NOTE = (
     "Each picture shows the true image, renders in the order trained, and the error of the last "
     "one: black is none, and bright yellow is a quarter of the range of colors, or more."
@@ -46,15 +47,15 @@ def figures(pictures: Sequence[Picture]) -> list[str]:
             parts.append(f"<h2>{html.escape(section)}</h2>")
             note = _PICTURE_NOTES.get(section.split(": ")[-1])  # a sweep's begin with the scene
             parts += [f"<p>{note}</p>"] if note else []
-        parts.append(figure(picture.image, picture.caption))
+        parts.append(figure(picture.image, picture.caption, quality=_SMALL))
     return parts
 
 
-def figure(image: np.ndarray, caption: str) -> str:
-    """Return an image with its caption."""
+def figure(image: np.ndarray, caption: str, *, quality: int = 90) -> str:
+    """Return an image with its caption; `quality` is that of `webp_data_uri`."""
     caption = html.escape(caption)
     return (
-        f"<figure><img alt='{caption}' src='{webp_data_uri(image)}'>"
+        f"<figure><img alt='{caption}' src='{webp_data_uri(image, quality=quality)}'>"
         f"<figcaption>{caption}</figcaption></figure>"
     )
 
@@ -102,6 +103,7 @@ figure { margin: 1em 0 }
 img { display: block; width: 100% }
 details { margin: 1em 0; border-top: 1px solid #ccc; padding-top: 1em }
 summary { cursor: pointer; font-size: 1.25em; font-weight: bold }
+.moving { max-width: 590px }
 .pair { display: grid; gap: 0 1em;
   grid-template-columns: repeat(auto-fit, minmax(min(100%, 340px), 1fr)) }
 .slider div { position: relative }

@@ -123,7 +123,8 @@ def _moving(dolly):
         return []
     text = "from where a photograph was taken towards what a close-up shows, and back"
     source = f"data:image/webp;base64,{base64.b64encode(dolly).decode()}"
-    return [f"<figure><img alt='{text}' src='{source}'><figcaption>{text}</figcaption></figure>"]
+    image = f"<img alt='{text}' src='{source}'>"
+    return [f"<figure class=moving>{image}<figcaption>{text}</figcaption></figure>"]
 
 
 def _exhibition(shown, stage):
