@@ -16,13 +16,13 @@ from tiny_runs import TINY, TINY_SURFELS
 from experiments.evaluate import evaluate_folders
 from experiments.evaluation.audit import blur_to_footprint
 from experiments.evaluation.scores import NO_PERCEPTUAL, Target, score, summarize
-from experiments.methods import CoarseConfig, WindowConfig, pseudo_settings
+from experiments.methods import METHODS, CoarseConfig, WindowConfig, pseudo_settings
 from experiments.methods.surfels import REDUCED
 from experiments.run import run
 from experiments.training.gate import AGREEMENT, verdict, weigh_labels
 from experiments.training.loop import TrainingError, run_stage
 from experiments.training.programs import Programs
-from experiments.training.setup import initial_points
+from experiments.training.setup import initial_points, initial_state
 from experiments.training.stored_run import choose_stage, load_run_scene, read_run, restore
 from experiments.viewing.approach import FRAMES
 from jaxcloseup.artifacts.checkpoints import Checkpoints
@@ -138,6 +138,21 @@ def test_windows_of_reduced_photographs_are_these(capture_folder):
     scene = load_scene(str(capture_folder), downscale=2)
     preset = dataclasses.replace(TINY_SURFELS, windows=WindowConfig(finest=2), downscale=2)
     assert Programs(preset, scene).photographs is scene.train
+
+
+def test_a_nerf_may_learn_from_rays_of_larger_photographs(capture_folder, capsys):
+    with jax.numpy_dtype_promotion("standard"):
+        scene = load_scene(str(capture_folder), downscale=2)
+        preset = dataclasses.replace(TINY, windows=WindowConfig(), downscale=2)
+        programs = Programs(preset, scene)
+        photographs = programs.photographs
+        assert "learning from pixels of photographs of 32 x 24 pixels" in capsys.readouterr().out
+        assert photographs.pyramid.sizes == ((24, 32), (12, 16))
+        state, metrics = programs.run(
+            "photographs", initial_state(programs, 0), photographs, count=2
+        )
+    assert state.step == 2 and metrics["skipped"] == 0 and np.isfinite(metrics["loss"])
+    assert METHODS["nerf"].presets["quick"].windows.finest == 8  # reduced photographs alone
 
 
 def test_no_step_is_taken_on_a_truncated_image(capture_folder, capsys):

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import optax
 
-from experiments.methods.method import LabelConfig, Method, Preset
+from experiments.methods.method import LabelConfig, Method, Preset, WindowConfig
 from jaxcloseup.field import RadianceField
 from jaxcloseup.scene import Scene
 from jaxcloseup.train import TrainConfig
@@ -75,6 +75,8 @@ QUICK = Preset(
     baseline_steps=1000,
     closeup_steps=200,
     downscale=8,
+    # The network is too small for the detail of larger photographs: windows.finest=1 wins nothing.
+    windows=WindowConfig(finest=8),
 )
 
 
