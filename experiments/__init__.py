@@ -1,4 +1,4 @@
-"""Scripts driven by absl flags; run from the root of the checkout.
+"""Scripts driven by absl flags.
 
 Ctrl-C ends a program at once, also while it imports or compiles: files are written under other
 names first, so nothing is half-written, and `--resume` goes on from the last checkpoint. Python

@@ -27,7 +27,7 @@ def zoom_plots(stages: Mapping[str, Any]) -> list[str]:
             " The second plot shows how far each stage is above <i>control</i>: labels help where "
             "the curve of <i>closeup</i> is above 0."
         )
-    return [f"<h2>PSNR by magnification</h2><p>{text}</p><div class=plots>", *plots, "</div>"]
+    return [f"<p>{text}</p><div class=plots>", *plots, "</div>"]
 
 
 def label_plots(labels: Mapping[str, Any], left_out: Mapping[str, Any] | None) -> list[str]:

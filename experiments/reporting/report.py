@@ -114,7 +114,7 @@ def write_report(
     if results["detail"]:
         parts += folded("How right is the detail?", [detail_table(results["detail"])])
     config = html.escape(json.dumps({k: results[k] for k in ("config", "versions")}, indent=1))
-    parts += folded("Configuration", [f"<pre>{config}</pre>", "</html>"])
+    parts += [*folded("Configuration", [f"<pre>{config}</pre>"]), "</html>"]
     write_file(path, "\n".join(parts).encode())
 
 

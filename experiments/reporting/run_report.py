@@ -18,6 +18,7 @@ from experiments.training.stages import Outcome
 from jaxcloseup.artifacts.images import encode_webp_animation
 from jaxcloseup.files import write_file, write_json
 from jaxcloseup.label_rules import label_depth
+from jaxcloseup.pyramids import Pyramid
 
 
 _FPS = 12
@@ -95,9 +96,19 @@ def _showcase(programs: Programs, outcome: Outcome) -> list[Exhibit]:
         {name: one["psnr"] for name, one in views.items() if one["psnr"] is not None},
         render_depth=lambda camera: label_depth(programs.render(outcome.start.state, camera)),
         sources=outcome.start.sources,
-        photographs=programs.pyramid()[0],
+        photographs=_loaded_photographs(programs, outcome),
         names=programs.scene.names["train"],
     )
+
+
+def _loaded_photographs(programs: Programs, outcome: Outcome) -> Pyramid:
+    """The finest photographs that the stages have read: a report must not draw or read others."""
+    windows, finest = programs.preset.windows, programs.preset.downscale
+    if outcome.detail is not None:
+        finest = 1
+    elif windows is not None:
+        finest = windows.finest
+    return programs.pyramid(finest)[0]
 
 
 def _finer_resolution(targets: Mapping[str, Sequence[Target]]) -> list[int] | None:
