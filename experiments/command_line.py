@@ -1,17 +1,19 @@
 """Flags and setup that the programs of `experiments` share."""
 
 import contextlib
-import functools
+import difflib
 import logging
 import os
 import pathlib
+import re
 import shlex
+import shutil
 import sys
+import textwrap
 import warnings
 from collections.abc import Callable
 from typing import Any
 
-import jax
 from absl import app, flags
 
 import experiments
@@ -45,25 +47,108 @@ flags.DEFINE_string(
     "experiments.render <run>/videos/<date_time>",
 )
 
+_TOPICS = {
+    "What is trained": "scene scenes method preset set stages arms seed seeds downscale windows",
+    "The capture": "format split zoom half_pixel invert_masks alpha_mode",
+    "The run": "run stage data",
+    "Cameras": "views camera_path camera_transform target orbit from pixel magnification up frames "
+    "width height",
+    "Pictures": "fine_tune target_steps detail support fps",
+    "Results": "output_dir output resume save_every tensorboard",
+    "Computers": "host port max_parallel coordinator num_processes process_id compilation_cache "
+    "lpips_weights",
+}
+
 
 def start(main: Callable[[list[str]], None]) -> None:
-    """Run a program; `--help` and `-h` print its flags, and a wrong flag is one sentence."""
+    """Run a program; `--help` and `-h` print its flags, and a wrong flag or word is one sentence.
+
+    Args:
+      main: is called with the program's path. It imports JAX, and its module does not.
+    """
     if {"-h", "--help"} & set(sys.argv[1:]):
-        try:
-            app.run(main, argv=[sys.argv[0], "--help"])
-        except SystemExit:
-            sys.exit(0)
-    call = functools.partial
-    app.run(call(_in_a_sentence, main), flags_parser=call(_in_a_sentence, FLAGS))
+        with contextlib.suppress(BrokenPipeError):  # `--help | head`
+            print(_describe_program(), flush=True)
+        os._exit(0)
+    app.run(main, flags_parser=_parse)
 
 
-def _in_a_sentence(call, words):
-    """Call with the command line's words; what is wrong with them is one sentence."""
+def _parse(words):
+    """Set the flags; what is wrong with them is one sentence."""
     try:
-        return call(words)
-    except (flags.Error, app.UsageError) as error:
-        program = pathlib.Path(words[0]).stem
-        sys.exit(f"experiments.{program}: {' '.join(str(error).split())} (--help lists the flags)")
+        rest = FLAGS(words)
+    except flags.Error as error:
+        reason = _explain(error)
+    else:
+        if len(rest) == 1:
+            return rest
+        reason = f"{rest[1]} is not a flag: flags begin with --"
+    sys.exit(f"experiments.{pathlib.Path(words[0]).stem}: {reason}")
+
+
+def _explain(error):
+    """What is wrong with a flag, beginning with its name."""
+    text = " ".join(str(error).split())
+    if isinstance(error, flags.UnrecognizedFlagError):
+        near = difflib.get_close_matches(error.flagname, _own_flags(), n=1)
+        meant = "".join(f"perhaps --{name} is meant; " for name in near)
+        return f"--{error.flagname} is not a flag: {meant}--help lists all flags"
+    if found := re.match(r"Missing value for flag (\S+)", text):
+        return f"{found[1]} needs a value"
+    if found := re.match(r"flag --(\w+)=(.*?): ", text):
+        return f"--{found[1]}={found[2]} must be {_wanted(FLAGS[found[1]].parser)}"
+    return re.sub(r"^flags? .*?: (?=--)", "", text)  # of a validator
+
+
+def _wanted(parser):
+    """What a flag's parser takes, in words."""
+    if choices := getattr(parser, "enum_values", None):
+        return f"one of {', '.join(choices)}"
+    if isinstance(parser, flags.BooleanParser):
+        return "true or false"
+    if not isinstance(parser, flags.IntegerParser | flags.FloatParser):
+        return parser.syntactic_help
+    kind = "a whole number" if isinstance(parser, flags.IntegerParser) else "a number"
+    low, high = parser.lower_bound, parser.upper_bound
+    if low is None:
+        return kind
+    return f"{kind} of at least {low}" if high is None else f"{kind} between {low} and {high}"
+
+
+def _own_flags():
+    """The flags of the program that runs, by name."""
+    return {flag.name: flag for flag in FLAGS.get_key_flags_for_module(sys.argv[0])}
+
+
+def _describe_program():
+    """What the program does, and its flags by topic."""
+    found = _own_flags()
+    topics = {topic: [n for n in names.split() if n in found] for topic, names in _TOPICS.items()}
+    others = sorted(set(found).difference(*topics.values()))
+    lines = [(sys.modules["__main__"].__doc__ or "").strip()]
+    for topic, names in ({"Its own flags": others} | topics).items():
+        if names:
+            lines += ["", f"{topic}:", *(_describe_flag(found[name]) for name in names)]
+    return "\n".join(lines)
+
+
+def _describe_flag(flag):
+    width = min(max(shutil.get_terminal_size().columns, 60), 100)
+    if flag.boolean:
+        shown = f"--[no]{flag.name}"
+    else:
+        values = flag.default if isinstance(flag.default, list) else [flag.default]
+        shown = f"--{flag.name}=" + ",".join("..." if one is None else str(one) for one in values)
+    text = re.sub(r"^<.*?>: |;\s+repeat this option .*", "", flag.help)  # as absl says it
+    choices = getattr(flag.parser, "enum_values", ())
+    if not all(choice in text for choice in choices):
+        text += f"; one of {', '.join(choices)}"
+    if flag.boolean and flag.default:
+        text += "; on by default"
+    left = " " * 26
+    wrapped = textwrap.fill(text, width, initial_indent=left, subsequent_indent=left)
+    first = f"  {shown}"
+    return first + wrapped[len(first) :] if len(first) < len(left) - 1 else f"{first}\n{wrapped}"
 
 
 def set_up() -> None:
@@ -87,6 +172,8 @@ def set_up_compilation_cache(folder: str | None) -> None:
     if folder is None:
         folder = str(cache_folder() / "jaxcloseup" / "xla")
     if folder:
+        import jax  # not before the flags are read
+
         jax.config.update("jax_compilation_cache_dir", folder)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 

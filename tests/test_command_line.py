@@ -1,5 +1,6 @@
 """Flags of `experiments.run`: what they set, and one sentence for each that makes no sense."""
 
+import importlib
 import json
 import os
 import pathlib
@@ -18,7 +19,9 @@ from experiments import run as program
 from experiments import sweep
 from experiments.command_line import LOCK, check_unused, lock_output_dir
 from experiments.methods import METHODS
+from experiments.training import define_flags, names
 from experiments.training import flags as training_flags
+from experiments.training.arms import KINDS
 from experiments.training.settings import plain_config, settings_of
 from jaxcloseup.scene import SceneError
 from jaxcloseup.splats.adaptive import AdaptiveConfig
@@ -36,7 +39,7 @@ def parsed_flags():
 
 def test_help_lists_the_flags_that_programs_share():
     keys = flags.FLAGS.key_flags_by_module_dict()
-    defined = flags.FLAGS.flags_by_module_dict()[training_flags.__name__]
+    defined = flags.FLAGS.flags_by_module_dict()[define_flags.__name__]
     shared = {flag.name for flag in defined} | {"output_dir"}
     for module in (program, sweep):
         assert shared <= {flag.name for flag in keys[module.__name__]}
@@ -76,8 +79,10 @@ def test_the_command_runs_a_program_from_any_folder(tmp_path):
     assert "Score a folder of rendered images" in done.stdout and "--renders" in done.stdout
     done = call("--render=a")
     assert done.returncode == 1
-    assert done.stderr.startswith("experiments.evaluate: Unknown command line flag 'render'")
-    assert done.stderr.endswith("(--help lists the flags)\n") and done.stderr.count("\n") == 1
+    assert done.stderr == (
+        "experiments.evaluate: --render is not a flag: perhaps --renders is meant; --help lists "
+        "all flags\n"
+    )
 
 
 def test_nothing_to_resume_is_one_sentence(parsed_flags, tmp_path):
@@ -271,12 +276,75 @@ def test_settings_of_nested_records_have_their_path(parsed_flags):
     assert field.means_lr == (0.1, 0.01)
 
 
-def test_help_lists_every_setting(parsed_flags):
-    shown = flags.FLAGS["set"].help
-    for method in METHODS.values():
-        for name in settings_of(method.presets["quick"]):
-            assert name in shown or (name.startswith("coarse.") and "coarse model" in shown)
-    assert "coarse.capacity" not in shown  # the coarse model has all settings of surfels again
+def test_every_setting_is_listed_with_values_that_it_may_have(parsed_flags, capsys):
+    for name, method in METHODS.items():
+        given = flagsaver.flagsaver(method=name, preset="paper", set=["help"])
+        with given, pytest.raises(SystemExit) as end:
+            program.main(["run"])
+        assert end.value.code == 0
+        said = [line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()[1:]]
+        found = dict(one.split("=") for one, _ in said)
+        assert set(found) == set(settings_of(method.presets["paper"]))
+        wanted = dict(said)
+        assert found["rgb_tolerance"] == "0.05"
+        assert wanted["rgb_tolerance=0.05"] == "a number between 0 and inf"
+        assert wanted["use_mask=true"] == "true or false"
+
+
+def test_flags_know_all_names():
+    """Modules that define flags import no JAX, so they repeat the names of what imports it."""
+    assert {name: tuple(method.presets) for name, method in METHODS.items()} == names.PRESETS
+    assert names.ARMS == KINDS
+
+
+@pytest.mark.parametrize("name", command.PROGRAMS)
+def test_help_does_not_wait_for_jax(name):
+    """Importing JAX and what needs it takes seconds; absl and the flags take a twentieth of one."""
+    for words in ([name, "-h"], [name, "--help"]):
+        done = subprocess.run(
+            [sys.executable, "-X", "importtime", "-m", "experiments", *words],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0
+        imported = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
+        assert "absl.flags" in imported and not imported & {"jax", "numpy", "cv2", "matplotlib"}
+        doc = importlib.import_module(f"experiments.{name}").__doc__
+        assert done.stdout.startswith(doc.splitlines()[0])
+        shared = {"run": "The capture:", "render": "Cameras:", "view": "Computers:"}
+        assert shared.get(name, "--") in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            ["run", "--seed=-1"],
+            "--seed=-1 must be a whole number between 0 and 9223372036854775807",
+        ),
+        (["run", "--zoom=1"], "--zoom=1 must be a whole number of at least 2"),
+        (["run", "--resume=si"], "--resume=si must be true or false"),
+        (["run", "--split=all"], "--split=all must be one of given, every8, closest, zoom"),
+        (["run", "--stages=polish"], "--stages takes names of baseline, control, closeup, "),
+        (["run", "table"], "table is not a flag: flags begin with --"),
+        (["run", "--scene"], "--scene needs a value"),
+        (["render", "--fps=fast"], "--fps=fast must be a number"),
+        (["render", "--pixels=1,2"], "--pixels is not a flag: perhaps --pixel is meant; --help"),
+        (["bench", "nerf"], "nerf is not a flag"),
+    ],
+)
+def test_wrong_words_are_one_sentence(words, message):
+    done = subprocess.run(
+        [sys.executable, "-m", "experiments", *words],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1 and done.stdout == "" and done.stderr.count("\n") == 1
+    assert done.stderr.startswith(f"experiments.{words[0]}: {message}")
 
 
 def test_surfels_can_be_cloned_and_split(parsed_flags):

@@ -11,6 +11,7 @@ from absl.testing import flagsaver
 
 from experiments import evaluate as program
 from experiments.evaluation.scores import NO_PERCEPTUAL
+from experiments.jobs.evaluate import evaluate_folders
 
 
 @pytest.fixture(autouse=True)
@@ -57,7 +58,7 @@ def test_masks_choose_the_pixels_that_count(pair, tmp_path):
     lower[8:] = 255
     upper = 255 - lower
     masks = write_images(tmp_path / "masks", {"a.png": upper, "b.png": lower})
-    found = program.evaluate_folders(*pair, masks, NO_PERCEPTUAL)
+    found = evaluate_folders(*pair, masks, NO_PERCEPTUAL)
     assert found["views"]["a"]["psnr"] == pytest.approx(-10 * math.log10(0.04), abs=1e-4)
 
 

@@ -12,6 +12,7 @@ PACKAGE, EXPERIMENTS = ROOT / "jaxcloseup", ROOT / "experiments"
 MODULES = sorted([*PACKAGE.rglob("*.py"), *EXPERIMENTS.rglob("*.py")])
 MAY_IMPORT = {
     "version": set(),
+    "choices": set(),
     "files": set(),
     "memory": set(),
     "ply": {"files"},
@@ -38,7 +39,16 @@ MAY_IMPORT = {
         *("numerics", "geometry", "field", "photographs"),
         *("draws", "pseudo", "label_rules", "rendered_loss", "pyramids", "windows"),
     },
-    "captures": {"files", "memory", "ply", "numerics", "geometry", "photographs", "scene"},
+    "captures": {
+        "choices",
+        "files",
+        "memory",
+        "ply",
+        "numerics",
+        "geometry",
+        "photographs",
+        "scene",
+    },
     "procedural": {"files", "numerics", "geometry", "photographs", "scene"},
     "scenes": {"captures", "procedural", "scene"},
     "artifacts": {"files", "ply", "numerics", "geometry", "photographs", "splats"},
@@ -51,6 +61,7 @@ ROOMS = {
     "reporting": {"methods", "evaluation", "training"},
     "viewing": {"methods", "evaluation", "training"},
     "benchmarks": {"methods", "evaluation", "training", "reporting", "viewing"},
+    "jobs": {"methods", "evaluation", "training", "reporting", "viewing", "command_line"},
     "command_line": set(),
 }
 LIBRARIES_OF_GEOMETRY = {"jax", "chex", "flax", "typing", "jaxcloseup"}

@@ -9,7 +9,8 @@ import pytest
 from absl import flags
 from absl.testing import flagsaver
 
-from experiments import sweep
+from experiments import sweep as program
+from experiments.jobs import sweep
 from experiments.training import manifest
 from experiments.training.manifest import about_scene, git_commit, hash_data
 from experiments.training.sweep import SweepOutcome
@@ -106,7 +107,7 @@ def test_a_sweep_writes_a_manifest(capture_folder, tmp_path, monkeypatch):
     monkeypatch.setattr(sweep, "print_sweep", lambda *_: None)
     given = {"output_dir": str(tmp_path / "out"), "scenes": [str(capture_folder)], "downscale": 1}
     with flagsaver.flagsaver(compilation_cache="", arms=["control"], seeds=2, **given):
-        sweep.main(["sweep"])
+        program.main(["sweep"])
     assert started["finished"] is False and started["seconds"] is None
     after = json.loads((tmp_path / "out" / "manifest.json").read_text())
     name = capture_folder.name

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from tiny_capture import frame, write_image, write_json
 
-from experiments.evaluate import evaluate_folders
 from experiments.evaluation.renders import write_renders, write_truth
 from experiments.evaluation.scores import NO_PERCEPTUAL, evaluate, targets_by_split
+from experiments.jobs.evaluate import evaluate_folders
 from experiments.reporting.pictures import comparisons
 from experiments.viewing import frames
 from experiments.viewing.camera_paths import orbit, view_shots

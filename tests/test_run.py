@@ -13,12 +13,12 @@ import plane
 import pytest
 from tiny_runs import TINY, TINY_SURFELS
 
-from experiments.evaluate import evaluate_folders
 from experiments.evaluation.audit import blur_to_footprint
 from experiments.evaluation.scores import NO_PERCEPTUAL, Target, score, summarize
+from experiments.jobs.evaluate import evaluate_folders
+from experiments.jobs.run import run
 from experiments.methods import METHODS, CoarseConfig, WindowConfig, pseudo_settings
 from experiments.methods.surfels import REDUCED
-from experiments.run import run
 from experiments.training.gate import AGREEMENT, verdict, weigh_labels
 from experiments.training.loop import TrainingError, run_stage
 from experiments.training.programs import Programs

@@ -24,9 +24,10 @@ from experiments.benchmarks.timing import interleaved_medians
 from experiments.methods import Preset, surfels
 from experiments.methods.nerf import QUICK as NERF_QUICK
 from experiments.training.fine_tuning import fine_tune
+from experiments.training.names import STAGES
 from experiments.training.programs import Programs
 from experiments.training.setup import Training, identity_of, initial_state, start_labels
-from experiments.training.stages import STAGES, run_stages
+from experiments.training.stages import run_stages
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.scenes import load_scene
 from jaxcloseup.splats import RasterizeConfig

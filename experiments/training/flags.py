@@ -1,8 +1,9 @@
-"""Flags of the programs that train: the preset, the settings and the capture that they describe."""
+"""The preset, the settings and the capture that the flags of the programs that train describe."""
 
 import datetime
 import os
 import pathlib
+import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,80 +11,18 @@ from absl import flags
 
 from experiments.command_line import CHECKPOINTS, check_unused
 from experiments.methods import METHODS, Preset
-from experiments.training import set_flag
-from experiments.training.settings import with_settings
-from jaxcloseup.captures.formats import FORMATS
-from jaxcloseup.captures.photo_reading import ALPHA_MODES
-from jaxcloseup.captures.splits import SPLITS
+from experiments.training.settings import describe_settings, with_settings
 from jaxcloseup.metrics import SSIM_TAPS
 from jaxcloseup.scene import Scene, SceneError
 from jaxcloseup.scenes import load_scene
 
 
 FLAGS = flags.FLAGS
-flags.adopt_module_key_flags(set_flag)
-flags.DEFINE_enum("method", "surfels", list(METHODS), "radiance field")
-flags.DEFINE_enum(
-    "preset",
-    "quick",
-    list(dict.fromkeys(name for method in METHODS.values() for name in method.presets)),
-    "hyper-parameters: "
-    + "; ".join(f"{name} has {', '.join(method.presets)}" for name, method in METHODS.items()),
-)
-flags.DEFINE_integer(
-    "downscale",
-    None,
-    "divide the size of photographs by this, averaging areas; default: the preset's",
-    lower_bound=1,
-)
-flags.DEFINE_integer(
-    "windows",
-    None,
-    "windows of photographs that a step learns from, and pseudo-labels, shared out among devices, "
-    "or among the cores of a CPU; default: the preset's",
-    lower_bound=1,
-)
-flags.DEFINE_bool("resume", False, "resume the training that was cut off in --output_dir")
-flags.DEFINE_bool(
-    "tensorboard", False, "also write event files for TensorBoard; needs the extra tensorboard"
-)
-flags.DEFINE_bool(
-    "half_pixel", False, "the capture has pixel centers at integers: add 0.5 to cx, cy"
-)
-flags.DEFINE_enum(
-    "format",
-    None,
-    list(FORMATS),
-    "read this from the capture's folder: transforms*.json, a COLMAP model or LLFF's "
-    "poses_bounds.npy; default: the first of them that the folder holds",
-)
-flags.DEFINE_enum(
-    "split",
-    "given",
-    list(SPLITS),
-    "photographs to hold out: given: as the capture says; every8: every 8th by name, as test_far; "
-    "closest: the closest tenth, as test, and every 8th of the rest, as test_far; zoom: every 8th, "
-    "as test_far, and unreduced parts of some others, which train reduced --zoom times more, as "
-    "test",
-)
-flags.DEFINE_integer(
-    "zoom",
-    None,
-    "with --split=zoom: how many times finer test is than the training photographs; default: 4",
-    lower_bound=2,
-)
-flags.DEFINE_bool("invert_masks", False, "masks are white where photographs do not count")
-flags.DEFINE_enum(
-    "alpha_mode",
-    "blend",
-    list(ALPHA_MODES),
-    "blend: transparent pixels show a white background; mask: they weigh as a mask does",
-)
 _OF_CAPTURE = ("format", "split", "zoom", "invert_masks", "alpha_mode")
 
 
 def preset_from_flags() -> Preset:
-    """The preset with the settings that flags change.
+    """The preset with the settings that flags change; ends the program after `--set=help`.
 
     Raises:
       ValueError: one sentence that names the flag.
@@ -92,8 +31,11 @@ def preset_from_flags() -> Preset:
     if FLAGS.preset not in presets:
         raise ValueError(
             f"--preset={FLAGS.preset} is not for --method={FLAGS.method}: choose "
-            + " or ".join(presets)
+            + ", ".join(presets)
         )
+    if "help" in FLAGS.set:
+        print(describe_settings(presets[FLAGS.preset]))
+        sys.exit(0)
     given = {"downscale": FLAGS.downscale, "num_windows": FLAGS.windows}
     flagged = [f"{name}={value}" for name, value in given.items() if value is not None]
     return with_settings(presets[FLAGS.preset], [*FLAGS.set, *flagged])

@@ -9,7 +9,7 @@ import math
 import sys
 import types
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from experiments.methods import METHODS, Method, Preset
@@ -207,27 +207,23 @@ def _is_number(value):
     return isinstance(value, float) or abs(value) <= sys.float_info.max
 
 
-def describe_settings(methods: Mapping[str, Method]) -> str:
-    """The names of all settings, for `--help`: those that methods share, then each method's own.
+def describe_settings(preset: Preset) -> str:
+    """What `--set=help` prints: a line for each setting, with its value and what it may be."""
+    lines = [f"--set name=value changes any of these, of the method {preset.method}:"]
+    found = settings_of(preset)
+    width = max(len(f"{name}={_text(setting.value)}") for name, setting in found.items())
+    for name, setting in found.items():
+        shown = f"{name}={_text(setting.value)}"
+        lines.append(f"  {shown:{width}}  {_wanted(name, setting.kind)}")
+    return "\n".join(lines)
 
-    Values are those of the preset `quick`.
-    """
-    by_method = {
-        name: settings_of(next(iter(method.presets.values())), method)
-        for name, method in methods.items()
-    }
-    shared = set.intersection(*(set(settings) for settings in by_method.values()))
-    first = next(iter(by_method.values()))
-    shared = [name for name in first if name in shared and first[name].path[0] != "field"]
-    parts = ["settings of every method: " + ", ".join(shared)]
-    for name, settings in by_method.items():
-        own = {key: s for key, s in settings.items() if key not in shared}
-        coarse = [key for key in own if key.startswith("coarse.")]
-        texts = [f"{key}={_text(s.value)}" for key, s in own.items() if key not in coarse]
-        # The coarse model has all settings of the field again.
-        texts += ["coarse.steps and the other settings of the coarse model"] if coarse else []
-        parts.append(f"settings of {name}, with its first preset's values: " + ", ".join(texts))
-    return "; ".join(parts)
+
+def _wanted(name, kind):
+    """What a setting must be, as the error of a wrong value says it."""
+    try:
+        check_value(name, object(), kind)
+    except ValueError as error:
+        return str(error)
 
 
 def _text(value):

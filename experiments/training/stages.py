@@ -13,6 +13,7 @@ from experiments.evaluation.renders import write_truth
 from experiments.evaluation.scores import NO_PERCEPTUAL, Perceptual
 from experiments.training.detail import detail_path, detailed, find_detail
 from experiments.training.gate import weigh
+from experiments.training.names import STAGES
 from experiments.training.programs import Programs
 from experiments.training.scoring import HeldOut, Scorer, hold_out
 from experiments.training.setup import (
@@ -30,9 +31,6 @@ from jaxcloseup.label_rules import label_depth
 from jaxcloseup.photographs import Views
 from jaxcloseup.pseudo import LabelSources, PseudoSettings, label_sources
 from jaxcloseup.train import TrainState
-
-
-STAGES = ("baseline", "control", "closeup", "test_time", "detail")
 
 
 class Outcome(NamedTuple):

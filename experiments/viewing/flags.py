@@ -1,10 +1,11 @@
-"""Flags of the programs that load a stored run, and the run that the flags name."""
+"""The stored run that the flags name."""
 
 import pathlib
+import sys
 
 from absl import flags
 
-from experiments.training import set_flag
+from experiments.training.settings import describe_settings
 from experiments.training.stored_run import (
     RunError,
     StoredRun,
@@ -15,16 +16,12 @@ from experiments.training.stored_run import (
 
 
 FLAGS = flags.FLAGS
-flags.adopt_module_key_flags(set_flag)
-flags.DEFINE_string("run", None, "folder of a run of experiments.run")
-flags.DEFINE_string("stage", None, "stage to render; default: closeup, else control, else baseline")
-flags.DEFINE_string(
-    "data", None, "folder of the run's capture, if the capture was moved since training"
-)
 
 
 def run_from_flags() -> tuple[StoredRun, str]:
     """Return the run that `--run` names, with the settings of `--set`, and the stage to render.
+
+    `--set=help` ends the program instead.
 
     Raises:
       RunError: the run, the stage or a setting does not exist.
@@ -32,4 +29,7 @@ def run_from_flags() -> tuple[StoredRun, str]:
     if FLAGS.run is None:
         raise RunError("--run is missing: name the folder of a run of experiments.run")
     run = read_run(pathlib.Path(FLAGS.run))
+    if "help" in FLAGS.set:
+        print(describe_settings(run.preset))
+        sys.exit(0)
     return change_settings(run, FLAGS.set), choose_stage(run, FLAGS.stage)

@@ -17,7 +17,6 @@ from jaxcloseup.captures.transforms import read_transforms
 from jaxcloseup.scene import SceneError, printable
 
 
-FORMATS = ("transforms", "colmap", "llff")
 _FILES = {
     "train": ("transforms_train.json",),
     "test": ("transforms_test.json",),

@@ -21,7 +21,6 @@ from jaxcloseup.memory import installed_memory
 from jaxcloseup.scene import SceneError
 
 
-ALPHA_MODES = ("blend", "mask")
 _MAX_CONCURRENT = 4  # each needs a few times its own size: 12 megapixels take about 100 MB
 _SOURCES = ("photo_reading.py", "images.py", "distortion.py")
 _BYTES_PER_PIXEL = 12  # peak of what stays: as read, padded, and weights in float32

@@ -19,7 +19,6 @@ from jaxcloseup.scene import DuplicateFileWarning, SceneError, UnknownKeyWarning
 TEST_EVERY = 8
 CLOSEST_SHARE = 0.1
 _LONGEST_NAME = 120  # bytes; files of renders add to it, and may have 255
-SPLITS = ("given", "every8", "closest", "zoom")
 _LISTS = {"train": "train_filenames", "test": "test_filenames", "test_far": "val_filenames"}
 _SPLIT_FILE_KEYS = {"train", "test", "test_far", "unused"}
 

@@ -1,0 +1,45 @@
+"""The viewer of a stored run: what `experiments.view` does."""
+
+import sys
+
+from absl import flags
+
+from experiments.command_line import set_up
+from experiments.training.detail import detail_path
+from experiments.training.stored_run import RunError, load_run_scene, restore
+from experiments.viewing.flags import run_from_flags
+from jaxcloseup.artifacts.checkpoints import CheckpointError
+from jaxcloseup.scene import SceneError
+
+
+FLAGS = flags.FLAGS
+
+
+def main() -> None:
+    """Serve the run that the flags name until Ctrl-C."""
+    set_up()
+    try:
+        from experiments.viewing import page, server
+    except ModuleNotFoundError as error:
+        if error.name != "viser":
+            raise
+        sys.exit('experiments.view: viser is missing: install jaxcloseup with the extra "viewer"')
+    try:
+        record, stage = run_from_flags()
+        server.check_address(FLAGS.host, FLAGS.port)
+        scene = load_run_scene(record, FLAGS.data)
+        programs, state = restore(record, scene, stage)
+        viser_server = server.serve(FLAGS.host, FLAGS.port)
+        viewer = page.Viewer(
+            viser_server,
+            programs,
+            state,
+            stage=stage,
+            seed=record.identity["seed"],
+            kept=detail_path(record.folder, stage),
+        )
+    except (RunError, server.ServeError, SceneError, CheckpointError, OSError) as error:
+        sys.exit(f"experiments.view: {error}")
+    print(f"open http://{FLAGS.host}:{FLAGS.port} in a browser; press Ctrl-C to stop", flush=True)
+    while True:
+        viewer.work()

@@ -1,0 +1,5 @@
+"""Names that users choose from, by flag or by argument; importing them costs nothing."""
+
+FORMATS = ("transforms", "colmap", "llff")  # of captures on disk
+SPLITS = ("given", "every8", "closest", "zoom")
+ALPHA_MODES = ("blend", "mask")
