@@ -153,6 +153,8 @@ def _describe_flag(flag):
 
 def set_up() -> None:
     """Set up the compilation cache, and silence messages that do not concern the user."""
+    with contextlib.suppress(AttributeError):  # not a file
+        sys.stdout.reconfigure(line_buffering=True)  # also where a file or a pipe is read along
     set_up_compilation_cache(FLAGS.compilation_cache)
     # The program's own warnings are sentences for the user. Notes about missing accelerators, about
     # every file of a checkpoint, and repeats of what the program prints are not.

@@ -5,6 +5,7 @@ import pathlib
 import numpy as np
 
 from jaxcloseup.files import read_bytes, write_file
+from jaxcloseup.messages import printable
 
 
 _TYPES = {
@@ -18,6 +19,10 @@ _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 class PlyError(ValueError):
     """A PLY file cannot be read. The message is one sentence that says what to do."""
+
+    def __init__(self, message: str) -> None:
+        """Escape what a terminal would obey in what files say."""
+        super().__init__(printable(message))
 
 
 def read_vertices(path: str | pathlib.Path) -> np.ndarray:

@@ -1,7 +1,6 @@
 """`Scene`, the record that every loader returns, with its errors and warnings."""
 
 import dataclasses
-import unicodedata
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -9,20 +8,8 @@ import jax
 import numpy as np
 
 from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.messages import printable
 from jaxcloseup.photographs import Views, camera_at
-
-
-def printable(text: str) -> str:
-    """Escape what a terminal would obey or that no file holds: names in files may say anything."""
-    return "".join(
-        character.encode("unicode_escape").decode() if is_control(character) else character
-        for character in text
-    )
-
-
-def is_control(character: str) -> bool:
-    """Whether a character controls, formats or breaks lines, or is half of another."""
-    return unicodedata.category(character) in ("Cc", "Cf", "Cs", "Zl", "Zp")
 
 
 class SceneError(ValueError):

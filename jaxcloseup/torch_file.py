@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from jaxcloseup.files import LARGEST, check_file
+from jaxcloseup.messages import printable, reason
 
 
 LARGEST_FILE = LARGEST  # bytes, also unpacked; the largest known file of weights has 528 MiB
@@ -34,6 +35,10 @@ _VERSION = 1001
 class TorchFileError(Exception):
     """A file holds no readable tensors. The message is one sentence that says what to do."""
 
+    def __init__(self, message: str) -> None:
+        """Escape what a terminal would obey in what files say."""
+        super().__init__(printable(message))
+
 
 def read_tensors(path: str | pathlib.Path) -> dict[str, np.ndarray]:
     """Read the tensors, by name, of a state dictionary that `torch.save` wrote.
@@ -51,7 +56,7 @@ def read_tensors(path: str | pathlib.Path) -> dict[str, np.ndarray]:
         raise TorchFileError(f"{path} cannot be read ({error.strerror}): restore it.") from error
     except Exception as error:  # a damaged pickle can fail in any way
         raise TorchFileError(
-            f"{path} is not a whole file of PyTorch tensors ({error}): download it again."
+            f"{path} is not a whole file of PyTorch tensors ({reason(error)}): download it again."
         ) from error
     tensors = isinstance(found, dict) and all(
         isinstance(name, str) and isinstance(value, np.ndarray) for name, value in found.items()

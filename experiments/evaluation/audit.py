@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments import progress
 from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points, points_to_pixels
 from jaxcloseup.geometry.masks import depth_consistent, in_bounds
@@ -118,7 +119,7 @@ def audit_labels(
     of_curve: list[tuple[np.ndarray, ...]] = []
     pixels_total = 0
     error = kept = kept_visible = visible_total = 0.0
-    for one in jax.random.split(key, count):
+    for one in progress.track(jax.random.split(key, count), "close-ups"):
         camera, index = sample(one, sources, settings)
         pixels = pixel_grid(camera.height, camera.width)
         label = label_image(camera, pixels, render_depth(camera), index, sources, settings)

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from absl import flags
 
+from experiments import progress
 from experiments.command_line import check_unused, prepare_to_stop, set_up
 from experiments.training.detail import detail_path, find_detail
 from experiments.training.fine_tuning import fine_tune
@@ -40,7 +41,8 @@ def main() -> None:
     """Render the cameras that the flags choose."""
     set_up()
     try:
-        _render()
+        with progress.showing():
+            _render()
     except (
         *(RunError, CameraError, SceneError),
         *(CheckpointError, TrainingError, OSError),

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from absl import flags
 
+from experiments import progress
 from experiments.command_line import lock_output_dir, prepare_to_stop, set_up
 from experiments.evaluation.metrics_text import FINER
 from experiments.evaluation.scores import NO_PERCEPTUAL, Perceptual, find_perceptual
@@ -26,6 +27,7 @@ from experiments.training.manifest import (
     write_manifest,
 )
 from experiments.training.names import STAGES
+from experiments.training.plan import in_words, plan_run
 from experiments.training.programs import Programs
 from experiments.training.settings import plain_config
 from experiments.training.setup import Training, identity_of, timed, timed_compiling
@@ -83,8 +85,11 @@ def run(
     write_manifest(output_dir, manifest)
     write_dataparser_transforms(output_dir, scene)
     with timed_compiling(training.seconds):
-        outcome = run_stages(training, seed, output_dir, to_run=to_run, perceptual=perceptual)
-    results = report_run(output_dir, training, outcome, about, dolly=_dolly(training, outcome))
+        shown = {"words": in_words, "compiled": lambda: training.seconds["compile"]}
+        with progress.showing(plan_run(preset, scene, to_run), **shown):
+            outcome = run_stages(training, seed, output_dir, to_run=to_run, perceptual=perceptual)
+            dolly = _dolly(training, outcome)
+            results = report_run(output_dir, training, outcome, about, dolly=dolly)
     print(f"compiling took {training.seconds['compile']:.0f} s of the run")
     write_manifest(output_dir, manifest, training.seconds)
     return results
@@ -113,7 +118,8 @@ def main() -> None:
         )
         prepare_to_stop(output_dir, "experiments.run")
         load_options = training_flags.load_options_from_flags(preset)
-        scene = training_flags.load(FLAGS.scene, load_options)
+        with progress.showing(), progress.saying(f"loading {FLAGS.scene}"):
+            scene = training_flags.load(FLAGS.scene, load_options)
         perceptual = find_perceptual(FLAGS.lpips_weights)
         lock = lock_output_dir(output_dir)
     except (SceneError, OSError, ValueError) as error:

@@ -10,6 +10,7 @@ from typing import Any
 import jax
 from absl import flags
 
+from experiments import progress
 from experiments.command_line import lock_output_dir, prepare_to_stop, set_up
 from experiments.evaluation.scores import Perceptual, find_perceptual
 from experiments.methods import Preset
@@ -22,6 +23,7 @@ from experiments.training.logs import TrainLog, check_tensorboard
 from experiments.training.loop import TrainingError
 from experiments.training.manifest import NAME as MANIFEST
 from experiments.training.manifest import about_scene, versions, write_manifest
+from experiments.training.plan import in_words
 from experiments.training.programs import HOSTS_WAIT
 from experiments.training.settings import plain_config
 from experiments.training.stored_run import RunError, read_fields
@@ -107,7 +109,7 @@ def main() -> None:
         # Hosts that are done wait for the first one, which writes the tables.
         jax.distributed.initialize(*hosts, shutdown_timeout_seconds=HOSTS_WAIT)
     try:
-        with lock:
+        with lock, progress.showing(words=in_words):
             found = sweep_scenes(scenes, preset, output_dir, load_options, perceptual, first=first)
     except (TrainingError, CheckpointError, OSError) as error:
         if hosts is None:

@@ -9,8 +9,8 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import optax
-from rich.progress import track
 
+from experiments import progress
 from experiments.methods.method import CoarseConfig, LabelConfig, Method, Preset, WindowConfig
 from jaxcloseup.artifacts.gaussians import as_gaussians
 from jaxcloseup.artifacts.surfel_ply import write_surfels
@@ -199,7 +199,7 @@ def refine(
     each = min(max(0, free) // views, math.prod(pyramid.sizes[level]))
     sample = jax.jit(functools.partial(surfels_where_wrong, count=each, sh_degree=config.sh_degree))
     new = []
-    for view in track(range(views), description="   new surfels"):
+    for view in progress.track(range(views), "photographs searched"):
         camera = pyramid.camera(camera_at(cameras, view), view, level)
         photograph, seen = to_float(pyramid.image(view, level)), render(camera)
         data = photograph[..., :3], photograph[..., 3], seen.rgb, label_depth(seen)

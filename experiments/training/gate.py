@@ -13,6 +13,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from experiments import progress
 from experiments.evaluation.audit import audit_left_out
 from experiments.methods import pseudo_settings
 from experiments.training.programs import Programs
@@ -50,7 +51,9 @@ def weigh(programs: Programs, start: LabelStart) -> tuple[PseudoSettings, dict[s
         return settings, None
     render = functools.partial(programs.render, start.state)
     settings, found = weigh_labels(start.sources, render, settings)
-    print(f"     gate: {verdict(found)}")
+    print(f"gate: {verdict(found)}")
+    if not found["weight"]:
+        progress.skip("closeup", "test_time")
     return settings, found
 
 

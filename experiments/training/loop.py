@@ -1,9 +1,9 @@
-"""One stage of training: steps in chunks, with checkpoints, rates and the time left."""
+"""One stage of training: steps in chunks, with checkpoints."""
 
 import dataclasses
-import time
 from typing import Any
 
+from experiments import progress
 from experiments.training.logs import TrainLog
 from experiments.training.programs import Programs
 from jaxcloseup.artifacts.checkpoints import Checkpoints
@@ -68,39 +68,39 @@ def run_stage(
         last good state is kept.
     """
     chunk = max(1, min(-(-steps // 10), 500))
-    progress = _resume(name, programs, state, checkpoints, steps)
-    begun = progress.done
+    reached = _resume(name, programs, state, checkpoints, steps)
+    progress.count(name, reached.done, steps)
     if log is not None:
-        log.begin(name, progress.history)
+        log.begin(name, reached.history)
 
     def keep():
-        kept = {"history": progress.history, "growth": programs.growth}
-        checkpoints.save(name, progress.done, progress.state, kept)
-        progress.saved = progress.done
+        kept = {"history": reached.history, "growth": programs.growth}
+        checkpoints.save(name, reached.done, reached.state, kept)
+        reached.saved = reached.done
 
-    start = time.perf_counter()
-    failing, good = 0, (progress.done, progress.state)
-    while progress.done < steps:
-        count = min(chunk, steps - progress.done)
-        progress.state, values = programs.run(kind, progress.state, *data, count=count)
-        progress.done += count
+    failing, good = 0, (reached.done, reached.state)
+    while reached.done < steps:
+        count = min(chunk, steps - reached.done)
+        reached.state, values = programs.run(kind, reached.state, *data, count=count)
+        reached.done += count
         failing = failing + count if values["skipped"] == count else 0
         if failing >= min(PERSISTENT, steps):
-            progress.done, progress.state = good
-            progress.history = [e for e in progress.history if e["step"] <= progress.done]
-            if progress.done > progress.saved:
+            reached.done, reached.state = good
+            reached.history = [e for e in reached.history if e["step"] <= reached.done]
+            if reached.done > reached.saved:
                 keep()
-            raise TrainingError(_why_stopped(name, progress.done, failing, checkpoints))
+            raise TrainingError(_why_stopped(name, reached.done, failing, checkpoints))
         if not failing:
-            good = progress.done, progress.state
-        progress.history.append({"step": progress.done} | values)
-        rate = (progress.done - begun) / (time.perf_counter() - start)
-        _print_progress(name, progress.done, steps, rate, values)
+            good = reached.done, reached.state
+        reached.history.append({"step": reached.done} | values)
+        numbers = {key: value for key, value in values.items() if isinstance(value, float)}
+        shown = (f"{key} {value:.4g}" for key, value in numbers.items())
+        print("  ".join([progress.count(name, reached.done, steps), *shown]), flush=True)
         if log is not None:
-            log.write(progress.history[-1])
-        if progress.done == steps or (progress.done - progress.saved >= save_every and not failing):
+            log.write(reached.history[-1])
+        if reached.done == steps or (reached.done - reached.saved >= save_every and not failing):
             keep()
-    return progress.state, progress.history
+    return reached.state, reached.history
 
 
 def _resume(name, programs, state, checkpoints, steps):
@@ -109,7 +109,7 @@ def _resume(name, programs, state, checkpoints, steps):
         return _Progress(0, 0, state, [])
     done, state, stored = kept
     programs.make_room(stored["growth"])
-    print(f"{name:>9} {done}/{steps}  resumed")
+    print(f"{name} {done}/{steps}  resumed")
     return _Progress(done, done, state, stored["history"])
 
 
@@ -118,15 +118,4 @@ def _why_stopped(name, done, failing, checkpoints):
     return (
         f"{name} stopped after {done} good steps{where}: loss or gradient was not finite in each "
         f"of the next {failing}: lower the learning rate, or look for broken photographs or poses"
-    )
-
-
-def _print_progress(name, done, steps, rate, values):
-    left = int((steps - done) / rate)
-    numbers = {key: value for key, value in values.items() if isinstance(value, float)}
-    shown = "  ".join(f"{key} {value:.4g}" for key, value in numbers.items())
-    print(
-        f"{name:>9} {done:>{len(str(steps))}}/{steps}  {rate:6.1f} steps/s  "
-        f"{left // 60}:{left % 60:02d} left  {shown}",
-        flush=True,
     )

@@ -1,5 +1,6 @@
 """Compiled programs of one preset on one scene: kinds of steps, and rendering."""
 
+import contextlib
 import dataclasses
 import functools
 import math
@@ -14,6 +15,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from orbax.checkpoint.multihost import sync_global_processes
 
+from experiments import progress
 from experiments.methods import METHODS, Preset
 from jaxcloseup.draws import in_a_loop, in_threads, over_devices
 from jaxcloseup.field import Rendering
@@ -49,6 +51,7 @@ class Programs:
         self._compile()
 
     def _compile(self) -> None:
+        self._compiled: set[str] = set()
         self.field = self.method.make_field(self.preset.field, self.scene, self.growth)
         bound = {"field": self.field, "optimizer": self.optimizer, "config": self.preset.train}
         steps = {
@@ -185,13 +188,21 @@ class Programs:
         """
         arrays = self._share_out(kind, (state, *data))
         while True:
-            after, metrics = self._collect(kind, self._runners[kind](*arrays, count=count))
-            metrics = jax.device_get(metrics)
+            with self._compiling(kind, "compiling the steps"):
+                after, metrics = self._collect(kind, self._runners[kind](*arrays, count=count))
+                metrics = jax.device_get(metrics)
             # Means of counts: positive if any step had an overflow.
             overflow = [metrics.pop(key, np.zeros(())) for key in ("overflow", "label_overflow")]
             if not any(np.any(values) for values in overflow):
                 return after, _checked(metrics, kind, count)
             self._grow()
+
+    def _compiling(self, kind: str, what: str) -> contextlib.AbstractContextManager[None]:
+        """Says that a kind of step, or rendering, is compiled, when it is called first."""
+        if kind in self._compiled:
+            return contextlib.nullcontext()
+        self._compiled.add(kind)
+        return progress.saying(what)
 
     def _share_out(self, kind: str, arrays: tuple[Any, ...]) -> tuple[Any, ...]:
         """State and data of a step on the devices that take it."""
@@ -224,7 +235,8 @@ class Programs:
         """Render a whole image; without a key, deterministically."""
         programs = self._for_width(camera.width)
         while True:
-            rendering = programs._render(state, camera, key)
+            with programs._compiling("render", "compiling the renderer"):
+                rendering = programs._render(state, camera, key)
             if rendering.overflow is None or not int(rendering.overflow):
                 return rendering
             programs._grow()

@@ -7,8 +7,8 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rich.progress import track
 
+from experiments import progress
 from experiments.training.programs import Programs
 from jaxcloseup.label_rules import label_depth
 from jaxcloseup.metrics import fit_colors
@@ -76,7 +76,7 @@ def render_residuals(
     rendered = pyramid.level_near(most * cameras.width)
     values = np.empty((*pyramid.values.shape[:2], 3), np.int8)
     windows, depths, rng = [], [], np.random.default_rng(0)
-    for view in track(range(len(scene.train)), description="   residuals"):
+    for view in progress.track(range(len(scene.train)), "residuals of photographs"):
         for level in range(last, -1, -1):
             camera = pyramid.camera(camera_at(cameras, view), view, level)
             photograph = pyramid.image(view, level)

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxcloseup
+from experiments import progress
 from experiments.methods import LabelConfig, Preset, pseudo_settings
 from experiments.training.detail import detailed_views, find_detail
 from experiments.training.logs import TrainLog
@@ -245,7 +246,8 @@ def rendered_depths(
     """
     count = cameras.intrinsics.shape[0]
     keys = [None] * count if key is None else jax.random.split(key, count)
-    seen = (render(camera_at(cameras, i), keys[i]) for i in range(count))
+    views = progress.track(range(count), "rendering depths")
+    seen = (render(camera_at(cameras, i), keys[i]) for i in views)
     return jnp.stack([depth(rendering, near=near, far=scene.far) for rendering in seen])
 
 
@@ -300,9 +302,10 @@ def label_closeups(
 
 @contextlib.contextmanager
 def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
-    """Record under `name` how long the body takes."""
+    """Record under `name` how long the body takes, which is a part of the run."""
     start = time.perf_counter()
-    yield
+    with progress.part(name):
+        yield
     seconds[name] = time.perf_counter() - start
     _give_back_memory()
 

@@ -17,6 +17,7 @@ from experiments.training.setup import state_shapes
 from experiments.training.stored_config import preset_from_config
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.files import read_object
+from jaxcloseup.messages import printable
 from jaxcloseup.scene import Scene
 from jaxcloseup.scenes import load_scene
 from jaxcloseup.train import TrainState
@@ -38,6 +39,10 @@ _WORDS = {str: "a text", dict: "an object", list: "a list", int: "a whole number
 
 class RunError(Exception):
     """A run that cannot be rendered. The message is one sentence that says what to do."""
+
+    def __init__(self, message: str) -> None:
+        """Escape what a terminal would obey in what files say."""
+        super().__init__(printable(message))
 
 
 class StoredRun(NamedTuple):

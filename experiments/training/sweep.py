@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments import progress
 from experiments.evaluation.metrics_text import SPLIT_TITLES
 from experiments.evaluation.scores import NO_PERCEPTUAL, Perceptual, Target, evaluate
 from experiments.methods import Preset
@@ -165,6 +166,10 @@ class ArmScorer:
 
     def score(self, arm: str, seed: int, state: TrainState, skipped: int) -> None:
         """Render and score one arm of one seed."""
+        with progress.part(f"{arm}_{seed}_evaluation"):
+            self._score(arm, seed, state, skipped)
+
+    def _score(self, arm, seed, state, skipped):
         splits = {}
         for split, targets in self.held_out.all.items():
             render = functools.partial(self.programs.render, state)

@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rich.progress import track
 
+from experiments import progress
 from experiments.evaluation.scores import Target
 from experiments.viewing.camera_paths import dolly, named_cameras
 from jaxcloseup.artifacts.images import to_uint8
@@ -61,5 +61,5 @@ def approach(
         magnification=float(np.clip(nearer, *MAGNIFICATION)),
         frames=FRAMES,
     )
-    cameras = track(named_cameras(shots), description="   a dolly")
+    cameras = progress.track(named_cameras(shots), "frames")
     return [to_uint8(np.asarray(render(one).rgb)[:height, :width]) for _, one in cameras]

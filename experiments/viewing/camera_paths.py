@@ -16,6 +16,7 @@ from jaxcloseup.captures.json_fields import number, read_object, rigid_transform
 from jaxcloseup.geometry.cameras import Camera, pixels_to_points
 from jaxcloseup.geometry.poses import closeup_position
 from jaxcloseup.memory import installed_memory
+from jaxcloseup.messages import printable
 from jaxcloseup.photographs import Views, camera_at
 from jaxcloseup.scenes import Scene, SceneError
 
@@ -28,6 +29,10 @@ _BYTES_PER_PIXEL = 400  # half of what rendering surfels took
 
 class CameraError(Exception):
     """The requested cameras are invalid. The message is one sentence that says what to do."""
+
+    def __init__(self, message: str) -> None:
+        """Escape what a terminal would obey in what files say."""
+        super().__init__(printable(message))
 
 
 class Shots(NamedTuple):

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
+from experiments import progress
 from experiments.training.detail import detailed
 from experiments.training.programs import Programs
 from experiments.viewing.camera_paths import Shots, named_cameras
@@ -55,7 +56,8 @@ def render_shots(
     limits = depth_range([label_depth(one, near=0, far=scene.far) for one in some], scene)
     sizes = shots.sizes or [(shots.cameras.width, shots.cameras.height)] * len(cameras)
     images: dict[str, Image] = {}
-    for (name, camera), (width, height) in zip(cameras, sizes, strict=True):
+    shown = progress.track(zip(cameras, sizes, strict=True), "rendering frames", len(cameras))
+    for (name, camera), (width, height) in shown:
         images = render_pictures(
             programs, state, camera, sources=sources, detail=detail, limits=limits
         )

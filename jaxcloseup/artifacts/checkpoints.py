@@ -18,6 +18,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from jaxcloseup.files import read_object, write_file
+from jaxcloseup.messages import printable, reason
 
 
 _CHECKSUM = "crc32"  # entry of the progress item
@@ -25,6 +26,10 @@ _CHECKSUM = "crc32"  # entry of the progress item
 
 class CheckpointError(Exception):
     """A run cannot be saved or resumed; the message is one sentence that says what to do."""
+
+    def __init__(self, message: str) -> None:
+        """Escape what a terminal would obey in what files say."""
+        super().__init__(printable(message))
 
 
 class Checkpoints:
@@ -52,9 +57,9 @@ class Checkpoints:
         try:
             kept = read_object(path)
         except (OSError, ValueError) as error:
-            reason = getattr(error, "strerror", None) or error
+            why = getattr(error, "strerror", None) or error
             raise CheckpointError(
-                f"{path} cannot be read ({reason}): start a new run in another output folder."
+                f"{path} cannot be read ({why}): start a new run in another output folder."
             ) from error
         for name in sorted(kept.keys() | identity.keys()):
             if kept.get(name) != identity.get(name):
@@ -85,9 +90,9 @@ class Checkpoints:
         try:
             self._manager(stage).save(step, args=items, force=True)
         except (ValueError, OSError) as error:  # a full disk raises ValueError
-            reason = str(error).partition("\n")[0].rsplit(": ", 1)[-1].split(" [os_error")[0]
+            why = str(error).partition("\n")[0].rsplit(": ", 1)[-1].split(" [os_error")[0]
             raise CheckpointError(
-                f"{self.folder / stage / str(step)} cannot be written ({reason}): make room on the "
+                f"{self.folder / stage / str(step)} cannot be written ({why}): make room on the "
                 "disk and resume the run from the previous checkpoint."
             ) from error
 
@@ -125,7 +130,7 @@ class Checkpoints:
         except (ValueError, KeyError, TypeError, OSError) as error:
             raise CheckpointError(
                 f"{self.folder / stage / str(step)} does not hold this run's state "
-                f"({str(error).splitlines()[0]}): remove it to resume from an earlier one."
+                f"({reason(error)}): remove it to resume from an earlier one."
             ) from error
         state = jax.tree.map(
             lambda new, old: jax.random.wrap_key_data(new) if _is_key(old) else jnp.asarray(new),

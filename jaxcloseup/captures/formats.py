@@ -14,7 +14,8 @@ from jaxcloseup.captures.reduced_photos import attach_reduced
 from jaxcloseup.captures.scale import check_positions, plausible
 from jaxcloseup.captures.splits import divide, splits_from_fields, splits_from_file, warn_duplicates
 from jaxcloseup.captures.transforms import read_transforms
-from jaxcloseup.scene import SceneError, printable
+from jaxcloseup.messages import printable
+from jaxcloseup.scene import SceneError
 
 
 _FILES = {

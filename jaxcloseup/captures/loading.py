@@ -19,8 +19,9 @@ from jaxcloseup.captures.scale import LENGTH, check_positions
 from jaxcloseup.captures.splits import unique_names
 from jaxcloseup.captures.triangulation import triangulate
 from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.messages import printable
 from jaxcloseup.photographs import Views
-from jaxcloseup.scene import NearFarWarning, Scene, SceneError, printable
+from jaxcloseup.scene import NearFarWarning, Scene, SceneError
 
 
 _MIN_POINTS = 100  # fewer triangulated points say too little about where the scene is

@@ -13,7 +13,8 @@ from jaxcloseup.captures.depth_range import depths_in_view
 from jaxcloseup.captures.frames import Frame, frame_intrinsics
 from jaxcloseup.captures.images import read_image
 from jaxcloseup.captures.json_fields import read_json
-from jaxcloseup.scene import DuplicateFileWarning, SceneError, UnknownKeyWarning, is_control
+from jaxcloseup.messages import is_control
+from jaxcloseup.scene import DuplicateFileWarning, SceneError, UnknownKeyWarning
 
 
 TEST_EVERY = 8
