@@ -49,7 +49,8 @@ def read_vertices(path: str | pathlib.Path) -> np.ndarray:
     if encoding == "ascii":
         rows = data[start:].split(b"\n", count)[:count]
         try:
-            vertices = np.array([tuple(map(float, row.split())) for row in rows], dtype)
+            with np.errstate(over="ignore"):  # too large for its type is infinite, as in binary
+                vertices = np.array([tuple(map(float, row.split())) for row in rows], dtype)
         except (ValueError, OverflowError) as error:
             whole = all(len(row.split()) == len(properties) for row in rows)
             words = (

@@ -253,7 +253,11 @@ def cases(run):
 
 
 def one(rng, make, read, only, folder):
-    """Read a damaged folder; returns what was damaged, and what is wrong with the outcome."""
+    """Read a damaged folder.
+
+    Returns:
+      What was damaged; whether a reader refused it; and what is wrong with the outcome, or None.
+    """
     folder.mkdir()
     make(folder)
     what = mutate(rng, folder, only)
@@ -264,14 +268,15 @@ def one(rng, make, read, only, folder):
             read(rng, folder)
     except ERRORS as error:
         text = str(error)
-        if not text.isprintable() or len(text) > 1000 or len(text) < 20:
-            return what, f"says {text[:300]!r}"
+        sentence = text.isprintable() and 20 < len(text) < 1000
+        return what, True, None if sentence else f"says {text[:300]!r}"
     except OSError as error:  # of logs, which say it in a sentence
         if error.errno is not None or "\n" in str(error):
-            return what, traceback.format_exc()
+            return what, True, traceback.format_exc()
+        return what, True, None
     except Exception:
-        return what, traceback.format_exc()
-    return what, None
+        return what, True, traceback.format_exc()
+    return what, False, None
 
 
 def main():
@@ -291,10 +296,11 @@ def main():
         rng, start = random.Random(number), time.process_time()
         name = sorted(made)[number % len(made)]
         place = folder / f"read {number}"
-        what, fault = one(rng, *made[name], place)
+        what, refused, fault = one(rng, *made[name], place)
         shutil.rmtree(place, ignore_errors=True)
         seconds = time.process_time() - start
-        answer = {"case": name, "what": what, "fault": fault, "seconds": seconds}
+        answer = {"case": name, "what": what, "refused": refused, "fault": fault}
+        answer["seconds"] = seconds
         answers.write(json.dumps(answer) + "\n")
         answers.flush()
 

@@ -329,8 +329,8 @@ def mutate(rng: random.Random, folder: pathlib.Path, only: str = "*") -> str:
     for _ in range(rng.choice([1, 1, 1, 2, 4])):
         try:
             data = damage(rng, data)
-        except (ValueError, IndexError, KeyError, struct.error, TypeError, StopIteration):
-            damage = damage_bytes  # it is no longer of its format
+        except Exception:  # it is no longer of its format
+            damage = damage_bytes
             data = damage(rng, data)
     path.write_bytes(data)
     return f"{path.relative_to(folder)} by {damage.__name__}"

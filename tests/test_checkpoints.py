@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 import resource
 import shutil
 
@@ -141,6 +142,18 @@ def test_edited_progress_is_refused(tmp_path, change):
     file.write_text(json.dumps(json.loads(file.read_text()) | change))
     with pytest.raises(CheckpointError, match="its files were changed or damaged"):
         Checkpoints(tmp_path, RUN).load("baseline", state(0))
+
+
+def test_a_pipe_in_a_checkpoint_is_refused(tmp_path):
+    """Whoever opens it for reading waits for ever."""
+    kept = Checkpoints(tmp_path, {})
+    kept.save("baseline", 1, {"a": jnp.zeros(3)}, {})
+    path = tmp_path / "baseline" / "1" / "_CHECKPOINT_METADATA"
+    assert path.is_file()
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(CheckpointError, match=r"_CHECKPOINT_METADATA cannot be read \(Not an ord"):
+        Checkpoints(tmp_path, {}).load("baseline", {"a": jnp.zeros(3)})
 
 
 def test_a_checkpoint_without_a_checksum_loads(tmp_path):

@@ -4,6 +4,7 @@
 seventeenth again.
 """
 
+import collections
 import json
 import os
 import pathlib
@@ -23,6 +24,7 @@ class Worker:
     """A process that reads damaged files, started again after each hang or crash."""
 
     def __init__(self, folder, run):
+        self.refused, self.read_well = collections.Counter(), collections.Counter()
         self._command = [sys.executable, str(pathlib.Path(__file__).parent / "fuzzing.py")]
         self._command += [str(folder), str(run)]
         self._process = None
@@ -41,6 +43,7 @@ class Worker:
         else:
             answer = json.loads(answer)
             fault = answer["fault"]
+            (self.refused if answer["refused"] else self.read_well)[answer["case"]] += 1
             if answer["seconds"] > HANG:
                 fault = f"took {answer['seconds']:.0f} s"
             return fault and f"{number}, {answer['case']}, {answer['what']}: {fault}"
@@ -85,4 +88,8 @@ def test_damaged_files_are_refused_in_a_sentence_or_read_sanely(worker):
     first, colon, last = os.environ.get("JAXCLOSEUP_FUZZ", str(MUTATIONS)).partition(":")
     numbers = range(int(first), int(last)) if colon else range(int(first))
     faults = [fault for number in numbers if (fault := worker.read(number))]
+    print(f"refused: {dict(worker.refused)}; read: {dict(worker.read_well)}")
     assert not faults, f"{len(faults)} of {len(numbers)}:\n" + "\n".join(faults)
+    if len(numbers) >= MUTATIONS:  # most damage is seen, and some does no harm
+        for outcomes in (worker.refused, worker.read_well):
+            assert len(outcomes) > 10 and sum(outcomes.values()) > len(numbers) / 10

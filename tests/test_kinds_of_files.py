@@ -9,6 +9,7 @@ from tiny_capture import frame, paper_capture, single_file, write_json
 from tiny_models import colmap_capture, llff_capture
 
 from jaxcloseup.files import check_file, read_bytes
+from jaxcloseup.scene import PointsWarning
 from jaxcloseup.scenes import SceneError, load_scene
 
 
@@ -162,3 +163,46 @@ def test_observations_of_points_that_the_model_lacks(tmp_path, binary):
         SceneError, match=r"images\.(bin|txt): image '00\d\.png' shows point \d, which .*points3D"
     ):
         load_scene(tmp_path)
+
+
+def test_a_photograph_whose_name_is_no_text(tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    colmap_capture(tmp_path)
+    model = tmp_path / "sparse/0"
+    found = pycolmap.Reconstruction()
+    found.read_text(str(model))
+    found.write_binary(str(model))
+    path = model / "images.bin"
+    path.write_bytes(path.read_bytes().replace(b"001.png", b"00\x99.png"))
+    with pytest.raises(SceneError, match=r"images\.bin: image 2 has a name that is not UTF-8"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("factor", [0.5, 1e39, 1e200])
+def test_a_frame_whose_quaternion_has_another_length(tmp_path, factor):
+    """pycolmap normalizes the quaternions of images alone."""
+    pycolmap = pytest.importorskip("pycolmap")
+    colmap_capture(tmp_path)
+    model = tmp_path / "sparse/0"
+    found = pycolmap.Reconstruction()
+    found.read_text(str(model))
+    found.write_binary(str(model))
+    path = model / "frames.bin"
+    data = path.read_bytes()
+    path.write_bytes(
+        data.replace(
+            np.float64([1, 0, 0, 0]).tobytes(), np.float64([factor, factor, 0, 0]).tobytes()
+        )
+    )
+    assert path.read_bytes() != data
+    with pytest.raises(SceneError, match="has a pose whose rotation is none"):
+        load_scene(tmp_path)
+
+
+def test_points_beyond_their_type_are_dropped(tmp_path):
+    paper_capture(tmp_path)
+    header = "ply\nformat ascii 1.0\nelement vertex 3\n"
+    header += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
+    (tmp_path / "points3d.ply").write_text(header + "1 2 3\n4 5 6\n1e39 0 0\n")
+    with pytest.warns(PointsWarning, match="1 of 3 points are not finite"):
+        assert len(load_scene(tmp_path).points) == 2

@@ -113,6 +113,14 @@ def test_truncated_files_are_refused(tmp_path, name):
             read_tensors(path)
 
 
+def test_what_a_file_says_is_no_command_to_the_terminal(tmp_path):
+    data = (DATA / "tensors_legacy.pth").read_bytes()
+    path = tmp_path / "a.pth"
+    path.write_bytes(data.replace(b"_rebuild_tensor_v2", b"_rebuild\x1b[31mtenso"))
+    with pytest.raises(TorchFileError, match=r"it holds torch\._utils\._rebuild\\x1b\[31mtenso"):
+        read_tensors(path)
+
+
 def test_a_file_cannot_run_code(tmp_path):
     path = tmp_path / "evil.pth"
     with zipfile.ZipFile(path, "w") as archive:

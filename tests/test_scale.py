@@ -8,6 +8,7 @@ from tiny_capture import POSE, frame, paper_capture, vertices, write_image, writ
 from tiny_models import colmap_capture, llff_capture, llff_rows
 
 from jaxcloseup.captures.depth_range import near_far_from_cameras
+from jaxcloseup.captures.scale import plausible
 from jaxcloseup.scene import NearFarWarning, PointsWarning
 from jaxcloseup.scenes import SceneError, load_scene
 
@@ -129,3 +130,10 @@ def test_stray_points_of_a_model_are_dropped_from_what_photographs_see(tmp_path)
     np.testing.assert_array_equal(scene.points, whole.points[[0, 2, 4]])
     np.testing.assert_array_equal(scene.rgb, whole.rgb[[0, 2, 4]])
     assert scene.metadata["times_nearer"] == whole.metadata["times_nearer"]
+
+
+def test_positions_whose_square_is_too_large_for_a_float():
+    points = np.array([[0.0, 0, 0], [1, 1, 1], [1e39, 0, 0]])
+    with pytest.warns(PointsWarning, match="1 of 3 points"):  # and no warning of an overflow
+        keep = plausible("a file", points, np.array([[0.0, 0, 0], [0, 0, 1], [1e306, 0, 0]]))
+    assert keep.tolist() == [True, True, False]

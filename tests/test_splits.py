@@ -1,10 +1,13 @@
 import json
+import pathlib
+import time
 
 import numpy as np
 import pytest
 from tiny_capture import HEIGHT, WIDTH, vertices, write_image, write_json, write_ply
 from tiny_models import colmap_capture, llff_capture, llff_rows
 
+from jaxcloseup.captures.splits import unique_names
 from jaxcloseup.scene import UnknownKeyWarning
 from jaxcloseup.scenes import SceneError, load_scene
 
@@ -99,3 +102,13 @@ def test_closest_needs_photographs_and_points(capture):
 def test_built_in_scenes_have_their_own_split(options):
     with pytest.raises(SceneError, match=rf"built-in scene.*leave out {next(iter(options))}"):
         load_scene("table", **options)
+
+
+def test_many_photographs_of_one_name_are_named_soon():
+    """A list that repeats its photographs has names that clash; numbering them takes no square."""
+    files = [pathlib.Path("images/a.png"), pathlib.Path("images/a_2.png")] * 20_000
+    start = time.process_time()
+    names = unique_names(files)
+    assert time.process_time() - start < 10
+    assert names[:4] == ["images_a", "images_a_2", "images_a_3", "images_a_2_2"]
+    assert len(set(names)) == len(files)

@@ -17,11 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
-from jaxcloseup.files import read_object, write_file
+from jaxcloseup.files import check_file, read_object, write_file
 from jaxcloseup.messages import printable, reason
 
 
 _CHECKSUM = "crc32"  # entry of the progress item
+_LARGEST = 2**36  # bytes of a file
 
 
 class CheckpointError(Exception):
@@ -143,6 +144,7 @@ class Checkpoints:
         if stage not in self._managers:
             folder = self.folder / stage
             folder.mkdir(parents=True, exist_ok=True)
+            _check_files(folder)
             here, alone = jax.process_index(), ocp.options.MultiprocessingOptions()
             if jax.process_count() > 1:
                 alone = ocp.options.MultiprocessingOptions(here, {here}, f"host_{here}")
@@ -154,6 +156,19 @@ class Checkpoints:
             )
             self._managers[stage] = ocp.CheckpointManager(folder, options=options)
         return self._managers[stage]
+
+
+def _check_files(folder):
+    """Raise unless a folder holds ordinary files alone: Orbax would wait for a pipe."""
+    for path in folder.rglob("*"):
+        try:
+            if not path.is_dir():
+                check_file(path, most=_LARGEST)
+        except OSError as error:
+            raise CheckpointError(
+                f"{path} cannot be read ({error.strerror}): restore it, or remove its checkpoint "
+                "to resume from an earlier one."
+            ) from error
 
 
 def _difference(name, kept, identity):

@@ -19,6 +19,7 @@ from jaxcloseup.scene import SceneError
 
 
 _FIELDS = {"f": "fl_x", "fx": "fl_x", "fy": "fl_y", "k": "k1"}  # other names are the same
+_RIGID = 1e-3
 
 
 def holds_model(folder: pathlib.Path) -> bool:
@@ -83,6 +84,14 @@ def read_colmap(
     for image in images:
         world_to_camera = image.cam_from_world().matrix()
         rotation = world_to_camera[:, :3].T
+        # pycolmap normalizes the quaternions of images, but not those of frames.
+        with np.errstate(all="ignore"):
+            rigid = np.allclose(rotation.T @ rotation, np.eye(3), atol=_RIGID)
+        if not rigid:
+            raise SceneError(
+                f"{source}: image {image.name!r} has a pose whose rotation is none: export the "
+                "model again."
+            )
         lens, size = lenses[image.camera_id]
         seen = {point.point3D_id for point in image.get_observation_points2D()}
         if absent := seen - known:

@@ -86,6 +86,11 @@ def _walk_image(path, data, at, _):
     if end < 0:
         raise struct.error
     name = data[at + 64 : end].decode("utf-8", "replace")
+    if "\ufffd" in name:
+        raise SceneError(
+            f"{path}: image {image} has a name that is not UTF-8 ({name}): rename the photograph "
+            "and export the model again."
+        )
     _check_pose(f"{path}: image {image} ({name})", pose)
     (observations,) = struct.unpack_from("<Q", data, end + 1)
     return end + 9 + 24 * observations

@@ -74,7 +74,8 @@ def plausible(label: object, points: np.ndarray, positions: np.ndarray) -> np.nd
     finite = (np.abs(points) <= np.finfo(np.float32).max).all(-1)
     away = np.abs(np.where(finite[:, None], points, 0) - center).max(-1)
     usual = np.median(away[finite]) if finite.any() else 0.0
-    keep = finite & (away <= STRAY * max(usual, np.abs(positions - center).max()))
+    # Divided, because a product could be too large for a float.
+    keep = finite & (away / STRAY <= max(usual, np.abs(positions - center).max()))
     if not keep.all():
         warnings.warn(
             f"{label}: {np.sum(~keep)} of {len(keep)} points are not finite, or {STRAY:g} times "

@@ -133,16 +133,17 @@ def unique_names(files: Sequence[pathlib.Path]) -> list[str]:
 
     Names are of printable characters, and longer ones than `_LONGEST_NAME` end in a hash.
     """
-    stems = [file.stem for file in files]
-    names = []
-    for file, stem in zip(files, stems, strict=True):
-        name = base = _name(stem if stems.count(stem) == 1 else f"{file.parent.name}_{stem}")
-        repeat = 1
+    stems = collections.Counter(file.stem for file in files)
+    names: dict[str, None] = {}
+    repeats: dict[str, int] = {}  # the last number of each name
+    for file in files:
+        stem = file.stem
+        name = base = _name(stem if stems[stem] == 1 else f"{file.parent.name}_{stem}")
         while name in names:
-            repeat += 1
-            name = f"{base}_{repeat}"
-        names.append(name)
-    return names
+            repeats[base] = repeats.get(base, 1) + 1
+            name = f"{base}_{repeats[base]}"
+        names[name] = None
+    return list(names)
 
 
 def _name(text: str) -> str:
