@@ -2,6 +2,7 @@
 
 import contextlib
 import difflib
+import importlib
 import logging
 import os
 import pathlib
@@ -10,6 +11,7 @@ import shlex
 import shutil
 import sys
 import textwrap
+import types
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -17,6 +19,7 @@ from typing import Any
 from absl import app, flags
 
 import experiments
+from experiments import progress
 from jaxcloseup.files import cache_folder
 
 
@@ -64,13 +67,19 @@ def start(main: Callable[[list[str]], None]) -> None:
     """Run a program; `--help` and `-h` print its flags, and a wrong flag or word is one sentence.
 
     Args:
-      main: is called with the program's path. It imports JAX, and its module does not.
+      main: is called with the program's path. What needs JAX is in its `job`.
     """
     if {"-h", "--help"} & set(sys.argv[1:]):
         with contextlib.suppress(BrokenPipeError):  # `--help | head`
             print(_describe_program(), flush=True)
         os._exit(0)
     app.run(main, flags_parser=_parse)
+
+
+def job(name: str) -> types.ModuleType:
+    """The module of `experiments.jobs` with this name; what it imports takes seconds."""
+    with progress.showing():
+        return importlib.import_module(f"experiments.jobs.{name}")
 
 
 def _parse(words):

@@ -8,7 +8,7 @@ experiments.run on 8-bit colors, and writes the means over images and the metric
 
 from absl import flags
 
-from experiments.command_line import start
+from experiments.command_line import job, start
 
 
 for _name in ("lpips_weights", "compilation_cache"):
@@ -23,9 +23,7 @@ flags.DEFINE_string("output", "metrics.json", "JSON file to write; it must not e
 
 def main(_: list[str]) -> None:
     """Score the folders that the flags name."""
-    from experiments.jobs import evaluate  # imports JAX, which --help does without
-
-    evaluate.main()
+    job("evaluate").main()
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ pseudo-labels made for them; `--target=FILE` is short for `--camera_path=FILE --
 
 from absl import flags
 
-from experiments.command_line import start
+from experiments.command_line import job, start
 from experiments.viewing import define_flags
 
 
@@ -34,7 +34,10 @@ flags.DEFINE_bool(
     "orbit", False, "render an orbit around the point that the training cameras look at"
 )
 flags.DEFINE_list(
-    "up", None, "x,y,z: the world's up direction in --orbit; default: the cameras' mean up"
+    "up",
+    None,
+    "x,y,z: the world's up direction in --orbit; default: as the capture says, else as its level "
+    "cameras say; give it where an orbit is tilted",
 )
 flags.DEFINE_string("from", None, "training view from which to render a dolly towards --pixel")
 flags.DEFINE_list("pixel", None, "x,y: pixel of the --from view, at the view's training size")
@@ -75,9 +78,7 @@ flags.DEFINE_bool(
 
 def main(_: list[str]) -> None:
     """Render the cameras that the flags choose."""
-    from experiments.jobs import render  # imports JAX, which --help does without
-
-    render.main()
+    job("render").main()
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ it with labels of the very close-ups that are scored. The scene is a built-in on
 
 from absl import flags
 
-from experiments.command_line import start
+from experiments.command_line import job, start
 from experiments.training import define_flags
 from experiments.training.names import STAGES
 
@@ -35,9 +35,7 @@ flags.DEFINE_list("stages", list(STAGES), "stages to run; baseline always runs")
 
 def main(_: list[str]) -> None:
     """Run all stages with the settings of the flags."""
-    from experiments.jobs import run  # imports JAX, which --help does without
-
-    run.main()
+    job("run").main()
 
 
 @flags.multi_flags_validator(["stages"], message=f"--stages takes names of {', '.join(STAGES)}")

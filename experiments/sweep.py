@@ -9,7 +9,7 @@ goes on to the same tables.
 
 from absl import flags
 
-from experiments.command_line import start
+from experiments.command_line import job, start
 from experiments.training import define_flags
 from experiments.training.names import ARMS
 
@@ -43,9 +43,7 @@ flags.DEFINE_integer("process_id", None, "which of them this is, from 0", lower_
 
 def main(_: list[str]) -> None:
     """Run the sweep of the flags on every scene."""
-    from experiments.jobs import sweep  # imports JAX, which --help does without
-
-    sweep.main()
+    job("sweep").main()
 
 
 if __name__ == "__main__":

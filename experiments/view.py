@@ -10,7 +10,7 @@ camera and one picture. The program needs the extra "viewer".
 
 from absl import flags
 
-from experiments.command_line import start
+from experiments.command_line import job, start
 from experiments.viewing import define_flags
 
 
@@ -23,9 +23,7 @@ flags.DEFINE_integer("port", 7007, "port to serve at", lower_bound=1, upper_boun
 
 def main(_: list[str]) -> None:
     """Serve the run that the flags name until Ctrl-C."""
-    from experiments.jobs import view  # imports JAX, which --help does without
-
-    view.main()
+    job("view").main()
 
 
 if __name__ == "__main__":

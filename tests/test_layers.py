@@ -67,7 +67,7 @@ ROOMS = {
     "jobs": {
         *("methods", "evaluation", "progress", "training", "reporting", "viewing", "command_line"),
     },
-    "command_line": set(),
+    "command_line": {"progress"},
 }
 LIBRARIES_OF_GEOMETRY = {"jax", "chex", "flax", "typing", "jaxcloseup"}
 LONGEST_MODULE, LONGEST_FUNCTION, MOST_PROGRAMS = 400, 80, 8

@@ -125,7 +125,7 @@ def main() -> None:
     except (SceneError, OSError, ValueError) as error:
         sys.exit(f"experiments.run: {error}")
     try:
-        with lock:
+        with lock, progress.showing():
             results = run(
                 scene,
                 preset,

@@ -38,9 +38,9 @@ class _Display:
                     parts.append(f"{self.estimate.done} of {self.estimate.total} steps")
             remaining = _left(self.estimate)
             counting = self.estimate.done is not None
-        parts += self.doing[-1:]
+        parts += self.doing[-1:] or ([] if parts else ["getting ready"])
         seconds = time.monotonic() - self._began
-        if parts and seconds >= 1 and (self.doing or not counting):
+        if seconds >= 1 and (self.doing or not counting):
             parts.append(f"{seconds:.0f} s")
         return ", ".join([*parts, *remaining])
 
@@ -53,14 +53,13 @@ class _Display:
     def say(self) -> None:
         """Print the line."""
         self.said = time.monotonic()
-        if line := self.line():
-            sys.stdout.write(f"{line}\n")
-            sys.stdout.flush()
+        sys.stdout.write(f"{self.line()}\n")
+        sys.stdout.flush()
 
     def watch(self, ended: threading.Event) -> None:
         """Say the line whenever nothing was said for `QUIET` seconds."""
         while not ended.wait(0.2):
-            if time.monotonic() - self.said >= QUIET:
+            if _display is self and time.monotonic() - self.said >= QUIET:
                 self.say()
 
 
@@ -99,10 +98,12 @@ def showing(
     outer, _display = _display, _Display(Estimate(plan or {}, compiled=compiled), words)
     display, ended = _display, threading.Event()
     try:
-        if _is_terminal() and outer is None:
+        if _is_terminal() and outer is not None:
+            yield  # its line shows this now
+        elif _is_terminal():
             line = Live(
                 console=Console(),
-                get_renderable=lambda: Text(display.line(), no_wrap=True, overflow="ellipsis"),
+                get_renderable=lambda: Text(_display.line(), no_wrap=True, overflow="ellipsis"),
                 refresh_per_second=2,
                 transient=True,
             )
@@ -132,6 +133,7 @@ def part(name: str) -> Iterator[None]:
     finally:
         with display.lock:
             display.estimate.end()
+        display.changed(aloud=False)
 
 
 @contextlib.contextmanager

@@ -52,7 +52,7 @@ class Estimate:
 
     def end(self) -> None:
         """End the current part."""
-        self._spent += self._worked()
+        self._spent += self._cost()
         self._typical += self._share * self._plan.get(self.name, 0.0)
         self.name = self.done = None
 
@@ -66,7 +66,8 @@ class Estimate:
         """Count steps of the current part; the first call says with how many it begins."""
         now, compiled = self._clock(), self._compiled()
         if self.done is None:
-            self._since, self._share = (done, now, compiled), 1 - done / max(total, 1)
+            self._since, self._first = (done, now, compiled), done
+            self._share = 1 - done / max(total, 1)
         else:
             first, since, before = self._since
             seconds, compiling = now - since, compiled - before
@@ -83,6 +84,12 @@ class Estimate:
     def _worked(self):
         """How long the current part has taken, without compiling."""
         return max(self._clock() - self._started - (self._compiled() - self._before), 0.0)
+
+    def _cost(self):
+        """Seconds of all steps of the current part; without steps, those that it has taken."""
+        if self._rate:
+            return (self.total - self._first) / self._rate
+        return self._worked()
 
     @property
     def place(self) -> tuple[int, int] | None:
@@ -101,7 +108,7 @@ class Estimate:
             if self._rate:
                 own = (self.total - self.done) / self._rate
                 own = max(own - (self._clock() - self._counted), 0.0)
-                spent, typical = spent + self._worked() + own, typical + expected
+                spent, typical = spent + self._cost(), typical + expected
             elif typical > 0:
                 own = max(spent / typical * expected - self._worked(), 0.0)
         later = sum(self._plan[name] for name in self._names[self._next :])
