@@ -15,7 +15,7 @@ from jaxcloseup.rendered_loss import rendered_loss
 from jaxcloseup.volume.encodings import positional_encoding
 from jaxcloseup.volume.nerf import NerfConfig, nerf
 from jaxcloseup.volume.networks import apply_network, init_network
-from jaxcloseup.volume.renderer import VolumeAux
+from jaxcloseup.volume.rays import VolumeAux
 
 
 TINY = NerfConfig(

@@ -2,10 +2,10 @@
 
 import dataclasses
 
-import numpy as np
 import optax
 
 from experiments.methods.method import LabelConfig, Method, Preset, WindowConfig
+from experiments.methods.volumes import unit_cube
 from jaxcloseup.field import RadianceField
 from jaxcloseup.scene import Scene
 from jaxcloseup.train import TrainConfig
@@ -93,17 +93,6 @@ def make_optimizer(config: NerfTrainingConfig, scene: Scene) -> optax.GradientTr
     return optax.adam(
         optax.exponential_decay(config.initial_lr, config.lr_decay_steps, config.lr_decay)
     )
-
-
-def unit_cube(scene: Scene) -> tuple[tuple[float, float, float], float]:
-    """Center and scale that bring the cameras and most of what they see into [-1, 1]."""
-    positions = np.asarray(scene.train.cameras.position)
-    forward = np.asarray(scene.train.cameras.rotation)[..., 2]
-    middle = positions + 0.5 * (scene.near + scene.far) * forward
-    seen = scene.points if len(scene.points) else middle
-    both = np.concatenate([positions, np.percentile(seen, [5, 95], axis=0)])
-    low, high = both.min(axis=0), both.max(axis=0)
-    return tuple(((low + high) / 2).tolist()), float(2 / (high - low).max())
 
 
 METHOD = Method(

@@ -1,34 +1,64 @@
-"""Volume rendering: ray samples, encodings, compositing, a renderer, and the NeRF built on it."""
+"""Volume rendering: rays and samples, encodings, networks, compositing, and the fields on them."""
 
-from jaxcloseup.volume.compositing import Composite, composite
+from jaxcloseup.volume.compositing import Composite, composite, composite_intervals
+from jaxcloseup.volume.coordinates import contract, contraction_scale, spaced, unspaced
 from jaxcloseup.volume.encodings import positional_encoding
+from jaxcloseup.volume.hash_grid import HashGridConfig, grid_rows, hash_features, init_hash_grid
+from jaxcloseup.volume.intervals import Histogram, IntervalConfig, Round, interval_field
 from jaxcloseup.volume.nerf import NerfConfig, nerf
-from jaxcloseup.volume.networks import Raw, apply_network, dense, init_network
-from jaxcloseup.volume.renderer import (
-    Samples,
-    VolumeAux,
-    VolumeConfig,
-    photometric_loss,
-    volume_field,
+from jaxcloseup.volume.networks import (
+    Raw,
+    apply_mlp,
+    apply_network,
+    dense,
+    init_mlp,
+    init_network,
 )
-from jaxcloseup.volume.samplers import importance, stratified
+from jaxcloseup.volume.ngp import NgpConfig, ngp
+from jaxcloseup.volume.rays import Rays, VolumeAux, photometric_loss, ray_field
+from jaxcloseup.volume.regularizers import distortion, proposal_penalty
+from jaxcloseup.volume.renderer import Samples, VolumeConfig, volume_field
+from jaxcloseup.volume.samplers import importance, interval_quantiles, resample, stratified
 
 
 __all__ = [
     "Composite",
+    "HashGridConfig",
+    "Histogram",
+    "IntervalConfig",
     "NerfConfig",
+    "NgpConfig",
     "Raw",
+    "Rays",
+    "Round",
     "Samples",
     "VolumeAux",
     "VolumeConfig",
+    "apply_mlp",
     "apply_network",
     "composite",
+    "composite_intervals",
+    "contract",
+    "contraction_scale",
     "dense",
+    "distortion",
+    "grid_rows",
+    "hash_features",
     "importance",
+    "init_hash_grid",
+    "init_mlp",
     "init_network",
+    "interval_field",
+    "interval_quantiles",
     "nerf",
+    "ngp",
     "photometric_loss",
     "positional_encoding",
+    "proposal_penalty",
+    "ray_field",
+    "resample",
+    "spaced",
     "stratified",
+    "unspaced",
     "volume_field",
 ]

@@ -33,6 +33,12 @@ class Composite(NamedTuple):
     expected_depth: jax.Array
     median_depth: jax.Array
 
+    def over(self, background: float | None) -> "Composite":
+        """The same, with a gray level behind the samples in `rgb`; None adds nothing."""
+        if background is None:
+            return self
+        return self._replace(rgb=self.rgb + (1 - self.alpha[..., None]) * background)
+
 
 def composite(
     rgb: jax.Array, density: jax.Array, depth: jax.Array, ray_length: jax.Array
@@ -52,10 +58,36 @@ def composite(
     delta = jnp.diff(depth, axis=-1) * ray_length[..., None]
     optical = density[..., :-1] * delta
     last = density[..., -1:] * _INFINITE * ray_length[..., None]
+    return _composite(rgb, jnp.concatenate([optical, last], axis=-1), depth)
+
+
+def composite_intervals(
+    rgb: jax.Array | None, density: jax.Array, edges: jax.Array, ray_length: jax.Array
+) -> Composite:
+    """Integrate densities and colors that are constant in intervals (mip-NeRF, eq. 4).
+
+    Args:
+      rgb: `[..., S, 3]` colors; None: black.
+      density: `[..., S]` non-negative, per world unit.
+      edges: `[..., S + 1]` ascending z-depths; nothing lies beyond the last. The depth of an
+        interval is its middle.
+      ray_length: `[...]` length of the ray's direction, in world units per unit of z-depth.
+    """
+    chex.assert_shape(edges, (*density.shape[:-1], density.shape[-1] + 1))
+    chex.assert_shape(ray_length, density.shape[:-1])
+    if rgb is None:
+        rgb = jnp.zeros((*density.shape, 3), density.dtype)
+    optical = density * jnp.diff(edges, axis=-1) * ray_length[..., None]
+    return _composite(rgb, optical, 0.5 * (edges[..., 1:] + edges[..., :-1]))
+
+
+def _composite(rgb: jax.Array, optical: jax.Array, depth: jax.Array) -> Composite:
+    """Composite samples of optical depths `[..., S]`."""
     # Optical depth in front of each sample. A sum stays precise where transmittance is tiny.
-    before = jnp.concatenate([jnp.zeros_like(last), jnp.cumsum(optical, axis=-1)], axis=-1)
+    before = jnp.cumsum(optical[..., :-1], axis=-1)
+    before = jnp.concatenate([jnp.zeros_like(optical[..., :1]), before], axis=-1)
     transmittance = jnp.exp(-before)
-    weights = transmittance * -jnp.expm1(-jnp.concatenate([optical, last], axis=-1))
+    weights = transmittance * -jnp.expm1(-optical)
     alpha = jnp.sum(weights, axis=-1)
     expected = jnp.sum(weights * depth, axis=-1)
     after = transmittance - weights

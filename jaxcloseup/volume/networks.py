@@ -84,6 +84,38 @@ def apply_network(network: Params, positions: jax.Array, directions: jax.Array) 
     )
 
 
+def init_mlp(key: jax.Array, widths: Sequence[int], *, ray_features: int = 0) -> Params:
+    """Layers of a small network, Glorot-uniform; `key` is consumed.
+
+    Args:
+      key: random key.
+      widths: number of inputs, of each hidden layer's outputs, and of outputs.
+      ray_features: inputs that all samples of a ray share, beside `widths[0]`.
+    """
+    keys = jax.random.split(key, len(widths) - 1)
+    fan_ins = [(widths[0], ray_features)[: 1 + (ray_features > 0)]] + [(w,) for w in widths[1:-1]]
+    return [_init_layer(*layer) for layer in zip(keys, fan_ins, widths[1:], strict=True)]
+
+
+def apply_mlp(layers: Params, x: jax.Array, of_rays: jax.Array | None = None) -> jax.Array:
+    """Evaluate a network from `init_mlp`: linear layers with positive parts between them.
+
+    Args:
+      layers: its parameters.
+      x: `[I, R * S]` inputs, with the samples of a ray side by side.
+      of_rays: `[J, R]` inputs that all samples of a ray share, if the network has any.
+
+    Returns:
+      `[O, R * S]`.
+    """
+    for i, layer in enumerate(layers):
+        weights, bias = layer["weights"], layer["bias"][:, None]
+        if len(weights) == 2:  # the same for all samples of a ray, so it becomes a bias
+            bias = dense(weights[1:], bias, (of_rays,), False)
+        x = dense(weights[:1], bias, (x,), i + 1 < len(layers))
+    return x
+
+
 @functools.partial(jax.custom_vjp, nondiff_argnums=(3,))
 def dense(
     weights: Sequence[jax.Array], bias: jax.Array, inputs: Sequence[jax.Array], relu: bool

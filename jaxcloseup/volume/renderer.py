@@ -1,9 +1,7 @@
-"""The volume renderer: it samples rays, asks a field for densities and colors, and composites them.
+"""The renderer of point samples: it asks a field for densities and colors, and composites them.
 
 A volumetric field brings its parameters and a *query function*; sampling, the coarse and the fine
-pass, compositing and chunking are the same for all of them. Rays are `[R]`, their samples `[R, S]`.
-Rays go through in chunks, one after another, in training as for whole images: the working set stays
-in the cache, and memory does not grow with the number of rays.
+pass and compositing are the same for all of them. Rays are `[R]`, their samples `[R, S]`.
 """
 
 import dataclasses
@@ -15,9 +13,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxcloseup.field import RadianceField, Rendering
-from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_rays
-from jaxcloseup.numerics import safe_divide, safe_norm
 from jaxcloseup.volume.compositing import Composite, composite
+from jaxcloseup.volume.rays import Rays, VolumeAux, ray_field
 from jaxcloseup.volume.samplers import importance, stratified
 
 
@@ -43,25 +40,11 @@ class Samples(NamedTuple):
 
     Attributes:
       density: `[R, S]` non-negative, per world unit, whatever the scale of the field's coordinates.
-      rgb: `[R, S, 3]` colors in [0, 1].
+      rgb: `[R, S, 3]` colors in [0, 1]; None from what asks for densities alone.
     """
 
     density: jax.Array
-    rgb: jax.Array
-
-
-class VolumeAux(NamedTuple):
-    """The `aux` of a volumetric field's rendering.
-
-    Attributes:
-      coarse_rgb: `[..., 3]` colors of the coarse pass, for the loss.
-      median_depth: `[...]` z-depth at which half of the light is absorbed, 0 where it never is.
-      expected_depth: `[...]` weighted sum of z-depths, not divided by alpha.
-    """
-
-    coarse_rgb: jax.Array
-    median_depth: jax.Array
-    expected_depth: jax.Array
+    rgb: jax.Array | None
 
 
 Query = Callable[[Any, Any, str, jax.Array | None, jax.Array, jax.Array], Samples]
@@ -105,111 +88,30 @@ def volume_field(
     if not 0 < near < far:
         raise ValueError(f"near and far must satisfy 0 < near < far, not {near} and {far}")
 
-    def render(
-        params: Any,
-        buffers: Any,
-        camera: Camera,
-        pixels: jax.Array | None,
-        key: jax.Array | None,
-    ) -> Rendering:
-        if pixels is None:
-            pixels = pixel_grid(camera.height, camera.width)
-        origins, directions = _rays(camera, pixels)
+    def trace(params: Any, buffers: Any, key: jax.Array | None, rays: Rays) -> Rendering:
+        return _two_passes(
+            lambda *args: query(params, buffers, *args), key, rays, near, far, config
+        )
 
-        def render_rays(rays):
-            key, origins, directions = rays
-            return _render_rays(
-                lambda *args: query(params, buffers, *args),
-                key,
-                (origins - jnp.array([center])) * scale,
-                directions * scale,
-                safe_norm(directions),
-                near,
-                far,
-                config,
-            )
-
-        shape = pixels.shape[:-1]
-        rays = origins.reshape(-1, 3), directions.reshape(-1, 3)
-        rendering = _map_chunks(render_rays, key, rays, config.chunk)
-        return jax.tree.map(lambda x: x.reshape((*shape, *x.shape[1:])), rendering)
-
-    return RadianceField(
-        init=init, render=render, loss=photometric_loss, gradient_chunk=config.chunk
-    )
+    return ray_field(init=init, trace=trace, center=center, scale=scale, chunk=config.chunk)
 
 
-def photometric_loss(
-    rendering: Rendering, target_rgb: jax.Array, weight: jax.Array
-) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Weighted mean squared error of the fine and of the coarse colors, summed (NeRF, eq. 6).
-
-    Args:
-      rendering: rendering of pixels `[...]` with a `VolumeAux`.
-      target_rgb: `[..., 3]` true colors.
-      weight: `[...]` non-negative; all zero gives a zero loss.
-
-    Returns:
-      The loss, and `{"psnr"}` of the fine colors, which is inf where no pixel has weight.
-    """
-    chex.assert_equal_shape([rendering.rgb, rendering.aux.coarse_rgb, target_rgb])
-    chex.assert_shape(weight, target_rgb.shape[:-1])
-
-    def error(rgb):
-        squared = jnp.mean((rgb - target_rgb) ** 2, axis=-1)
-        return safe_divide(jnp.sum(weight * squared), jnp.sum(weight))
-
-    fine, coarse = error(rendering.rgb), error(rendering.aux.coarse_rgb)
-    return fine + coarse, {"psnr": -10 * jnp.log10(fine)}
-
-
-def _rays(camera: Camera, pixels: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Rays of one camera, or of stacked cameras `[N]`, one for each of `pixels[N, 2]`."""
-    if camera.intrinsics.ndim == 1:
-        return pixels_to_rays(camera, pixels)
-    chex.assert_shape(pixels, (camera.intrinsics.shape[0], 2))
-    return jax.vmap(pixels_to_rays)(camera, pixels)
-
-
-def _map_chunks(fn, key, rays, chunk):
-    """`fn((key, *rays))` on chunks of the rays' leading axis `[R]`, in fixed memory.
-
-    A backward pass computes each chunk again: remembering all of them takes as long, and gigabytes.
-    """
-    (num_rays,) = {x.shape[0] for x in rays}
-    if chunk is None or num_rays <= chunk:
-        return fn((key, *rays))
-    num_chunks = -(-num_rays // chunk)
-    pad = num_chunks * chunk - num_rays
-    rays = [jnp.pad(x, ((0, pad), (0, 0)), mode="edge").reshape(num_chunks, chunk, 3) for x in rays]
-    keys = None if key is None else jax.random.split(key, num_chunks)
-    out = jax.lax.map(jax.checkpoint(fn), (keys, *rays))
-    return jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:]))[:num_rays], out)
-
-
-def _render_rays(query, key, origins, directions, ray_length, near, far, config):
-    """Coarse pass, importance samples, fine pass, on rays `[R]` in the field's coordinates."""
+def _two_passes(query, key, rays, near, far, config):
+    """Coarse pass, importance samples, fine pass."""
     keys = (None,) * 4 if key is None else jax.random.split(key, 4)
     key_coarse, key_fine, key_coarse_query, key_fine_query = keys
-    unit = directions / safe_norm(directions, keepdims=True)
 
     def see(stage, key, depth) -> Composite:
-        positions = origins.T[..., None] + directions.T[..., None] * depth[None]  # [3, R, S]
-        samples = query(stage, key, positions, unit.T)
+        samples = query(stage, key, rays.at(depth), rays.unit)
         chex.assert_shape(samples.density, depth.shape)
-        return composite(samples.rgb, samples.density, depth, ray_length)
+        return composite(samples.rgb, samples.density, depth, rays.length)
 
-    depth = stratified(key_coarse, near, far, config.num_coarse, origins.shape[:1])
+    depth = stratified(key_coarse, near, far, config.num_coarse, rays.length.shape)
     coarse = see("coarse", key_coarse_query, depth)
     middles = 0.5 * (depth[..., 1:] + depth[..., :-1])
     more = importance(key_fine, middles, coarse.weights[..., 1:-1], config.num_fine)
     depth = jnp.sort(jnp.concatenate([depth, more], axis=-1), axis=-1)
     fine = see("fine", key_fine_query, depth)
-
-    def add_background(seen: Composite) -> jax.Array:
-        if config.background is None:
-            return seen.rgb
-        return seen.rgb + (1 - seen.alpha[..., None]) * config.background
-
-    aux = VolumeAux(add_background(coarse), fine.median_depth, fine.expected_depth)
-    return Rendering(add_background(fine), fine.depth, fine.alpha, aux)
+    coarse_rgb = coarse.over(config.background).rgb
+    aux = VolumeAux(coarse_rgb, fine.median_depth, fine.expected_depth)
+    return Rendering(fine.over(config.background).rgb, fine.depth, fine.alpha, aux)

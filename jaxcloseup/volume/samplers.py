@@ -45,17 +45,63 @@ def importance(
     Returns:
       `[..., num_samples]` samples, not sorted unless `key` is None.
     """
-    chex.assert_equal_shape_prefix([edges, weights], weights.ndim - 1)
-    chex.assert_axis_dimension(edges, -1, weights.shape[-1] + 1)
-    edges, weights = jax.lax.stop_gradient((edges, weights))
-    weights = weights + 1e-5
-    pdf = weights / jnp.sum(weights, axis=-1, keepdims=True)
-    cdf = jnp.cumsum(pdf, axis=-1) - pdf
+    edges, cdf, pdf = _cdf(edges, weights)
     shape = (*weights.shape[:-1], num_samples)
     if key is None:
         quantiles = jnp.broadcast_to(jnp.linspace(0, 1, num_samples), shape)
     else:
         quantiles = jax.random.uniform(key, shape)
+    return _invert(edges, cdf, pdf, quantiles)
+
+
+def interval_quantiles(
+    key: jax.Array | None, num_intervals: int, shape: tuple[int, ...]
+) -> jax.Array:
+    """Edges of intervals in [0, 1]: 0, about i / `num_intervals`, and 1.
+
+    Args:
+      key: consumed, moves each inner edge by up to half of a step; None leaves it.
+      num_intervals: number of intervals per ray.
+      shape: batch shape of the rays.
+
+    Returns:
+      `[*shape, num_intervals + 1]` ascending edges.
+    """
+    half = 0.5 / num_intervals
+    inner = stratified(key, half, 1 - half, num_intervals - 1, shape)
+    ends = jnp.zeros((*shape, 1), inner.dtype)
+    return jnp.concatenate([ends, inner, ends + 1], axis=-1)
+
+
+def resample(
+    key: jax.Array | None, edges: jax.Array, weights: jax.Array, num_intervals: int
+) -> jax.Array:
+    """Intervals with about equal shares of a histogram; they cover all of it.
+
+    Args:
+      key: consumed, as in `interval_quantiles`.
+      edges: `[..., B + 1]` ascending edges of the histogram.
+      weights: `[..., B]` as in `importance`.
+      num_intervals: number of new intervals per ray.
+
+    Returns:
+      `[..., num_intervals + 1]` ascending edges, without a gradient.
+    """
+    edges, cdf, pdf = _cdf(edges, weights)
+    return _invert(edges, cdf, pdf, interval_quantiles(key, num_intervals, weights.shape[:-1]))
+
+
+def _cdf(edges, weights):
+    """Edges, and where the CDF of the raised weights begins and what it gains in each bin."""
+    chex.assert_equal_shape_prefix([edges, weights], weights.ndim - 1)
+    chex.assert_axis_dimension(edges, -1, weights.shape[-1] + 1)
+    edges, weights = jax.lax.stop_gradient((edges, weights))
+    weights = weights + 1e-5
+    pdf = weights / jnp.sum(weights, axis=-1, keepdims=True)
+    return edges, jnp.cumsum(pdf, axis=-1) - pdf, pdf
+
+
+def _invert(edges, cdf, pdf, quantiles):
     # The inverse is a sum of clipped ramps, one per bin, without search or gather.
     inside = jnp.clip((quantiles[..., None] - cdf[..., None, :]) / pdf[..., None, :], 0, 1)
     widths = jnp.diff(edges, axis=-1)

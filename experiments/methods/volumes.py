@@ -1,0 +1,43 @@
+"""What the volumetric methods share: Adam, and coordinates in which a scene has about unit size."""
+
+import dataclasses
+
+import numpy as np
+import optax
+
+from jaxcloseup.scene import Scene
+
+
+@dataclasses.dataclass(frozen=True)
+class AdamConfig:
+    """A training by Adam whose learning rate decays.
+
+    Attributes:
+      initial_lr: the learning rate at the first step.
+      lr_decay: factor on it over `lr_decay_steps`, along an exponential through all stages.
+      lr_decay_steps: see `lr_decay`.
+      target_steps: steps on all target views together.
+    """
+
+    initial_lr: float = 1e-2
+    lr_decay: float = 0.1
+    lr_decay_steps: int = 20_000
+    target_steps: int = 200
+
+
+def adam(config: AdamConfig, scene: Scene) -> optax.GradientTransformation:
+    """Adam as for hash grids (Instant-NGP, section 4): entries with tiny gradients move too."""
+    del scene
+    rate = optax.exponential_decay(config.initial_lr, config.lr_decay_steps, config.lr_decay)
+    return optax.adam(rate, b1=0.9, b2=0.99, eps=1e-15)
+
+
+def unit_cube(scene: Scene) -> tuple[tuple[float, float, float], float]:
+    """Center and scale that bring the cameras and most of what they see into [-1, 1]."""
+    positions = np.asarray(scene.train.cameras.position)
+    forward = np.asarray(scene.train.cameras.rotation)[..., 2]
+    middle = positions + 0.5 * (scene.near + scene.far) * forward
+    seen = scene.points if len(scene.points) else middle
+    both = np.concatenate([positions, np.percentile(seen, [5, 95], axis=0)])
+    low, high = both.min(axis=0), both.max(axis=0)
+    return tuple(((low + high) / 2).tolist()), float(2 / (high - low).max())

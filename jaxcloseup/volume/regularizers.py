@@ -1,0 +1,48 @@
+"""What volumetric fields add to the loss of a ray: penalties on where its light comes from.
+
+A round of samples is a histogram: `weights [..., S]` in intervals with `edges [..., S + 1]`, spaced
+in [0, 1]. Intervals `[..., S]` against others `[..., P]` are compared all with all: S and P are
+tens.
+"""
+
+import chex
+import jax
+import jax.numpy as jnp
+
+
+_SMALL = 1e-7
+
+
+def proposal_penalty(
+    edges: jax.Array, weights: jax.Array, proposed_edges: jax.Array, proposed: jax.Array
+) -> jax.Array:
+    """How much light the last round found where a proposal says there is less (mip-NeRF 360, 13).
+
+    Teaches the proposal alone: no gradient flows to `weights`.
+
+    Args:
+      edges: `[..., S + 1]` of the last round.
+      weights: `[..., S]` of the last round.
+      proposed_edges: `[..., P + 1]` of the proposal.
+      proposed: `[..., P]` weights of the proposal.
+
+    Returns:
+      `[...]`.
+    """
+    chex.assert_axis_dimension(edges, -1, weights.shape[-1] + 1)
+    chex.assert_axis_dimension(proposed_edges, -1, proposed.shape[-1] + 1)
+    edges, weights = jax.lax.stop_gradient((edges, weights))
+    begins_before = proposed_edges[..., None, :-1] < edges[..., 1:, None]
+    ends_after = proposed_edges[..., None, 1:] > edges[..., :-1, None]
+    overlap = begins_before & ends_after  # [..., S, P]
+    bound = jnp.sum(jnp.where(overlap, proposed[..., None, :], 0), axis=-1)
+    excess = jnp.maximum(weights - bound, 0)
+    return jnp.sum(excess**2 / (weights + _SMALL), axis=-1)
+
+
+def distortion(edges: jax.Array, weights: jax.Array) -> jax.Array:
+    """How far apart the light of a ray comes from, `[...]` (mip-NeRF 360, eq. 15)."""
+    middles = 0.5 * (edges[..., 1:] + edges[..., :-1])
+    apart = jnp.abs(middles[..., :, None] - middles[..., None, :])
+    between = jnp.sum(weights * jnp.sum(weights[..., None, :] * apart, axis=-1), axis=-1)
+    return between + jnp.sum(weights**2 * jnp.diff(edges, axis=-1), axis=-1) / 3

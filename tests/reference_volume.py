@@ -1,0 +1,185 @@
+"""Slow NumPy float64 oracles of volumetric fields, from the papers, without the package's code."""
+
+import math
+
+import numpy as np
+
+
+def resolution(level, levels, coarsest, finest):
+    """Cells along a side of a level of the hash encoding (Instant-NGP, eq. 2 and 3)."""
+    growth = math.exp((math.log(finest) - math.log(coarsest)) / max(1, levels - 1))
+    return math.floor(coarsest * growth**level + 1e-6)
+
+
+def hash_row(vertex, side, entries):
+    """Row of a vertex `(x, y, z)` in its level's table (Instant-NGP, eq. 4); `side` vertices."""
+    x, y, z = map(int, vertex)
+    if side**3 <= entries:
+        return x + side * y + side * side * z
+    wrapped = [x * 1 % 2**32, y * 2654435761 % 2**32, z * 805459861 % 2**32]
+    return (wrapped[0] ^ wrapped[1] ^ wrapped[2]) % entries
+
+
+def hash_encoding(table, config, position):
+    """Features `[L, F]` of one position in [0, 1]^3, and what each row of the table weighs."""
+    table, entries = np.asarray(table, np.float64), 2**config.log2_entries
+    found, shares, start = [], {}, 0
+    for level in range(config.levels):
+        cells = resolution(level, config.levels, config.coarsest, config.finest)
+        scaled = np.clip(np.asarray(position, np.float64), 0, 1) * cells
+        low = np.minimum(np.floor(scaled), cells - 1)
+        total = np.zeros(table.shape[1])
+        for corner in np.ndindex(2, 2, 2):
+            share = np.prod([t if c else 1 - t for c, t in zip(corner, scaled - low, strict=True)])
+            row = start + hash_row(low + corner, cells + 1, entries)
+            total += share * table[row]
+            shares[level, row] = shares.get((level, row), 0) + share
+        found.append(total)
+        start += min((cells + 1) ** 3, entries)
+    assert start == len(table)
+    return np.array(found), shares
+
+
+def mlp(layers, *inputs):
+    """Outputs `[M, O]` of linear layers with positive parts between them, of inputs `[M, I_i]`."""
+    x = np.concatenate(inputs, axis=1)
+    for i, layer in enumerate(layers):
+        weights = np.concatenate([np.asarray(w, np.float64) for w in layer["weights"]], axis=1)
+        x = x @ weights.T + np.asarray(layer["bias"], np.float64)
+        x = np.maximum(x, 0) if i + 1 < len(layers) else x
+    return x
+
+
+def positional(x, octaves):
+    """`[M, 3 + 6 octaves]`: x, sin x, cos x, sin 2x, ... of `[M, 3]`."""
+    waves = [wave(2**k * x) for k in range(octaves) for wave in (np.sin, np.cos)]
+    return np.concatenate([x, *waves], axis=1)
+
+
+def contract(x):
+    """mip-NeRF 360, eq. 10, of `[M, 3]`."""
+    norm = np.linalg.norm(x, axis=1, keepdims=True)
+    return np.where(norm <= 1, x, (2 - 1 / np.maximum(norm, 1e-9)) * x / np.maximum(norm, 1e-9))
+
+
+def power(x, p):
+    """The power transformation of Zip-NeRF, eq. 24, with its limits."""
+    if p == 1:
+        return x
+    if p == 0:
+        return np.log(x + 1)
+    return abs(p - 1) / p * ((x / abs(p - 1) + 1) ** p - 1)
+
+
+def unspace(s, near, far, p):
+    """Distances in [near, far] at evenly transformed `s` in [0, 1], by bisection."""
+    result = []
+    for value in np.ravel(s):
+        low, high = near, far
+        for _ in range(100):
+            middle = (low + high) / 2
+            here = (power(middle, p) - power(near, p)) / (power(far, p) - power(near, p))
+            low, high = (middle, high) if here < value else (low, middle)
+        result.append((low + high) / 2)
+    return np.reshape(result, np.shape(s))
+
+
+def quantile_edges(edges, weights, count):
+    """`count + 1` edges of equal shares of a histogram raised by 1e-5."""
+    weights = np.asarray(weights, np.float64) + 1e-5
+    cdf = np.concatenate([[0], np.cumsum(weights / weights.sum())])
+    return np.interp(np.arange(count + 1) / count, cdf, edges)
+
+
+def absorb(density, edges, length):
+    """Weights of intervals of constant density along one ray, one after the other."""
+    light, weights = 1.0, []
+    for sigma, begin, end in zip(density, edges[:-1], edges[1:], strict=True):
+        kept = math.exp(-sigma * (end - begin) * length)
+        weights.append(light * (1 - kept))
+        light *= kept
+    return np.array(weights)
+
+
+def proposal_penalty(edges, weights, proposed_edges, proposed):
+    """mip-NeRF 360, eq. 11 to 13, with loops."""
+    total = 0.0
+    for i, weight in enumerate(weights):
+        bound = 0.0
+        for j, other in enumerate(proposed):
+            apart = proposed_edges[j + 1] <= edges[i] or proposed_edges[j] >= edges[i + 1]
+            bound += 0 if apart else other
+        total += max(0, weight - bound) ** 2 / (weight + 1e-7)
+    return total
+
+
+def distortion(edges, weights, steps=4000):
+    """mip-NeRF 360, eq. 14: the integral of w(u) w(v) |u - v|, by a sum over a fine grid."""
+    grid = edges[0] + (np.arange(steps) + 0.5) * (edges[-1] - edges[0]) / steps
+    bins = np.searchsorted(edges, grid, side="right") - 1
+    mass = (weights / np.diff(edges))[bins] * (edges[-1] - edges[0]) / steps
+    # The sum over pairs, by prefix sums over the ascending grid.
+    before = np.cumsum(mass) - mass
+    moment = np.cumsum(mass * grid) - mass * grid
+    return 2 * np.sum(mass * (grid * before - moment))
+
+
+def pixel_ray(camera, pixel):
+    """Origin, direction of unit camera-z and its length, of one pixel."""
+    fx, fy, cx, cy = np.asarray(camera.intrinsics, np.float64)
+    pose = np.asarray(camera.camtoworld, np.float64)
+    direction = pose[:, :3] @ [(pixel[0] - cx) / fx, (pixel[1] - cy) / fy, 1.0]
+    return pose[:, 3], direction, np.linalg.norm(direction)
+
+
+def march(camera, pixel, near, far, rounds, *, spacing=1.0, scale=1.0):
+    """One pixel's color, depth and alpha, and the histograms of all rounds.
+
+    `rounds` are pairs of a number of intervals and `look(origin, direction, edges) -> density, rgb`
+    per world unit; origin and direction are in the world. `spacing` is that of distances times
+    `scale`.
+    """
+    origin, direction, length = pixel_ray(camera, pixel)
+    edges, weights, histograms = None, None, []
+    for count, look in rounds:
+        if edges is None:
+            edges = np.arange(count + 1) / count
+        else:
+            edges = quantile_edges(edges, weights, count)
+        depth = unspace(edges, scale * near, scale * far, spacing) / scale
+        density, rgb = look(origin, direction, depth)
+        weights = absorb(density, depth, length)
+        histograms.append((edges, weights))
+    middle = (depth[1:] + depth[:-1]) / 2
+    alpha = weights.sum()
+    return weights @ rgb, weights @ middle / alpha, alpha, histograms
+
+
+def sigmoid(x):
+    return 1 / (1 + np.exp(-x))
+
+
+def ngp(config, params, center, scale):
+    """`rounds` for `march`, of Instant-NGP with proposals."""
+
+    def features(grid_config, table, points):
+        x = (points - center) * scale
+        x = contract(x) / 2 if config.contracted else x
+        return np.array([hash_encoding(table, grid_config, (p + 1) / 2)[0].ravel() for p in x])
+
+    def propose(origin, direction, depth):
+        points = origin + (depth[1:, None] + depth[:-1, None]) / 2 * direction
+        part = params["proposal"]
+        raw = mlp(part["density"], features(config.proposal, part["grid"], points))
+        return scale * np.exp(raw[:, 0]), None
+
+    def render(origin, direction, depth):
+        points = origin + (depth[1:, None] + depth[:-1, None]) / 2 * direction
+        part = params["fine"]
+        raw = mlp(part["density"], features(config.grid, part["grid"], points))
+        unit = np.tile(direction / np.linalg.norm(direction), (len(raw), 1))
+        looking = positional(unit, config.direction_octaves)
+        return scale * np.exp(raw[:, 0]), sigmoid(mlp(part["color"], raw, looking))
+
+    proposals = [n for n in (config.num_coarse, config.num_middle) if n]
+    return [*((n, propose) for n in proposals), (config.num_fine, render)]

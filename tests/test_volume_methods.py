@@ -1,0 +1,179 @@
+"""Every volumetric method against its oracle, and as experiments train it."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference_volume as reference
+from test_sweep import assert_same_step
+from tiny_runs import TINY
+
+from experiments.methods import METHODS
+from experiments.training.arms import make_arm
+from experiments.training.programs import Programs
+from experiments.training.settings import plain_config
+from experiments.training.setup import initial_state, start_labels
+from experiments.training.sweep import stack_arms
+from jaxcloseup.artifacts.checkpoints import Checkpoints
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.scenes import load_scene
+from jaxcloseup.volume import intervals
+from jaxcloseup.volume.hash_grid import HashGridConfig
+from jaxcloseup.volume.ngp import NgpConfig, ngp
+
+
+GRID = HashGridConfig(levels=3, features=2, log2_entries=8, coarsest=4, finest=16)
+NGP = NgpConfig(
+    grid=GRID,
+    proposal=dataclasses.replace(GRID, levels=2),
+    width=8,
+    proposal_width=4,
+    color_layers=1,
+    direction_octaves=1,
+    num_coarse=6,
+    num_middle=5,
+    num_fine=4,
+    spacing=-1.0,
+    contracted=True,
+    distortion_weight=0.1,
+)
+CENTER, SCALE, NEAR, FAR = (0.2, -0.1, 0.3), 0.6, 0.5, 4.0
+# Each method: its configuration, what makes its field, and its oracle's rounds and spacing.
+FIELDS = {"ngp": (NGP, ngp, reference.ngp)}
+PIXELS = np.array([[2.5, 3.5], [6.5, 1.5], [4.0, 4.25]])
+
+
+def camera():
+    """One that looks along z from (0.3, 0, -2), with pixels that are not square."""
+    pose = np.array([[1.0, 0, 0, 0.3], [0, 1, 0, 0], [0, 0, 1, -2]])
+    return Camera(jnp.asarray(pose), jnp.array([8.0, 9, 4, 4.5]), 8, 8)
+
+
+@functools.cache
+def field(name):
+    config, make, _ = FIELDS[name]
+    return make(config, near=NEAR, far=FAR, center=CENTER, scale=SCALE)
+
+
+@functools.cache
+def params(name):
+    """Float64 parameters whose scene is not empty; drawn by NumPy, which compiles nothing."""
+    shapes, _ = jax.eval_shape(field(name).init, jax.random.key(0), *[jnp.zeros((1, 3))] * 2)
+    numbers = np.random.default_rng(1)
+    return jax.tree.map(lambda x: 0.5 * numbers.normal(size=x.shape), shapes)
+
+
+@pytest.fixture(params=FIELDS)
+def name(request):
+    return request.param
+
+
+def test_a_rendering_matches_the_oracle(name):
+    config, _, oracle = FIELDS[name]
+    with jax.enable_x64(True):
+        seen = jax.jit(field(name).render)(params(name), (), camera(), jnp.asarray(PIXELS), None)
+    rounds = oracle(config, params(name), np.array(CENTER), SCALE)
+    for i, pixel in enumerate(PIXELS):
+        rgb, depth, alpha, histograms = reference.march(
+            camera(), pixel, NEAR, FAR, rounds, spacing=config.spacing, scale=SCALE
+        )
+        assert alpha > 0.1
+        np.testing.assert_allclose(seen.rgb[i], rgb, atol=1e-5)
+        np.testing.assert_allclose(seen.depth[i], depth, atol=1e-5)
+        np.testing.assert_allclose(seen.alpha[i], alpha, atol=1e-5)
+        penalty = sum(
+            reference.proposal_penalty(*histograms[-1], *proposed) for proposed in histograms[:-1]
+        )
+        penalty += config.distortion_weight * reference.distortion(*histograms[-1])
+        np.testing.assert_allclose(seen.aux.penalty[i], penalty, rtol=1e-4)
+
+
+def test_gradients_are_finite_differences(name, monkeypatch):
+    """With intervals that stay, because no gradient flows through where rays are cut."""
+
+    def even(key, edges, weights, count):
+        return intervals.interval_quantiles(key, count, weights.shape[:-1])
+
+    monkeypatch.setattr(intervals, "resample", even)
+    numbers = np.random.default_rng(3)
+    along = jax.tree.map(lambda x: numbers.normal(size=x.shape), params(name))
+    with jax.enable_x64(True):
+        weight, target = jnp.array([1.0, 0.5, 0.0]), jnp.full((3, 3), 0.3)
+
+        def losses(steps):
+            moved = {
+                key: jax.tree.map(lambda p, d, h=step: p + h * d, params(name)[key], along[key])
+                for key, step in steps.items()
+            }
+            seen = field(name).render(moved, (), camera(), jnp.asarray(PIXELS), None)
+            plain = seen._replace(aux=seen.aux._replace(penalty=None))
+            penalty = seen.aux.penalty
+            penalty = jnp.zeros(()) if penalty is None else jnp.sum(penalty)
+            return jnp.stack([field(name).loss(plain, target, weight)[0], penalty])
+
+        zero = dict.fromkeys(along, 0.0)
+        value, slopes = jax.jit(losses), jax.jit(jax.jacrev(losses))(zero)
+        for key in zero:
+            up, down = (value(zero | {key: h}) for h in (1e-6, -1e-6))
+            expected = (up - down) / 2e-6
+            # What teaches a proposal does not learn from it.
+            learns = slice(0, 1) if key == "fine" and "proposal" in zero else slice(0, 2)
+            np.testing.assert_allclose(slopes[key][learns], expected[learns], rtol=1e-4, atol=1e-8)
+            assert np.any(np.abs(expected[learns]) > 1e-4)
+
+
+def tiny_preset(name):
+    """The quick preset, as small as its oracle's, on whole photographs of the plane."""
+    quick = METHODS[name].presets["quick"]
+    small = {k: v for k, v in vars(FIELDS[name][0]).items() if k not in ("chunk", "spacing")}
+    field = dataclasses.replace(quick.field, **small, target_steps=2)
+    return dataclasses.replace(TINY, method=name, field=field)
+
+
+@functools.cache
+def trained(name, capture_folder):
+    """Programs of a tiny preset, and the state after three steps."""
+    scene = load_scene(str(capture_folder))
+    programs = Programs(tiny_preset(name), scene)
+    state = initial_state(programs, seed=0)
+    return programs, programs.run("photographs", state, scene.train, count=3)[0]
+
+
+def test_a_step_lowers_the_loss_of_what_it_saw(name, capture_folder):
+    with jax.numpy_dtype_promotion("standard"):
+        programs, state = trained(name, capture_folder)
+        views = programs.scene.train
+        after, before = programs.run("photographs", state, views, count=1)
+        _, again = programs.run("photographs", after.replace(step=state.step), views, count=1)
+    assert again["loss"] < before["loss"]
+
+
+def test_a_resumed_training_is_the_same_to_the_last_bit(name, capture_folder, tmp_path):
+    with jax.numpy_dtype_promotion("standard"):
+        programs, state = trained(name, capture_folder)
+        views = programs.scene.train
+        whole, _ = programs.run("photographs", state, views, count=4)
+        half, _ = programs.run("photographs", state, views, count=2)
+        kept = Checkpoints(tmp_path, {"config": plain_config(programs.preset)})
+        kept.save("baseline", 2, half, {"history": [], "growth": 1})
+        _, half, _ = kept.load("baseline", state)
+        ended, _ = programs.run("photographs", half, views, count=2)
+    jax.tree.map(np.testing.assert_array_equal, ended.params, whole.params)
+    jax.tree.map(np.testing.assert_array_equal, ended.opt_state, whole.opt_state)
+
+
+def test_an_arm_is_the_run_alone(name, capture_folder):
+    with jax.numpy_dtype_promotion("standard"):
+        programs, state = trained(name, capture_folder)
+        start = start_labels(programs, state, seed=0)
+        arms = [make_arm(arm, programs.preset).settings for arm in ("control", "rgb_tolerance=0.5")]
+        states, *data = stack_arms(arms, [start] * 2, len(jax.devices()))
+        together, metrics = programs.run("arms", states, start.sources.views, *data, count=1)
+        data = start.sources.views, start.sources, arms[1]
+        alone, _ = programs.run("random_closeups", start.state, *data, count=1)
+    assert not any(metrics["skipped"])
+    arm = jax.tree.map(lambda leaf: leaf[1], together.replace(step=alone.step[None]))
+    assert_same_step(arm, alone, start.state)
