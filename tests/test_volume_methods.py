@@ -6,6 +6,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import plane
 import pytest
 import reference_volume as reference
 from test_sweep import assert_same_step
@@ -43,6 +44,7 @@ NGP = NgpConfig(
 CENTER, SCALE, NEAR, FAR = (0.2, -0.1, 0.3), 0.6, 0.5, 4.0
 # Each method: its configuration, what makes its field, and its oracle's rounds and spacing.
 FIELDS = {"ngp": (NGP, ngp, reference.ngp)}
+TRAINED = [*FIELDS, "dsnerf"]
 PIXELS = np.array([[2.5, 3.5], [6.5, 1.5], [4.0, 4.25]])
 
 
@@ -66,11 +68,7 @@ def params(name):
     return jax.tree.map(lambda x: 0.5 * numbers.normal(size=x.shape), shapes)
 
 
-@pytest.fixture(params=FIELDS)
-def name(request):
-    return request.param
-
-
+@pytest.mark.parametrize("name", FIELDS)
 def test_a_rendering_matches_the_oracle(name):
     config, _, oracle = FIELDS[name]
     with jax.enable_x64(True):
@@ -91,6 +89,7 @@ def test_a_rendering_matches_the_oracle(name):
         np.testing.assert_allclose(seen.aux.penalty[i], penalty, rtol=1e-4)
 
 
+@pytest.mark.parametrize("name", FIELDS)
 def test_gradients_are_finite_differences(name, monkeypatch):
     """With intervals that stay, because no gradient flows through where rays are cut."""
 
@@ -128,6 +127,9 @@ def test_gradients_are_finite_differences(name, monkeypatch):
 def tiny_preset(name):
     """The quick preset, as small as its oracle's, on whole photographs of the plane."""
     quick = METHODS[name].presets["quick"]
+    if name == "dsnerf":
+        field = dataclasses.replace(TINY.field, depth_weight=quick.field.depth_weight)
+        return dataclasses.replace(TINY, method=name, field=field)
     small = {k: v for k, v in vars(FIELDS[name][0]).items() if k not in ("chunk", "spacing")}
     field = dataclasses.replace(quick.field, **small, target_steps=2)
     return dataclasses.replace(TINY, method=name, field=field)
@@ -136,12 +138,16 @@ def tiny_preset(name):
 @functools.cache
 def trained(name, capture_folder):
     """Programs of a tiny preset, and the state after three steps."""
-    scene = load_scene(str(capture_folder))
+    numbers = np.random.default_rng(0)
+    points = np.float32(np.column_stack([numbers.uniform(-0.5, 0.5, (200, 2)), np.zeros(200)]))
+    rgb = np.float32(plane.texture(points))
+    scene = dataclasses.replace(load_scene(str(capture_folder)), points=points, rgb=rgb)
     programs = Programs(tiny_preset(name), scene)
     state = initial_state(programs, seed=0)
     return programs, programs.run("photographs", state, scene.train, count=3)[0]
 
 
+@pytest.mark.parametrize("name", TRAINED)
 def test_a_step_lowers_the_loss_of_what_it_saw(name, capture_folder):
     with jax.numpy_dtype_promotion("standard"):
         programs, state = trained(name, capture_folder)
@@ -151,6 +157,7 @@ def test_a_step_lowers_the_loss_of_what_it_saw(name, capture_folder):
     assert again["loss"] < before["loss"]
 
 
+@pytest.mark.parametrize("name", TRAINED)
 def test_a_resumed_training_is_the_same_to_the_last_bit(name, capture_folder, tmp_path):
     with jax.numpy_dtype_promotion("standard"):
         programs, state = trained(name, capture_folder)
@@ -165,6 +172,7 @@ def test_a_resumed_training_is_the_same_to_the_last_bit(name, capture_folder, tm
     jax.tree.map(np.testing.assert_array_equal, ended.opt_state, whole.opt_state)
 
 
+@pytest.mark.parametrize("name", TRAINED)
 def test_an_arm_is_the_run_alone(name, capture_folder):
     with jax.numpy_dtype_promotion("standard"):
         programs, state = trained(name, capture_folder)

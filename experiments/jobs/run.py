@@ -138,7 +138,7 @@ def main() -> None:
                 load_options=load_options,
                 tensorboard=FLAGS.tensorboard,
             )
-    except (TrainingError, CheckpointError, OSError) as error:
+    except (TrainingError, CheckpointError, SceneError, OSError) as error:
         sys.exit(f"experiments.run: {error}")
     print_results(results)
     print(f"report: {output_dir / 'report.html'}")

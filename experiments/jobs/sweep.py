@@ -111,7 +111,7 @@ def main() -> None:
     try:
         with lock, progress.showing(words=in_words):
             found = sweep_scenes(scenes, preset, output_dir, load_options, perceptual, first=first)
-    except (TrainingError, CheckpointError, OSError) as error:
+    except (TrainingError, CheckpointError, SceneError, OSError) as error:
         if hosts is None:
             sys.exit(f"experiments.sweep: {error}")
         # The others would wait for this one at the end: without it they are told to stop.

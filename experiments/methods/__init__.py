@@ -1,6 +1,6 @@
 """The methods: one module each, and the table of them, written by hand."""
 
-from experiments.methods import nerf, ngp, surfels
+from experiments.methods import dsnerf, nerf, ngp, surfels
 from experiments.methods.method import (
     CoarseConfig,
     LabelConfig,
@@ -11,7 +11,12 @@ from experiments.methods.method import (
 )
 
 
-METHODS: dict[str, Method] = {"nerf": nerf.METHOD, "ngp": ngp.METHOD, "surfels": surfels.METHOD}
+METHODS: dict[str, Method] = {
+    "nerf": nerf.METHOD,
+    "dsnerf": dsnerf.METHOD,
+    "ngp": ngp.METHOD,
+    "surfels": surfels.METHOD,
+}
 
 __all__ = [
     "METHODS",

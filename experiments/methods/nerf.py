@@ -5,7 +5,7 @@ import dataclasses
 import optax
 
 from experiments.methods.method import LabelConfig, Method, Preset, WindowConfig
-from experiments.methods.volumes import unit_cube
+from experiments.methods.volumes import DepthConfig, depth_supervision, unit_cube
 from jaxcloseup.field import RadianceField
 from jaxcloseup.scene import Scene
 from jaxcloseup.train import TrainConfig
@@ -13,7 +13,7 @@ from jaxcloseup.volume.nerf import NerfConfig, nerf
 
 
 @dataclasses.dataclass(frozen=True)
-class NerfTrainingConfig(NerfConfig):
+class NerfTrainingConfig(NerfConfig, DepthConfig):
     """A NeRF and its training.
 
     Attributes:
@@ -84,7 +84,14 @@ def make_field(config: NerfTrainingConfig, scene: Scene, growth: int) -> Radianc
     """A NeRF between the scene's near and far; nothing overflows, so `growth` says nothing."""
     del growth
     center, scale = unit_cube(scene) if config.normalize else ((0.0, 0.0, 0.0), 1.0)
-    return nerf(config, near=scene.near, far=scene.far, center=center, scale=scale)
+    return nerf(
+        config,
+        near=scene.near,
+        far=scene.far,
+        center=center,
+        scale=scale,
+        supervision=depth_supervision(config, scene),
+    )
 
 
 def make_optimizer(config: NerfTrainingConfig, scene: Scene) -> optax.GradientTransformation:

@@ -3,7 +3,13 @@
 import dataclasses
 
 from experiments.methods.method import LabelConfig, Method, Preset, WindowConfig
-from experiments.methods.volumes import AdamConfig, adam, unit_cube
+from experiments.methods.volumes import (
+    AdamConfig,
+    DepthConfig,
+    adam,
+    depth_supervision,
+    unit_cube,
+)
 from jaxcloseup.field import RadianceField
 from jaxcloseup.scene import Scene
 from jaxcloseup.train import TrainConfig
@@ -12,7 +18,7 @@ from jaxcloseup.volume.ngp import NgpConfig, ngp
 
 
 @dataclasses.dataclass(frozen=True)
-class NgpTrainingConfig(NgpConfig, AdamConfig):
+class NgpTrainingConfig(NgpConfig, DepthConfig, AdamConfig):
     """Instant-NGP and its training."""
 
 
@@ -58,7 +64,14 @@ def make_field(config: NgpTrainingConfig, scene: Scene, growth: int) -> Radiance
     """Instant-NGP between the scene's near and far; nothing overflows."""
     del growth
     center, scale = unit_cube(scene)
-    return ngp(config, near=scene.near, far=scene.far, center=center, scale=scale)
+    return ngp(
+        config,
+        near=scene.near,
+        far=scene.far,
+        center=center,
+        scale=scale,
+        supervision=depth_supervision(config, scene),
+    )
 
 
 METHOD = Method(

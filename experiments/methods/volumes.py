@@ -5,7 +5,9 @@ import dataclasses
 import numpy as np
 import optax
 
+from experiments.methods.sightings import find_sightings
 from jaxcloseup.scene import Scene
+from jaxcloseup.volume.depth_supervision import DepthSupervision
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,6 +25,30 @@ class AdamConfig:
     lr_decay: float = 0.1
     lr_decay_steps: int = 20_000
     target_steps: int = 200
+
+
+@dataclasses.dataclass(frozen=True)
+class DepthConfig:
+    """Supervision of depth by the capture's points, for any volumetric field.
+
+    Attributes:
+      depth_weight: weight of its loss; 0 turns it off.
+      depth_share: rays through points in a step, as a share of its pixels.
+    """
+
+    depth_weight: float = 0.0
+    depth_share: float = 0.5
+
+
+def depth_supervision(config: DepthConfig, scene: Scene) -> DepthSupervision | None:
+    """What `config` says, on a scene.
+
+    Raises:
+      SceneError: the scene has no points for it.
+    """
+    if not config.depth_weight:
+        return None
+    return DepthSupervision(find_sightings(scene), config.depth_weight, config.depth_share)
 
 
 def adam(config: AdamConfig, scene: Scene) -> optax.GradientTransformation:

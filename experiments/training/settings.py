@@ -42,7 +42,9 @@ BOUNDS = {
         (1, _MOST),
     ),
     **dict.fromkeys(("chunk", "block"), (1, _MOST)),
-    **dict.fromkeys(("label_loss_weight", "ssim_weight", "whole_share", "background"), (0, 1)),
+    **dict.fromkeys(
+        ("label_loss_weight", "ssim_weight", "whole_share", "background", "depth_share"), (0, 1)
+    ),
     **dict.fromkeys(("initial_opacity", "min_opacity", "reset_opacity"), (0, 1)),
 }
 _CHOICES = {

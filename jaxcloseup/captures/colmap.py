@@ -29,7 +29,7 @@ def holds_model(folder: pathlib.Path) -> bool:
 
 def read_colmap(
     model: pathlib.Path, photographs: pathlib.Path
-) -> tuple[pathlib.Path, list[Frame], tuple[np.ndarray, np.ndarray]]:
+) -> tuple[pathlib.Path, list[Frame], tuple[np.ndarray, np.ndarray], np.ndarray]:
     """Read a sparse model, binary or text, with or without the rigs and frames of COLMAP 3.12.
 
     Args:
@@ -37,8 +37,9 @@ def read_colmap(
       photographs: folder of the images.
 
     Returns:
-      The file that lists the images; the images that have a pose, sorted by name; and the points
-      `[P, 3]` with their colors `[P, 3]` in [0, 1], float32, sorted by id.
+      The file that lists the images; the images that have a pose, sorted by name; the points
+      `[P, 3]` with their colors `[P, 3]` in [0, 1], float32, sorted by id; and the points' mean
+      reprojection errors `[P]` in pixels of the images, NaN where the model does not tell.
 
     Raises:
       SceneError: names the file and the record in it, and says what to do.
@@ -115,7 +116,9 @@ def read_colmap(
     check_photographs(source, frames)
     rgb = [reconstruction.points3D[i].color for i in kept]
     rgb = np.array(rgb, np.float32).reshape(-1, 3) / 255
-    return source, frames, (xyz[keep].astype(np.float32), rgb)
+    errors = np.array([reconstruction.points3D[i].error for i in kept], np.float32).reshape(-1)
+    errors = np.where(errors >= 0, errors, np.nan)  # COLMAP writes -1 for an unknown one
+    return source, frames, (xyz[keep].astype(np.float32), rgb), errors
 
 
 def _lens(file: pathlib.Path, camera: Any) -> tuple[dict[str, Any], tuple[int, int]]:

@@ -40,6 +40,8 @@ class Listing(NamedTuple):
       rgb: `[P, 3]` float32 colors of the points in [0, 1].
       notes: sentences on what was read and how it was split.
       times_nearer: see `splits.Division`.
+      errors: `[P]` mean reprojection errors of the points, in pixels of the photographs' own size,
+        NaN where unknown; None if the format has none.
     """
 
     format: str
@@ -51,6 +53,7 @@ class Listing(NamedTuple):
     rgb: np.ndarray
     notes: tuple[str, ...]
     times_nearer: tuple[float, ...] | None
+    errors: np.ndarray | None
 
 
 class _Content(NamedTuple):
@@ -61,6 +64,7 @@ class _Content(NamedTuple):
     frames: list[Frame]
     given: dict[str, list[Frame]] | None
     points: tuple[np.ndarray, np.ndarray]
+    errors: np.ndarray | None = None
 
 
 def read_listing(
@@ -110,11 +114,12 @@ def read_listing(
         folder=folder,
         file=content.file,
         fields=content.fields,
-        frames=frames,
+        frames={split: _renumbered(part, keep) for split, part in frames.items()},
         points=points[keep],
         rgb=rgb[keep],
         notes=tuple(map(printable, notes)),
         times_nearer=division.times_nearer,
+        errors=None if content.errors is None else content.errors[keep],
     )
 
 
@@ -156,8 +161,8 @@ def _read_transforms(folder: pathlib.Path, file: pathlib.Path) -> _Content:
 
 
 def _read_model(folder: pathlib.Path, model: pathlib.Path) -> _Content:
-    file, frames, points = read_colmap(model, folder / "images")
-    return _Content(file, {}, frames, None, points)
+    file, frames, points, errors = read_colmap(model, folder / "images")
+    return _Content(file, {}, frames, None, points, errors)
 
 
 def _read_llff(folder: pathlib.Path, file: pathlib.Path) -> _Content:
@@ -179,6 +184,15 @@ def _read_ply(
         keep = plausible(ply, points, np.stack([frame.camtoworld[:, 3] for frame in frames]))
         return points[keep], rgb[keep]
     return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
+
+
+def _renumbered(frames: list[Frame], keep: np.ndarray) -> list[Frame]:
+    """Frames whose `seen` counts only the points `[P]` that are kept."""
+    rows = np.cumsum(keep) - 1
+    return [
+        frame if frame.seen is None else frame._replace(seen=rows[frame.seen[keep[frame.seen]]])
+        for frame in frames
+    ]
 
 
 def _seen_in_training(splits: dict[str, list[Frame]], count: int) -> np.ndarray:

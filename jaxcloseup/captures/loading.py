@@ -96,6 +96,9 @@ def _load(listing: Listing, reading: Reading) -> Scene:
         "format": listing.format,
         "notes": listing.notes,
     }
+    if listing.errors is not None:
+        metadata["seen"] = [frame.seen for frame in listing.frames["train"]]
+        metadata["point_errors"] = listing.errors
     if listing.times_nearer is not None:
         metadata["times_nearer"] = listing.times_nearer
     if reading.zoom > 1:

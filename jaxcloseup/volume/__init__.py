@@ -2,6 +2,12 @@
 
 from jaxcloseup.volume.compositing import Composite, composite, composite_intervals
 from jaxcloseup.volume.coordinates import contract, contraction_scale, spaced, unspaced
+from jaxcloseup.volume.depth_supervision import (
+    DepthSupervision,
+    Sightings,
+    depth_divergence,
+    mean_divergence,
+)
 from jaxcloseup.volume.encodings import positional_encoding
 from jaxcloseup.volume.hash_grid import HashGridConfig, grid_rows, hash_features, init_hash_grid
 from jaxcloseup.volume.intervals import Histogram, IntervalConfig, Round, interval_field
@@ -15,7 +21,7 @@ from jaxcloseup.volume.networks import (
     init_network,
 )
 from jaxcloseup.volume.ngp import NgpConfig, ngp
-from jaxcloseup.volume.rays import Rays, VolumeAux, photometric_loss, ray_field
+from jaxcloseup.volume.rays import Rays, Traced, VolumeAux, photometric_loss, ray_field
 from jaxcloseup.volume.regularizers import distortion, proposal_penalty
 from jaxcloseup.volume.renderer import Samples, VolumeConfig, volume_field
 from jaxcloseup.volume.samplers import importance, interval_quantiles, resample, stratified
@@ -23,6 +29,7 @@ from jaxcloseup.volume.samplers import importance, interval_quantiles, resample,
 
 __all__ = [
     "Composite",
+    "DepthSupervision",
     "HashGridConfig",
     "Histogram",
     "IntervalConfig",
@@ -32,6 +39,8 @@ __all__ = [
     "Rays",
     "Round",
     "Samples",
+    "Sightings",
+    "Traced",
     "VolumeAux",
     "VolumeConfig",
     "apply_mlp",
@@ -41,6 +50,7 @@ __all__ = [
     "contract",
     "contraction_scale",
     "dense",
+    "depth_divergence",
     "distortion",
     "grid_rows",
     "hash_features",
@@ -50,6 +60,7 @@ __all__ = [
     "init_network",
     "interval_field",
     "interval_quantiles",
+    "mean_divergence",
     "nerf",
     "ngp",
     "photometric_loss",

@@ -15,7 +15,8 @@ import jax
 from jaxcloseup.field import RadianceField, Rendering
 from jaxcloseup.volume.compositing import composite_intervals
 from jaxcloseup.volume.coordinates import unspaced
-from jaxcloseup.volume.rays import Rays, VolumeAux, ray_field
+from jaxcloseup.volume.depth_supervision import DepthSupervision
+from jaxcloseup.volume.rays import Rays, Traced, VolumeAux, ray_field
 from jaxcloseup.volume.renderer import Samples
 from jaxcloseup.volume.samplers import interval_quantiles, resample
 
@@ -68,6 +69,7 @@ def interval_field(
     center: tuple[float, float, float] = (0.0, 0.0, 0.0),
     scale: float = 1.0,
     loss: Callable[..., tuple[jax.Array, dict[str, jax.Array]]] | None = None,
+    supervision: DepthSupervision | None = None,
 ) -> RadianceField:
     """A radiance field that renders by cutting rays into intervals, round after round.
 
@@ -80,6 +82,7 @@ def interval_field(
       center: world position that becomes the origin of the field's coordinates.
       scale: field units per world unit.
       loss: `photometric_loss` by default.
+      supervision: see `ray_field`.
 
     Raises:
       ValueError: the depth range is empty.
@@ -89,9 +92,9 @@ def interval_field(
         raise ValueError(f"near and far must satisfy 0 < near < far, not {near} and {far}")
     span = near * scale, far * scale
 
-    def trace(params: Any, buffers: Any, key: jax.Array | None, rays: Rays) -> Rendering:
+    def trace(params: Any, buffers: Any, key: jax.Array | None, rays: Rays) -> Traced:
         keys = [None] * 2 * len(rounds) if key is None else jax.random.split(key, 2 * len(rounds))
-        seen, histograms = [], []
+        seen, histograms, colored = [], [], []
         for i, (count, query) in enumerate(rounds):
             if not histograms:
                 edges = interval_quantiles(keys[0], count, rays.length.shape)
@@ -101,13 +104,20 @@ def interval_field(
             samples = query(params, buffers, keys[2 * i + 1], rays, depth)
             light = composite_intervals(samples.rgb, samples.density, depth, rays.length)
             histograms.append(Histogram(edges, light.weights))
-            seen.append(light.over(config.background) if samples.rgb is not None else None)
-        fine = seen[-1]
-        coarse_rgb = None if len(rounds) == 1 or seen[0] is None else seen[0].rgb
+            if samples.rgb is not None:
+                seen.append(light.over(config.background))
+                colored.append((depth, light.weights))
+        fine, coarse_rgb = seen[-1], seen[0].rgb if len(seen) > 1 else None
         more = None if penalty is None else penalty(params, histograms)
         aux = VolumeAux(coarse_rgb, fine.median_depth, fine.expected_depth, more)
-        return Rendering(fine.rgb, fine.depth, fine.alpha, aux)
+        return Traced(Rendering(fine.rgb, fine.depth, fine.alpha, aux), colored)
 
     return ray_field(
-        init=init, trace=trace, center=center, scale=scale, chunk=config.chunk, loss=loss
+        init=init,
+        trace=trace,
+        center=center,
+        scale=scale,
+        chunk=config.chunk,
+        loss=loss,
+        supervision=supervision,
     )

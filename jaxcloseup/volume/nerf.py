@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxcloseup.field import RadianceField
+from jaxcloseup.volume.depth_supervision import DepthSupervision
 from jaxcloseup.volume.encodings import positional_encoding
 from jaxcloseup.volume.networks import apply_network, init_network
 from jaxcloseup.volume.renderer import Samples, VolumeConfig, volume_field
@@ -64,11 +65,13 @@ def nerf(
     far: float,
     center: tuple[float, float, float] = (0.0, 0.0, 0.0),
     scale: float = 1.0,
+    supervision: DepthSupervision | None = None,
 ) -> RadianceField:
     """A NeRF that samples rays between z-depths `near` and `far`, in world units.
 
     The network sees `(position - center) * scale`, which should lie roughly within [-1, 1].
-    Parameters are `{"coarse": ..., "fine": ...}`; there are no buffers.
+    Parameters are `{"coarse": ..., "fine": ...}`; there are no buffers. `supervision` adds a loss
+    on depth, see `ray_field`.
 
     Raises:
       ValueError: the depth range is empty, or `config.compute_dtype` is unknown.
@@ -103,7 +106,14 @@ def nerf(
         chunk=config.rays_at_once,
     )
     return volume_field(
-        volume, init=init, query=query, near=near, far=far, center=center, scale=scale
+        volume,
+        init=init,
+        query=query,
+        near=near,
+        far=far,
+        center=center,
+        scale=scale,
+        supervision=supervision,
     )
 
 

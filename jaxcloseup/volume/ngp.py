@@ -13,6 +13,7 @@ import jax.numpy as jnp
 
 from jaxcloseup.field import RadianceField
 from jaxcloseup.volume.coordinates import contract
+from jaxcloseup.volume.depth_supervision import DepthSupervision
 from jaxcloseup.volume.encodings import positional_encoding
 from jaxcloseup.volume.hash_grid import HashGridConfig, hash_features, init_hash_grid
 from jaxcloseup.volume.intervals import IntervalConfig, Round, interval_field
@@ -73,12 +74,13 @@ def ngp(
     far: float,
     center: tuple[float, float, float] = (0.0, 0.0, 0.0),
     scale: float = 1.0,
+    supervision: DepthSupervision | None = None,
 ) -> RadianceField:
     """Instant-NGP between z-depths `near` and `far`, in world units.
 
     The field's coordinates are `(position - center) * scale`; what matters should lie within the
     unit cube or, with `contracted`, the unit ball. Parameters are `{"fine": ..., "proposal": ...}`;
-    there are no buffers.
+    there are no buffers. `supervision` adds a loss on depth, see `ray_field`.
 
     Raises:
       ValueError: the depth range is empty.
@@ -145,4 +147,5 @@ def ngp(
         penalty=penalty,
         center=center,
         scale=scale,
+        supervision=supervision,
     )

@@ -4,6 +4,7 @@ Rays are `[R]`. They go through in chunks, one after another, in training as for
 working set stays in the cache, and memory does not grow with the number of rays.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -14,6 +15,10 @@ import jax.numpy as jnp
 from jaxcloseup.field import RadianceField, Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_rays
 from jaxcloseup.numerics import safe_divide, safe_norm
+from jaxcloseup.volume.depth_supervision import DepthSupervision, mean_divergence
+
+
+_SUPERVISED = 1  # folded into the key of rays through known points
 
 
 class Rays(NamedTuple):
@@ -58,7 +63,20 @@ class VolumeAux(NamedTuple):
     penalty: jax.Array | None = None
 
 
-Trace = Callable[[Any, Any, jax.Array | None, Rays], Rendering]
+class Traced(NamedTuple):
+    """What tracing R rays gives.
+
+    Attributes:
+      rendering: `[R]`, with a `VolumeAux`.
+      light: of each pass that photographs teach, first to last: edges `[R, S + 1]` of its
+        intervals, ascending z-depths, and weights `[R, S]`, the shares of light from there.
+    """
+
+    rendering: Rendering
+    light: list[tuple[jax.Array, jax.Array]]
+
+
+Trace = Callable[[Any, Any, jax.Array | None, Rays], Traced]
 
 
 def ray_field(
@@ -69,6 +87,7 @@ def ray_field(
     scale: float = 1.0,
     chunk: int | None = None,
     loss: Callable[..., tuple[jax.Array, dict[str, jax.Array]]] | None = None,
+    supervision: DepthSupervision | None = None,
 ) -> RadianceField:
     """A radiance field that renders by tracing rays.
 
@@ -77,16 +96,28 @@ def ray_field(
 
     Args:
       init: `(key, points [P, 3], rgb [P, 3]) -> (params, buffers)`.
-      trace: `(params, buffers, key, rays [R]) -> Rendering [R]` with a `VolumeAux`; `key` is None
-        in a deterministic rendering.
+      trace: `(params, buffers, key, rays [R]) -> Traced`; `key` is None in a deterministic
+        rendering.
       center: world position that becomes the origin of the field's coordinates.
       scale: field units per world unit.
       chunk: rays traced, and in training differentiated, at once; None for all.
       loss: `photometric_loss` by default.
+      supervision: adds a loss on depth to the penalty of renderings with a key.
 
     Returns:
       A field whose `render` takes single pixels, also with stacked cameras.
     """
+
+    def trace_pixels(params, buffers, camera, pixels, key, take):
+        """`take(Traced)` of pixels `[N, 2]`, chunk by chunk."""
+
+        def trace_rays(rays):
+            key, origins, directions, pixel = rays
+            own = (origins - jnp.array([center])) * scale, directions * scale
+            rays = Rays(*own, safe_norm(directions), pixel * scale)
+            return take(trace(params, buffers, key, rays))
+
+        return _map_chunks(trace_rays, key, _rays(camera, pixels), chunk)
 
     def render(
         params: Any,
@@ -97,25 +128,19 @@ def ray_field(
     ) -> Rendering:
         if pixels is None:
             pixels = pixel_grid(camera.height, camera.width)
-        shape = pixels.shape[:-1]
-        origins, directions, pixel = _rays(camera, pixels)
+        shape, pixels = pixels.shape[:-1], pixels.reshape(-1, 2)
+        bound = functools.partial(trace_pixels, params, buffers)
+        rendering = bound(camera, pixels, key, lambda traced: traced.rendering)
+        if supervision is not None and key is not None:
 
-        def trace_rays(rays):
-            key, origins, directions, pixel = rays
-            return trace(
-                params,
-                buffers,
-                key,
-                Rays(
-                    (origins - jnp.array([center])) * scale,
-                    directions * scale,
-                    safe_norm(directions),
-                    pixel * scale,
-                ),
-            )
+            def see(key, cameras, pixels):
+                return bound(cameras, pixels, key, lambda traced: traced.light)
 
-        rays = origins.reshape(-1, 3), directions.reshape(-1, 3), pixel.reshape(-1)
-        rendering = _map_chunks(trace_rays, key, rays, chunk)
+            key = jax.random.fold_in(key, _SUPERVISED)
+            more = mean_divergence(supervision, key, len(pixels), see)
+            before = rendering.aux.penalty
+            more = jnp.broadcast_to(more, (len(pixels),)) + (0 if before is None else before)
+            rendering = rendering._replace(aux=rendering.aux._replace(penalty=more))
         return jax.tree.map(lambda x: x.reshape((*shape, *x.shape[1:])), rendering)
 
     return RadianceField(init, render, loss or photometric_loss, gradient_chunk=chunk)

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 
 from jaxcloseup.field import RadianceField, Rendering
 from jaxcloseup.volume.compositing import Composite, composite
-from jaxcloseup.volume.rays import Rays, VolumeAux, ray_field
+from jaxcloseup.volume.depth_supervision import DepthSupervision
+from jaxcloseup.volume.rays import Rays, Traced, VolumeAux, ray_field
 from jaxcloseup.volume.samplers import importance, stratified
 
 
@@ -59,6 +60,7 @@ def volume_field(
     far: float,
     center: tuple[float, float, float] = (0.0, 0.0, 0.0),
     scale: float = 1.0,
+    supervision: DepthSupervision | None = None,
 ) -> RadianceField:
     """A radiance field that renders by sampling rays between z-depths `near` and `far`.
 
@@ -77,6 +79,7 @@ def volume_field(
       far: z-depth of the last samples, world units.
       center: world position that becomes the origin of the field's coordinates.
       scale: field units per world unit.
+      supervision: see `ray_field`.
 
     Returns:
       A field whose `render` takes single pixels, also with stacked cameras, whose `loss` is
@@ -88,12 +91,19 @@ def volume_field(
     if not 0 < near < far:
         raise ValueError(f"near and far must satisfy 0 < near < far, not {near} and {far}")
 
-    def trace(params: Any, buffers: Any, key: jax.Array | None, rays: Rays) -> Rendering:
+    def trace(params: Any, buffers: Any, key: jax.Array | None, rays: Rays) -> Traced:
         return _two_passes(
             lambda *args: query(params, buffers, *args), key, rays, near, far, config
         )
 
-    return ray_field(init=init, trace=trace, center=center, scale=scale, chunk=config.chunk)
+    return ray_field(
+        init=init,
+        trace=trace,
+        center=center,
+        scale=scale,
+        chunk=config.chunk,
+        supervision=supervision,
+    )
 
 
 def _two_passes(query, key, rays, near, far, config):
@@ -106,12 +116,17 @@ def _two_passes(query, key, rays, near, far, config):
         chex.assert_shape(samples.density, depth.shape)
         return composite(samples.rgb, samples.density, depth, rays.length)
 
+    def light(depth, seen):  # each sample stands for the interval up to the next
+        return jnp.concatenate([depth, jnp.full_like(depth[..., :1], far)], axis=-1), seen.weights
+
     depth = stratified(key_coarse, near, far, config.num_coarse, rays.length.shape)
     coarse = see("coarse", key_coarse_query, depth)
+    first = light(depth, coarse)
     middles = 0.5 * (depth[..., 1:] + depth[..., :-1])
     more = importance(key_fine, middles, coarse.weights[..., 1:-1], config.num_fine)
     depth = jnp.sort(jnp.concatenate([depth, more], axis=-1), axis=-1)
     fine = see("fine", key_fine_query, depth)
     coarse_rgb = coarse.over(config.background).rgb
     aux = VolumeAux(coarse_rgb, fine.median_depth, fine.expected_depth)
-    return Rendering(fine.over(config.background).rgb, fine.depth, fine.alpha, aux)
+    rendering = Rendering(fine.over(config.background).rgb, fine.depth, fine.alpha, aux)
+    return Traced(rendering, [first, light(depth, fine)])

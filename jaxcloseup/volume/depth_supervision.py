@@ -1,0 +1,102 @@
+"""Depth supervision by points that photographs share (Deng et al., "Depth-supervised NeRF", 2022).
+
+Structure from motion leaves points whose depths in photographs are known up to their reprojection
+errors. A ray through such a point should end there: what absorbs its light should be distributed
+like the point's depth. The loss draws its own rays, beside those of a step's pixels.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+from jax.scipy.special import ndtr
+
+from jaxcloseup.geometry.cameras import Camera
+
+
+_SMALL = 1e-5  # added to weights, as in the authors' code
+
+
+class Sightings(NamedTuple):
+    """Points in photographs of V cameras.
+
+    Attributes:
+      cameras: stacked `[V]`.
+      view: `[N]` int32, the photograph of each sighting.
+      pixels: `[N, 2]` where it shows the point.
+      depth: `[N]` z-depth of the point there, world units.
+      deviation: `[N]` standard deviation of that depth, world units.
+    """
+
+    cameras: Camera
+    view: Any
+    pixels: Any
+    depth: Any
+    deviation: Any
+
+
+class DepthSupervision(NamedTuple):
+    """A loss on the depth of rays through known points.
+
+    Attributes:
+      sightings: the points; at least one.
+      weight: weight of the loss.
+      share: rays through points in a step, as a share of its pixels.
+    """
+
+    sightings: Sightings
+    weight: float
+    share: float
+
+
+def depth_divergence(
+    edges: jax.Array, weights: jax.Array, depth: jax.Array, deviation: jax.Array
+) -> jax.Array:
+    """KL divergence of a ray's light from a normal distribution of depth (DS-NeRF, eq. 5).
+
+    The light has the constant density `weights / widths` in each interval, so the integral over
+    normally distributed depths is a sum over intervals with their shares of the normal
+    distribution, which the paper approximates by its value at each sample.
+
+    Args:
+      edges: `[..., S + 1]` ascending z-depths.
+      weights: `[..., S]` shares of the ray's light.
+      depth: `[...]` mean of the normal distribution.
+      deviation: `[...]` its standard deviation, positive.
+
+    Returns:
+      `[...]`.
+    """
+    chex.assert_axis_dimension(edges, -1, weights.shape[-1] + 1)
+    below = ndtr((edges - depth[..., None]) / deviation[..., None])
+    widths = jnp.maximum(jnp.diff(edges, axis=-1), jnp.finfo(edges.dtype).tiny)
+    log_density = jnp.log(weights + _SMALL) - jnp.log(widths)
+    entropy = 0.5 + jnp.log(deviation * (2 * jnp.pi) ** 0.5)
+    return -entropy - jnp.sum(jnp.diff(below, axis=-1) * log_density, axis=-1)
+
+
+def mean_divergence(
+    supervision: DepthSupervision,
+    key: jax.Array,
+    num_pixels: int,
+    see: Callable[..., list[tuple[jax.Array, jax.Array]]],
+) -> jax.Array:
+    """The loss of rays through points drawn at random, `[]`, with its weight.
+
+    Args:
+      supervision: what to draw from.
+      key: consumed.
+      num_pixels: pixels of the step.
+      see: `(key, cameras [K], pixels [K, 2]) -> [(edges, weights), ...]`, what each of a field's
+        passes sees; all of them are taught.
+    """
+    key_draw, key_see = jax.random.split(key)
+    points = supervision.sightings
+    count = max(1, round(supervision.share * num_pixels))
+    drawn = jax.random.randint(key_draw, (count,), 0, len(points.view))
+    view, pixels, depth, deviation = (jnp.asarray(x)[drawn] for x in points[1:])
+    cameras = jax.tree.map(lambda leaf: leaf[view], points.cameras)
+    each = [depth_divergence(*seen, depth, deviation) for seen in see(key_see, cameras, pixels)]
+    return supervision.weight * sum(jnp.mean(one) for one in each)
