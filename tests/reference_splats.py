@@ -1,4 +1,6 @@
-"""A slow splatter in NumPy float64: rays against planes, every splat at every pixel, no tiles.
+"""A slow splatter in NumPy float64: every splat at every pixel, no tiles.
+
+Splats are discs, which rays meet, or with three scales volumetric Gaussians (at the end).
 
 It shares neither code nor formulas with the package: it intersects rays with discs, while the
 package interpolates homographies. Both follow the same decisions: the constants, the order (by
@@ -143,7 +145,12 @@ def render(surfels, camtoworld, intrinsics, height, width, *, background=None, *
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
     camtoworld = np.asarray(camtoworld, np.float64)
-    alphas, depths = intersect(surfels, camtoworld, intrinsics, pixels, **options)
+    volumetric = surfels["log_scales"].shape[1] == 3
+    if volumetric:
+        options.pop("reach", None)
+        options["size"] = width, height
+    draw = project if volumetric else intersect
+    alphas, depths = draw(surfels, camtoworld, intrinsics, pixels, **options)
     payload, order = [], []
     for mean, quaternion, sh in zip(
         surfels["means"], surfels["quaternions"], surfels["sh"], strict=True
@@ -158,6 +165,37 @@ def render(surfels, camtoworld, intrinsics, height, width, *, background=None, *
         alphas[by_depth], depths[by_depth], np.array(payload)[by_depth]
     )
     rgb = sums[:, :3] + (0 if background is None else (1 - alpha)[:, None] * background)
-    image = dict(rgb=rgb, normal=sums[:, 3:], alpha=alpha, depth=depth)
-    image |= dict(median_depth=median, distortion=distortion)
+    image = dict(rgb=rgb, alpha=alpha, depth=depth, median_depth=median, distortion=distortion)
+    image |= {} if volumetric else dict(normal=sums[:, 3:])
     return {name: value.reshape(height, width, *value.shape[1:]) for name, value in image.items()}
+
+
+def project(gaussians, camtoworld, intrinsics, pixels, *, near, size, antialias=False):
+    """Opacity and depth `[N, P]` of volumetric Gaussians, by matrices as Kerbl et al. wrote them.
+
+    The image has `size` (width, height). An ellipse grows by 0.3 px^2; with `antialias` by 0.1,
+    and its opacity falls as its area grows (Yu et al. 2024).
+    """
+    rotation, position = np.asarray(camtoworld)[:, :3], np.asarray(camtoworld)[:, 3]
+    focal, principal = np.asarray(intrinsics)[:2], np.asarray(intrinsics)[2:]
+    low = (-0.15 * np.array(size) - principal) / focal
+    high = (1.15 * np.array(size) - principal) / focal
+    alphas, depths = [], []
+    for i, mean in enumerate(gaussians["means"]):
+        x, y, z = mu = rotation.T @ (mean - position)
+        axes = rotation_of(gaussians["quaternions"][i]) * np.exp(gaussians["log_scales"][i])
+        covariance = rotation.T @ axes @ axes.T @ rotation
+        # The derivative of the projection by steps along the imaginary axis.
+        at = np.array([*np.clip([x / z, y / z], low, high), 1]) * z + 1e-30j * np.eye(3)
+        jacobian = ((focal * at[:, :2] / at[:, 2:]).imag / 1e-30).T
+        sharp = jacobian @ covariance @ jacobian.T
+        wide = sharp + (0.1 if antialias else 0.3) * np.eye(2)
+        opacity = 1 / (1 + np.exp(-gaussians["opacity_logits"][i]))
+        if antialias:
+            opacity *= np.sqrt(np.linalg.det(sharp) / np.linalg.det(wide))
+        offset = pixels - (focal * mu[:2] / z + principal)
+        rho = np.einsum("pi,ij,pj->p", offset, np.linalg.inv(wide), offset)
+        alpha = np.minimum(opacity * np.exp(-rho / 2), ALPHA_MAX)
+        alphas.append(np.where((alpha < ALPHA_MIN) | (z <= near), 0, alpha))
+        depths.append(np.full(len(pixels), z if z > near else 1.0))
+    return np.array(alphas), np.array(depths)

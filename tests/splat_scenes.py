@@ -21,14 +21,14 @@ ANTIALIASED = dataclasses.replace(CONFIG, antialias=True)
 OUTPUTS = ("rgb", "alpha", "depth", "normal", "median_depth", "distortion")
 
 
-def random_scene(seed, *, depth=(1.0, 3.0), log_scale=(-4.0, -0.7), count=COUNT):
-    """Surfels in front of the identity pose: float64 arrays by name, exact in float32."""
+def random_scene(seed, *, depth=(1.0, 3.0), log_scale=(-4.0, -0.7), count=COUNT, num_scales=2):
+    """Splats in front of the identity pose: float64 arrays by name, exact in float32."""
     rng = np.random.default_rng(seed)
     z = rng.uniform(*depth, count)
     xy = rng.uniform(-0.5, 0.5, (count, 2)) * np.maximum(np.abs(z), 0.5)[:, None]
     scene = dict(
         means=np.concatenate([xy, z[:, None]], axis=1),
-        log_scales=rng.uniform(*log_scale, (count, 2)),
+        log_scales=rng.uniform(*log_scale, (count, num_scales)),
         quaternions=rng.normal(size=(count, 4)),
         opacity_logits=rng.uniform(-2, 4, count),
         sh=0.4 * rng.normal(size=(count, 4, 3)),
@@ -42,6 +42,15 @@ SCENES = {
     "through the camera": random_scene(1, depth=(-0.5, 1.5), log_scale=(-2.0, 0.5)),
     "far and small": random_scene(2, depth=(2.0, 3.0), log_scale=(-6.0, -3.0)),
 }
+VOLUMES = {
+    f"volumes {name}": random_scene(seed, num_scales=3, **kwargs)
+    for name, seed, kwargs in [
+        ("in front", 0, dict(log_scale=(-4.0, -1.2))),
+        ("through the camera", 1, dict(depth=(-0.5, 1.5), log_scale=(-3.0, -1.0))),
+        ("far and small", 2, dict(depth=(2.0, 3.0), log_scale=(-6.0, -3.0))),
+    ]
+}
+SPLATS = SCENES | VOLUMES
 
 
 def to_surfels(scene, dtype=jnp.float32):
@@ -53,7 +62,7 @@ def to_camera(camtoworld=IDENTITY, intrinsics=INTRINSICS, size=(HEIGHT, WIDTH), 
 
 
 def render(surfels, camera, alive=None, config=CONFIG):
-    """All images of `render_surfels` over `BACKGROUND`, by name."""
+    """All images of `render_surfels` over `BACKGROUND`, by name; volumes have no normals."""
     alive = jnp.ones(surfels.means.shape[0], bool) if alive is None else alive
     return _render(surfels, camera, alive, config)
 
@@ -62,7 +71,7 @@ def render(surfels, camera, alive=None, config=CONFIG):
 def _render(surfels, camera, alive, config):
     background = jnp.asarray(BACKGROUND, surfels.means.dtype)
     image = render_surfels(surfels, alive, camera, config, background=background)
-    aux = image.aux._asdict()
+    aux = {name: values for name, values in image.aux._asdict().items() if values is not None}
     return dict(rgb=image.rgb, alpha=image.alpha, depth=image.depth, **aux)
 
 

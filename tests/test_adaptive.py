@@ -30,10 +30,11 @@ SMALL, LARGE, HUGE = 0.01, 0.05, 0.5  # scales in world units, around CONFIG's t
 grow = jax.jit(functools.partial(refine, config=CONFIG, extent=EXTENT))
 
 
-def scene_of(scales, opacities):
-    """Random surfels with the given scales along the first tangent and the given opacities."""
+def scene_of(scales, opacities, num_scales=2):
+    """Random splats with the given scales along the first tangent and the given opacities."""
     scene = random_scene(5)
-    scene["log_scales"] = np.log(np.stack([scales, 0.3 * np.asarray(scales)], axis=1))
+    shares = np.array([1.0, 0.3, 0.1])[:num_scales]
+    scene["log_scales"] = np.log(np.asarray(scales)[:, None] * shares)
     opacities = np.asarray(opacities, float)
     scene["opacity_logits"] = np.log(opacities) - np.log1p(-opacities)
     return with_image_offset(to_surfels(scene))
@@ -59,7 +60,8 @@ def test_an_image_offset_moves_the_center_by_half_images():
     np.testing.assert_allclose(depth_after, depth, rtol=1e-5)
 
 
-def test_small_surfels_are_cloned_large_split_faint_and_huge_removed(key):
+@pytest.mark.parametrize("num_scales", [2, 3])
+def test_small_surfels_are_cloned_large_split_faint_and_huge_removed(key, num_scales):
     scales, opacities, means = np.full(COUNT, SMALL), np.full(COUNT, 0.5), np.zeros(COUNT)
     means[[0, 1]] = 3.0, 2.0
     scales[1] = LARGE
@@ -67,7 +69,7 @@ def test_small_surfels_are_cloned_large_split_faint_and_huge_removed(key):
     scales[3] = HUGE
     means[4] = 0.99  # just below the threshold
     alive = np.arange(COUNT) < 10
-    before = scene_of(scales, opacities)
+    before = scene_of(scales, opacities, num_scales)
     gradients = gradients_of(means)
     after, now_alive, new = grow(key, before, jnp.asarray(alive), gradients, remove_huge=True)
     assert int(now_alive.sum()) == 10 - 2 + 2
@@ -82,9 +84,11 @@ def test_small_surfels_are_cloned_large_split_faint_and_huge_removed(key):
         np.testing.assert_array_equal(after.opacity_logits[row], before.opacity_logits[1])
         offset = np.asarray(after.means[row] - before.means[1], float)
         along = rotation_of(np.asarray(before.quaternions[1], float)).T @ offset
-        assert abs(along[2]) < 1e-6  # in its plane
-        assert np.all(np.abs(along[:2]) < 5 * np.array([LARGE, 0.3 * LARGE]))
         assert np.abs(along[:2]).max() > 1e-4
+        reach = np.array([1.0, 0.3, 0.1 if num_scales == 3 else 0.0]) * LARGE  # in a disc's plane
+        assert np.all(np.abs(along) < 5 * reach + 1e-6) and (abs(along[2]) > 1e-5) == (
+            num_scales == 3
+        )
     np.testing.assert_array_equal(np.nonzero(new)[0], [1, 2, 3])
     untouched = [0, *range(4, 10)]
     np.testing.assert_array_equal(

@@ -37,8 +37,10 @@ def window(name):
     [
         (dict(depth=(-0.5, 1.5), log_scale=(-4.0, -1.0)), 0.9),
         (dict(depth=(1.0, 3.0), log_scale=(-6.0, -3.0)), 0.3),
+        (dict(depth=(-0.5, 1.5), log_scale=(-4.0, -1.0), num_scales=3), 0.9),
+        (dict(depth=(1.0, 3.0), log_scale=(-6.0, -3.0), num_scales=3), 0.3),
     ],
-    ids=["through the camera", "small"],
+    ids=["through the camera", "small", "volumes through the camera", "small volumes"],
 )
 def test_whatever_shows_is_kept(kwargs, share, antialias):
     scene = random_scene(3, count=COUNT, **kwargs)
@@ -48,7 +50,11 @@ def test_whatever_shows_is_kept(kwargs, share, antialias):
         x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
         options = {"near": NEAR, "antialias": antialias}
-        alpha, _ = reference.intersect(scene, IDENTITY, intrinsics, pixels, **options)
+        known = scene, IDENTITY, intrinsics, pixels
+        if scene["log_scales"].shape[1] == 3:
+            alpha, _ = reference.project(*known, size=(width, height), **options)
+        else:
+            alpha, _ = reference.intersect(*known, **options)
         camera = to_camera(intrinsics=intrinsics, size=(height, width))
         surfels = to_surfels(scene)
         opacity = jax.nn.sigmoid(surfels.opacity_logits)

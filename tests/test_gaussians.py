@@ -2,20 +2,23 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from reference_splats import rotation_of
 from splat_scenes import random_scene, to_surfels
 
 from jaxcloseup.artifacts.gaussians import as_gaussians
 
 
-def test_covariances_match_thin_ellipsoids():
-    scene = random_scene(2)
+@pytest.mark.parametrize("num_scales", [2, 3])
+def test_covariances_match_ellipsoids_which_of_discs_are_thin(num_scales):
+    scene = random_scene(2, num_scales=num_scales)
     found = as_gaussians(to_surfels(scene), jnp.ones(16, bool))
     for i in range(16):
-        u, v = np.exp(scene["log_scales"][i])
+        scales = [*np.exp(scene["log_scales"][i])]
+        scales += [min(scales) / 1000] if num_scales == 2 else []
         rotation = rotation_of(scene["quaternions"][i])
-        expected = rotation @ np.diag(np.square([u, v, min(u, v) / 1000])) @ rotation.T
-        largest = max(u, v) ** 2
+        expected = rotation @ np.diag(np.square(scales)) @ rotation.T
+        largest = max(scales) ** 2
         np.testing.assert_allclose(found.covariances[i], expected, rtol=0, atol=1e-5 * largest)
     np.testing.assert_allclose(found.opacities, 1 / (1 + np.exp(-scene["opacity_logits"])), 1e-5)
 

@@ -8,10 +8,11 @@ import constant_color
 import jax
 import jax.numpy as jnp
 import numpy as np
+import plane
 import pytest
 from absl import flags
 from absl.testing import flagsaver
-from tiny_runs import TINY_SURFELS
+from tiny_runs import TINY_MIP, TINY_SURFELS
 
 from experiments import render, run, sweep
 from experiments.methods import METHODS, surfels
@@ -23,7 +24,11 @@ from experiments.training.setup import (
     initial_state,
     state_shapes,
 )
+from jaxcloseup.artifacts.surfel_ply import read_surfels
+from jaxcloseup.field import Rendering
+from jaxcloseup.pyramids import scene_pyramid
 from jaxcloseup.scenes import load_scene
+from jaxcloseup.splats.filters import SMOOTHING_VARIANCE, smoothed
 
 
 @pytest.fixture
@@ -49,13 +54,55 @@ def test_cameras_in_one_place_have_the_size_of_what_they_see(scene):
 
 def test_the_near_plane_is_small_in_a_small_scene(scene, monkeypatch):
     seen = []
-    monkeypatch.setattr(surfels, "surfel_field", lambda config, *, extent: seen.append(config))
+    monkeypatch.setattr(surfels, "surfel_field", lambda config, **_: seen.append(config))
     small = moved(scene, lambda old: 0.01 * old)
     for one in (scene, small, dataclasses.replace(small, far=0.01 * scene.far)):
         make_field(TINY_SURFELS.field, one, 1)
     near = [config.raster.near for config in seen]
     assert near[0] == TINY_SURFELS.field.raster.near
     assert near[1] == near[2] == pytest.approx(0.01 * 0.01 * extent(scene))
+
+
+def test_the_smoothing_filter_is_that_of_the_finest_photographs(capture_folder, monkeypatch):
+    scene, seen = load_scene(str(capture_folder), downscale=2), []
+    keep = lambda config, *, extent, photographs: seen.append(photographs)  # noqa: E731
+    monkeypatch.setattr(surfels, "surfel_field", keep)
+    train, own = scene.train.cameras, plane.WIDTH
+    for divisor, width in ((1, own), (2, own / 2), (8, own / 2)):
+        make_field(dataclasses.replace(TINY_MIP.field, smoothed_at=divisor), scene, 1)
+        assert seen[-1].width == width
+        expected = width / train.width * train.intrinsics
+        np.testing.assert_allclose(seen[-1].intrinsics, expected, rtol=1e-6)
+    make_field(TINY_SURFELS.field, scene, 1)
+    assert seen[-1] is None
+
+
+def test_refinement_and_exports_keep_the_shapes_that_the_filter_made(capture_folder, tmp_path):
+    """Splats of a coarse model have its filter in their scales, and beside them the finer one."""
+    scene = load_scene(str(capture_folder), downscale=2)
+    config = dataclasses.replace(TINY_MIP.field, smoothed_at=1, capacity=600)
+    coarse = dataclasses.replace(config, smoothed_at=2, capacity=100)
+    points = np.random.default_rng(0).uniform([-1, -1, -0.1], [1, 1, 0.1], (100, 3))
+    points = jnp.asarray(points, jnp.float32)
+    params, buffers = make_field(coarse, scene, 1).init(jax.random.key(0), points, points)
+    depth = jnp.full((plane.HEIGHT, plane.WIDTH), 4.0)
+    gray = Rendering(jnp.full((*depth.shape, 3), 0.5), depth, jnp.ones_like(depth))
+    pyramid, _ = scene_pyramid(scene)
+    finer, kept = METHODS["mip_gaussians"].refine(
+        jax.random.key(1), config, params, buffers, lambda camera: gray, scene, pyramid
+    )
+    added = SMOOTHING_VARIANCE * np.asarray(buffers.interval)[:, None] ** 2
+    variances = (np.exp(2 * np.asarray(one.log_scales, float)) for one in (params, finer))
+    before, after = variances
+    np.testing.assert_allclose(after[:100], before + added, rtol=1e-4)
+    np.testing.assert_allclose(kept.interval[:100], buffers.interval / 2, rtol=1e-5)
+    assert kept.alive.all() and finer.log_scales.shape == (600, 3)
+    METHODS["mip_gaussians"].export(tmp_path, "baseline", finer, kept)
+    found = read_surfels(tmp_path / "splats" / "baseline.ply", num_scales=3)
+    expected = smoothed(finer, kept.interval)
+    np.testing.assert_allclose(found.log_scales, expected.log_scales, rtol=1e-6)
+    np.testing.assert_allclose(found.opacity_logits, expected.opacity_logits, rtol=1e-5)
+    assert np.all(found.opacity_logits < finer.opacity_logits)
 
 
 def test_few_points_have_random_ones_beside_them(scene):

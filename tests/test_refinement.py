@@ -50,6 +50,17 @@ def test_new_surfels_lie_on_the_surface_where_the_render_is_wrong(found):
     np.testing.assert_allclose(np.abs(normals[:, 2]), 1, atol=1e-3)  # that of the plane
 
 
+def test_new_volumes_are_round(found):
+    camera, rgb, depth, _ = found
+    images = (np.asarray(image, np.float32) for image in (rgb, depth > 0, 1 - rgb, depth))
+    volumes, _ = surfels_where_wrong(
+        jax.random.key(0), camera, *map(jnp.asarray, images), count=9, sh_degree=0, num_scales=3
+    )
+    size = np.exp(volumes.log_scales) * float(camera.intrinsics[0])
+    away = (np.asarray(volumes.means) - np.asarray(camera.position)) @ camera.rotation[:, 2]
+    np.testing.assert_allclose(size, SIZE * np.tile(away[:, None], 3) / (1 - IN_FRONT), rtol=1e-4)
+
+
 def test_joined_surfels_are_the_living_ones_of_both(found):
     _, _, _, new = found
     old = jax.tree.map(lambda leaf: leaf[:6], new[0]), jnp.arange(6) % 2 == 0

@@ -26,18 +26,18 @@ def by_hand(path):
     return names, {name: [row[i] for row in rows] for i, name in enumerate(names)}
 
 
-@pytest.mark.parametrize("num_scales", [2, 3])
+@pytest.mark.parametrize(("num_scales", "own"), [(2, 2), (3, 2), (3, 3)])
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_round_trip_is_exact(tmp_path, num_scales, degree):
+def test_round_trip_is_exact(tmp_path, num_scales, own, degree):
     rng = np.random.default_rng(degree)
-    surfels = to_surfels(random_scene(1))
+    surfels = to_surfels(random_scene(1, num_scales=own))
     sh = rng.normal(size=(16, (degree + 1) ** 2, 3))
     surfels = surfels.replace(sh=jnp.asarray(sh, jnp.float32))
     alive = jnp.arange(16) % 3 > 0
     path = tmp_path / "deep" / "splats.ply"
     assert write_surfels(path, surfels, alive, num_scales=num_scales) == 0
     expected = jax.tree.map(lambda leaf: leaf[np.asarray(alive)], surfels)
-    jax.tree.map(np.testing.assert_array_equal, read_surfels(path), expected)
+    jax.tree.map(np.testing.assert_array_equal, read_surfels(path, num_scales=own), expected)
 
 
 def test_the_file_has_the_layout_that_viewers_expect(tmp_path):
@@ -59,6 +59,20 @@ def test_the_file_has_the_layout_that_viewers_expect(tmp_path):
         thin = np.log(1e-3) + float(surfels.log_scales[row].min())
         assert columns["scale_2"][row] == pytest.approx(max(thin, -20), rel=1e-6)
         assert columns["opacity"][row] == surfels.opacity_logits[row]
+
+
+def test_files_of_volumes_have_all_three_scales(tmp_path):
+    volumes, alive = to_surfels(random_scene(2, num_scales=3)), jnp.ones(16, bool)
+    write_surfels(tmp_path / "v.ply", volumes, alive)
+    names, columns = by_hand(tmp_path / "v.ply")
+    write_surfels(tmp_path / "s.ply", to_surfels(random_scene(2)), alive)
+    assert names == by_hand(tmp_path / "s.ply")[0]  # the layout of discs for such viewers
+    for i in range(3):
+        np.testing.assert_array_equal(columns[f"scale_{i}"], volumes.log_scales[:, i])
+    with pytest.raises(ValueError, match="three scales: num_scales must be 3"):
+        write_surfels(tmp_path / "w.ply", volumes, alive, num_scales=2)
+    flat = read_surfels(tmp_path / "s.ply", num_scales=3).log_scales
+    np.testing.assert_allclose(flat[:, 2] - flat[:, :2].min(axis=1), np.log(1e-3), rtol=1e-5)
 
 
 def test_surfels_that_are_not_finite_are_dropped_and_counted(tmp_path):

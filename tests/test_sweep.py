@@ -18,7 +18,7 @@ import pytest
 from absl import flags
 from absl.testing import flagsaver
 from conftest import QUICKLY
-from tiny_runs import TINY, TINY_SURFELS
+from tiny_runs import TINY, TINY_MIP, TINY_SURFELS
 
 from experiments import sweep
 from experiments.reporting.pictures import comparisons
@@ -78,7 +78,14 @@ def assert_same_step(arm, alone, before):
     assert max(jax.tree.leaves(changed)) > 1e-3
 
 
-@pytest.mark.parametrize("preset", [TINY_STEPS, TINY_SMOOTH], ids=["nerf", "surfels"])
+TINY_SMOOTH_MIP = dataclasses.replace(
+    TINY_MIP, field=dataclasses.replace(TINY_MIP.field, ssim_weight=0.0)
+)
+
+
+@pytest.mark.parametrize(
+    "preset", [TINY_STEPS, TINY_SMOOTH, TINY_SMOOTH_MIP], ids=lambda p: p.method
+)
 def test_an_arm_is_the_run_alone(preset, capture_folder):
     with jax.numpy_dtype_promotion("standard"):
         programs, start, arms = begin(preset, capture_folder)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import plane
 
+from experiments.methods import gaussians, mip_gaussians
 from experiments.methods.nerf import QUICK
 from experiments.methods.surfels import REDUCED
 from experiments.training.manifest import about_scene, write_manifest
@@ -51,6 +52,7 @@ TINY_SURFELS = dataclasses.replace(
     closeup_steps=2,
     downscale=1,
 )
+TINY_MIP = mip_gaussians.with_filters(gaussians.of_gaussians(TINY_SURFELS))
 KEPT = dataclasses.replace(TINY_SURFELS, gated=False)
 HALF = 1.4  # the surfels of a kept run reach so far from the middle of the plane
 OPENGL = np.diag([1.0, -1, -1])

@@ -1,6 +1,6 @@
 """The methods: one module each, and the table of them, written by hand."""
 
-from experiments.methods import dsnerf, nerf, ngp, surfels
+from experiments.methods import dsnerf, gaussians, mip_gaussians, nerf, ngp, surfels
 from experiments.methods.method import (
     CoarseConfig,
     LabelConfig,
@@ -16,6 +16,8 @@ METHODS: dict[str, Method] = {
     "dsnerf": dsnerf.METHOD,
     "ngp": ngp.METHOD,
     "surfels": surfels.METHOD,
+    "gaussians": gaussians.METHOD,
+    "mip_gaussians": mip_gaussians.METHOD,
 }
 
 __all__ = [

@@ -156,9 +156,9 @@ class Method(NamedTuple):
       gaussians: `(params, buffers) -> Gaussians`, what viewers draw; None: they draw the scene's
         points.
       background: `(config) -> float`, gray level in [0, 1] behind the scene.
-      refine: `(key, config, params, buffers, render, cameras, pyramid) -> (params, buffers)` gives
+      refine: `(key, config, params, buffers, render, scene, pyramid) -> (params, buffers)` gives
         what `CoarseConfig` trained the room and the detail of `config`; `render` renders a camera,
-        `cameras` are those of the photographs in `pyramid`. None for methods without `coarse`.
+        `pyramid` holds the scene's training photographs. None for methods without `coarse`.
     """
 
     presets: Mapping[str, Preset]

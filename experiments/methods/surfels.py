@@ -21,14 +21,15 @@ from jaxcloseup.photographs import camera_at, to_float
 from jaxcloseup.pyramids import Pyramid
 from jaxcloseup.scene import Scene
 from jaxcloseup.splats.adaptive import AdaptiveConfig
+from jaxcloseup.splats.config import SurfelConfig
 from jaxcloseup.splats.field import (
     SurfelBuffers,
-    SurfelConfig,
     camera_extent,
     surfel_field,
     surfel_optimizer,
     with_expected_depth,
 )
+from jaxcloseup.splats.filters import sampling_intervals, smoothed
 from jaxcloseup.splats.mcmc import McmcConfig
 from jaxcloseup.splats.rasterize import RasterizeConfig
 from jaxcloseup.splats.refinement import join_surfels, surfels_where_wrong
@@ -37,14 +38,22 @@ from jaxcloseup.train import TrainConfig
 
 
 @dataclasses.dataclass(frozen=True)
-class SurfelTrainingConfig(SurfelConfig):
-    """Surfels and their training.
+class SplatTraining:
+    """What experiments add to the configuration of surfels, and of volumetric Gaussians.
 
     Attributes:
       steps_per_target: steps for each target view.
+      smoothed_at: divisor of the photographs' size whose pixels bound how small splats are, by the
+        smoothing filter in space, see `filters`; at least training's size. None has no filter.
     """
 
     steps_per_target: int = 5
+    smoothed_at: int | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class SurfelTrainingConfig(SplatTraining, SurfelConfig):
+    """Surfels and their training."""
 
 
 _REFINED_AT = 4  # times the photographs' training size, at which new surfels are looked for
@@ -157,16 +166,33 @@ QUICK_ADAPTIVE = with_adaptive_density(REDUCED, AdaptiveConfig(start=200, stop=1
 PAPER_ADAPTIVE = with_adaptive_density(PAPER, AdaptiveConfig())
 
 
-def make_field(config: SurfelTrainingConfig, scene: Scene, growth: int) -> RadianceField:
-    """Surfels sized for a scene; `growth` multiplies the rasterizer's capacity."""
-    size = extent(scene)
-    # In a small scene the near plane must not hide what close-ups are for.
-    near = min(config.raster.near, 0.01 * size)
-    raster = dataclasses.replace(config.raster, capacity=config.raster.capacity * growth, near=near)
-    return surfel_field(dataclasses.replace(config, raster=raster), extent=size)
+def make_field(config: SplatTraining, scene: Scene, growth: int) -> RadianceField:
+    """Splats sized for a scene; `growth` multiplies the rasterizer's capacity."""
+    size, capacity = extent(scene), config.raster.capacity * growth
+    raster = dataclasses.replace(config.raster, capacity=capacity, near=_near(config, scene))
+    config = dataclasses.replace(config, raster=raster)
+    return surfel_field(config, extent=size, photographs=_photographs(config, scene))
 
 
-def make_optimizer(config: SurfelTrainingConfig, scene: Scene) -> optax.GradientTransformation:
+def _near(config, scene):
+    """The near plane, which in a small scene must not hide what close-ups are for."""
+    return min(config.raster.near, 0.01 * extent(scene))
+
+
+def _photographs(config, scene):
+    """Cameras of the photographs whose pixels bound how small splats are; None without a bound."""
+    if config.smoothed_at is None:
+        return None
+    cameras = scene.train.cameras
+    times = max(1, scene.metadata.get("downscale", 1) / config.smoothed_at)
+    return cameras.replace(
+        intrinsics=cameras.intrinsics * times,
+        height=round(cameras.height * times),
+        width=round(cameras.width * times),
+    )
+
+
+def make_optimizer(config: SplatTraining, scene: Scene) -> optax.GradientTransformation:
     """Adam with a learning rate for each kind of parameter."""
     return surfel_optimizer(config, extent=extent(scene))
 
@@ -180,24 +206,26 @@ def extent(scene: Scene) -> float:
 
 def export(folder: pathlib.Path, stage: str, surfels: Surfels, buffers: SurfelBuffers) -> None:
     """Write `splats/<stage>.ply`, for viewers of Gaussian splats."""
+    surfels = smoothed(surfels, buffers.interval)
     write_surfels(folder / "splats" / f"{stage}.ply", surfels, buffers.alive)
 
 
 def refine(
     key: jax.Array,
-    config: SurfelTrainingConfig,
+    config: SplatTraining,
     surfels: Surfels,
     buffers: SurfelBuffers,
     render: Callable[[Camera], Rendering],
-    cameras: Camera,
+    scene: Scene,
     pyramid: Pyramid,
 ) -> tuple[Surfels, SurfelBuffers]:
     """Fill the rows that `config` has beyond `surfels` where photographs show more than these."""
-    views = pyramid.values.shape[0]
+    views, cameras = pyramid.values.shape[0], scene.train.cameras
     level = pyramid.level_near(_REFINED_AT * cameras.width)
     free = config.capacity - int(buffers.alive.sum())
     each = min(max(0, free) // views, math.prod(pyramid.sizes[level]))
-    sample = jax.jit(functools.partial(surfels_where_wrong, count=each, sh_degree=config.sh_degree))
+    kind = {"sh_degree": config.sh_degree, "num_scales": config.num_scales}
+    sample = jax.jit(functools.partial(surfels_where_wrong, count=each, **kind))
     new = []
     for view in progress.track(range(views), "photographs searched"):
         camera = pyramid.camera(camera_at(cameras, view), view, level)
@@ -205,8 +233,13 @@ def refine(
         data = photograph[..., :3], photograph[..., 3], seen.rgb, label_depth(seen)
         new.append(sample(jax.random.fold_in(key, view), camera, *data))
     new = jax.tree.map(lambda *rows: jnp.concatenate(rows), *new)
-    surfels, alive = join_surfels((surfels, buffers.alive), new, config.capacity)
-    return surfels, buffers.replace(alive=alive)
+    # The filter of finer photographs is smaller, so what the coarse one made stays as it is.
+    old = smoothed(surfels, buffers.interval), buffers.alive
+    surfels, alive = join_surfels(old, new, config.capacity)
+    photographs, interval = _photographs(config, scene), None
+    if photographs is not None:
+        interval = sampling_intervals(surfels.means, photographs, near=_near(config, scene))
+    return surfels, buffers.replace(alive=alive, interval=interval)
 
 
 METHOD = Method(
@@ -225,7 +258,9 @@ METHOD = Method(
     max_points=lambda config: config.capacity,
     with_expected_depth=with_expected_depth,
     export=export,
-    gaussians=lambda surfels, buffers: as_gaussians(surfels, buffers.alive),
+    gaussians=lambda surfels, buffers: as_gaussians(
+        smoothed(surfels, buffers.interval), buffers.alive
+    ),
     background=lambda config: config.background or 0.0,
     refine=refine,
 )

@@ -36,6 +36,7 @@ BOUNDS = {
     **dict.fromkeys(("steps_per_target", "means_lr_steps", "lr_decay_steps"), (1, _MOST)),
     **dict.fromkeys(("every", "sh_every", "reset_every"), (1, _MOST)),
     **dict.fromkeys(("downscale", "score_downscale", "finest", "num_sources"), (1, _MOST)),
+    "smoothed_at": (1, _MOST),
     **dict.fromkeys(("num_rays", "num_label_rays", "num_windows"), (1, _MOST)),
     **dict.fromkeys(
         ("width", "direction_width", "proposal_width", "num_coarse", "num_fine", "coarsest"),

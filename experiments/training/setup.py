@@ -121,7 +121,7 @@ class Training:
         with timed(self.seconds, f"refine_{stage}"):
             params, buffers = programs.method.refine(
                 *(key_refine, preset.field, state.params, state.buffers),
-                *(render, programs.scene.train.cameras, pyramid),
+                *(render, programs.scene, pyramid),
             )
         none = jnp.zeros_like(state.step)
         return TrainState(none, params, buffers, programs.optimizer.init(params), key_fine)

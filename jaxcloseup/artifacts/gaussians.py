@@ -1,4 +1,4 @@
-"""Convert surfels to 3-D Gaussians for viewers: thin discs with one color each."""
+"""Convert splats to Gaussians for viewers, with one color each; discs become thin ellipsoids."""
 
 from typing import NamedTuple
 
@@ -31,7 +31,12 @@ class Gaussians(NamedTuple):
 
 
 def thickened(log_scales: np.ndarray) -> np.ndarray:
-    """Extend log scales `[N, 2]` to `[N, 3]` with a thickness of 1/1000 of the smaller radius."""
+    """Extend log scales `[N, 2]` to `[N, 3]` with a thickness of 1/1000 of the smaller radius.
+
+    Those of volumetric Gaussians, `[N, 3]`, stay.
+    """
+    if log_scales.shape[1] == 3:
+        return log_scales
     thin = log_scales.min(axis=1, keepdims=True) + np.float32(np.log(1e-3))
     return np.concatenate([log_scales, np.maximum(thin, _MIN_LOG_SCALE)], axis=1)
 

@@ -1,4 +1,4 @@
-"""Read and write surfels in the PLY layout that viewers and editors of Gaussian splats share.
+"""Read and write splats in the PLY layout that viewers and editors of Gaussian splats share.
 
 The file stores values before activation: log scales, opacity logits, unnormalized quaternions.
 Spherical harmonics above degree 0 are stored channel by channel, red first.
@@ -24,16 +24,16 @@ def write_surfels(
 
     Args:
       path: path of the file.
-      surfels: `N` surfels.
+      surfels: `N` surfels, or volumetric Gaussians.
       alive: `[N]` bool.
-      num_scales: 3 for viewers of 3-D Gaussians, with a thickness of 1/1000 of the smaller radius;
-        2 for viewers of discs.
+      num_scales: 3 for viewers of 3-D Gaussians, which surfels get a thickness of 1/1000 of the
+        smaller radius for; 2 for viewers of discs.
 
     Returns:
       The number of alive surfels that were dropped because a value is not finite.
 
     Raises:
-      ValueError: `num_scales` is neither 2 nor 3.
+      ValueError: `num_scales` is neither 2 nor 3, or is 2 of volumetric Gaussians.
       OSError: one sentence that names the path and the reason.
     """
     if num_scales not in (2, 3):
@@ -41,9 +41,13 @@ def write_surfels(
     surfels, alive = jax.device_get((surfels, alive))
     sh = np.asarray(surfels.sh, np.float32)
     scales = np.asarray(surfels.log_scales, np.float32)
+    normals = np.asarray(quaternion_to_matrix(jnp.asarray(surfels.quaternions)))[..., 2]
+    if scales.shape[1] == 3:
+        if num_scales == 2:
+            raise ValueError("volumetric Gaussians have three scales: num_scales must be 3")
+        normals = np.zeros_like(normals)  # as other programs write them
     if num_scales == 3:
         scales = thickened(scales)
-    normals = np.asarray(quaternion_to_matrix(jnp.asarray(surfels.quaternions)))[..., 2]
     columns = {
         **dict(zip("xyz", np.asarray(surfels.means).T, strict=True)),
         **dict(zip(("nx", "ny", "nz"), normals.T, strict=True)),
@@ -64,8 +68,13 @@ def write_surfels(
     return int(np.sum(alive & ~finite))
 
 
-def read_surfels(path: str | pathlib.Path) -> Surfels:
-    """Read surfels from a PLY file with two or three scales and spherical harmonics of degree 0-3.
+def read_surfels(path: str | pathlib.Path, *, num_scales: int = 2) -> Surfels:
+    """Read splats from a PLY file with two or three scales and spherical harmonics of degree 0-3.
+
+    Args:
+      path: path of the file.
+      num_scales: 2 for surfels, which leave a third scale out; 3 for volumetric Gaussians, for
+        which two scales get a thickness as in `write_surfels`.
 
     Raises:
       PlyError: the file is not a PLY file of splats; one sentence that says what to do.
@@ -86,10 +95,11 @@ def read_surfels(path: str | pathlib.Path) -> Surfels:
             f"{path} lacks the properties of splats (f_dc_*, f_rest_*, opacity, scale_*, rot_*): "
             "export it again as Gaussian splats."
         )
+    scales = scales[:, :2] if num_scales == 2 else thickened(scales)
     higher = rest.reshape(len(vertices), 3, bands).swapaxes(1, 2)
     return Surfels(
         means=jnp.asarray(np.stack([vertices[axis] for axis in "xyz"], axis=1), jnp.float32),
-        log_scales=jnp.asarray(scales[:, :2]),
+        log_scales=jnp.asarray(scales),
         quaternions=jnp.asarray(rotation),
         opacity_logits=jnp.asarray(vertices["opacity"].astype(np.float32)),
         sh=jnp.asarray(np.concatenate([constant[:, None], higher], axis=1)),

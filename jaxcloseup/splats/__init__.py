@@ -1,16 +1,18 @@
-"""Differentiable 2-D Gaussian splatting in plain JAX: surfels, rasterizer, trainable field."""
+"""Differentiable 2-D and 3-D Gaussian splatting in plain JAX: projections, rasterizer, field."""
 
 from jaxcloseup.splats.adaptive import AdaptiveConfig, OffsetSurfels
+from jaxcloseup.splats.config import GaussianConfig, SurfelConfig
 from jaxcloseup.splats.density import DensityControl, density_control
+from jaxcloseup.splats.ellipsoids import project_ellipsoids
 from jaxcloseup.splats.field import (
     SurfelBuffers,
-    SurfelConfig,
     SurfelFieldAux,
     camera_extent,
     surfel_field,
     surfel_optimizer,
     with_expected_depth,
 )
+from jaxcloseup.splats.filters import sampling_intervals, smoothed
 from jaxcloseup.splats.mcmc import McmcConfig
 from jaxcloseup.splats.projection import Discs, project_discs, surfel_columns, to_camera
 from jaxcloseup.splats.rasterize import Footprints, RasterizeConfig, SplatImage, rasterize
@@ -31,6 +33,7 @@ __all__ = [
     "DensityControl",
     "Discs",
     "Footprints",
+    "GaussianConfig",
     "McmcConfig",
     "OffsetSurfels",
     "RasterizeConfig",
@@ -46,14 +49,17 @@ __all__ = [
     "join_surfels",
     "normal_inconsistency",
     "project_discs",
+    "project_ellipsoids",
     "random_points",
     "rasterize",
     "render_surfels",
     "rgb_to_sh",
+    "sampling_intervals",
     "scale_by_selective_adam",
     "scale_free_distortion",
     "sh_basis",
     "sh_to_rgb",
+    "smoothed",
     "surfel_columns",
     "surfel_field",
     "surfel_optimizer",

@@ -107,7 +107,7 @@ def adaptive_control(
 def with_image_offset(surfels: Surfels) -> OffsetSurfels:
     """The same surfels with an image-plane offset of 0."""
     leaves = {f.name: getattr(surfels, f.name) for f in dataclasses.fields(Surfels)}
-    return OffsetSurfels(**leaves, image_offset=jnp.zeros_like(surfels.log_scales))
+    return OffsetSurfels(**leaves, image_offset=jnp.zeros_like(surfels.means[:, :2]))
 
 
 def apply_image_offset(surfels: OffsetSurfels, camera: Camera) -> OffsetSurfels:
@@ -150,7 +150,7 @@ def refine(
     """Clone, split and remove surfels.
 
     A clone is an exact copy. Two surfels replace a split one; their centers are drawn from its
-    Gaussian in its plane and their scales are smaller by `config.shrink`.
+    Gaussian in its plane or in space and their scales are smaller by `config.shrink`.
 
     Args:
       key: random key; consumed.
@@ -182,9 +182,10 @@ def refine(
 
     split = (parent | added) & (scale[source] > config.small)
     surfels = jax.tree.map(lambda leaf: leaf[source], surfels)
-    tangents = quaternion_to_matrix(surfels.quaternions)[..., :2]
-    step = jax.random.normal(key, (count, 2), surfels.means.dtype) * jnp.exp(surfels.log_scales)
-    moved = surfels.means + jnp.sum(tangents * step[:, None], axis=-1)
+    shape = surfels.log_scales.shape
+    step = jax.random.normal(key, shape, surfels.means.dtype) * jnp.exp(surfels.log_scales)
+    axes = quaternion_to_matrix(surfels.quaternions)[..., : shape[1]]
+    moved = surfels.means + jnp.sum(axes * step[:, None], axis=-1)
     surfels = surfels.replace(
         means=jnp.where(split[:, None], moved, surfels.means),
         log_scales=surfels.log_scales - jnp.where(split, jnp.log(config.shrink), 0)[:, None],

@@ -15,8 +15,10 @@ from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.geometry.rotations import quaternion_to_matrix
 from jaxcloseup.geometry.visibility import sphere_in_view
 from jaxcloseup.numerics import matmul, safe_norm
+from jaxcloseup.splats.ellipsoids import bounded_slopes
+from jaxcloseup.splats.filters import DILATION, LOW_PASS, PIXEL_VARIANCE
 from jaxcloseup.splats.kernel import ALPHA_MIN
-from jaxcloseup.splats.projection import LOW_PASS, MAX_LOG_SCALE, PIXEL_VARIANCE
+from jaxcloseup.splats.projection import MAX_LOG_SCALE
 from jaxcloseup.splats.surfels import Surfels
 
 
@@ -29,9 +31,10 @@ def may_show(
 ) -> jax.Array:
     """Whether an image may show each surfel, `[N]` bool; never wrongly no.
 
-    A surfel is bounded by a sphere about its center. With `antialias` (see `project_discs`), a
-    pixel displaces the point that its ray meets on the surfel's plane by at most z / f (1 + 1 / c),
-    where c is the cosine between the ray and the normal: that widens the sphere.
+    A disc is bounded by a sphere about its center. With `antialias` (see `project_discs`), a pixel
+    displaces the point that its ray meets on the disc's plane by at most z / f (1 + 1 / c), where c
+    is the cosine between the ray and the normal: that widens the sphere. A volumetric Gaussian is
+    bounded by a rectangle about its center's image, for its ellipse is not that of an ellipsoid.
 
     Args:
       surfels: `N` surfels.
@@ -45,6 +48,9 @@ def may_show(
     center = matmul(offset, camera.rotation)
     scale = jnp.exp(jnp.clip(jnp.max(surfels.log_scales, axis=-1), -MAX_LOG_SCALE, MAX_LOG_SCALE))
     cutoff = jnp.sqrt(2 * jnp.log(jnp.maximum(opacity / ALPHA_MIN, 1)))
+    if surfels.log_scales.shape[1] == 3:
+        seen = _ellipses_in_view(camera, center, cutoff, scale, near)
+        return seen & (opacity >= ALPHA_MIN)
     if antialias:
         normal = quaternion_to_matrix(surfels.quaternions)[..., 2]
         distance = safe_norm(offset)
@@ -60,6 +66,22 @@ def may_show(
     radius, margin = 1.01 * cutoff * scale, margin + 0.1
     seen = sphere_in_view(camera, center, radius, margin=margin, near=near)
     return seen & (opacity >= ALPHA_MIN)
+
+
+def _ellipses_in_view(camera, center, cutoff, scale, near):
+    """Whether ellipses of `project_ellipsoids` may meet the image, with either filter."""
+    x, y, depth = jnp.moveaxis(center, -1, 0)
+    seen = depth > near
+    inverse_depth = 1 / jnp.where(seen, depth, 1)
+    slopes = [x * inverse_depth, y * inverse_depth]
+    sides = zip(slopes, bounded_slopes(slopes, camera), (camera.width, camera.height), strict=True)
+    for i, (slope, bounded, size) in enumerate(sides):
+        focal, principal = camera.intrinsics[i], camera.intrinsics[2 + i]
+        largest = focal * inverse_depth * scale
+        variance = largest**2 * (1 + bounded**2) + DILATION
+        half, at = 1.01 * cutoff * jnp.sqrt(variance) + 0.1, focal * slope + principal
+        seen &= (at + half >= 0) & (at - half <= size)
+    return seen
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))

@@ -1,13 +1,13 @@
-"""Surfels as a radiance field: trainable 2-D Gaussian splatting (Huang et al., SIGGRAPH 2024).
+"""Splats as a radiance field: trainable 2-D Gaussian splatting (Huang et al., SIGGRAPH 2024).
 
-The field renders whole images only. Its regularizers align normals with the surface and gather
-the light along a ray at one depth; their weights do not depend on the unit of length.
+With a `GaussianConfig` it is 3-D Gaussian splatting (Kerbl et al., SIGGRAPH 2023), which all below
+calls surfels too. The field renders whole images only. Its regularizers align normals with the
+surface and gather the light along a ray at one depth; their weights do not depend on the unit of
+length.
 """
 
-import dataclasses
 import functools
 import math
-from collections.abc import Hashable
 from typing import Any, NamedTuple
 
 import chex
@@ -20,9 +20,9 @@ from jaxcloseup.field import RadianceField, Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.metrics import fit_colors, ssim
 from jaxcloseup.numerics import matmul, safe_divide
+from jaxcloseup.splats.config import GaussianConfig, SplatConfig, SurfelConfig
 from jaxcloseup.splats.density import DensityControl, density_control
-from jaxcloseup.splats.mcmc import McmcConfig
-from jaxcloseup.splats.rasterize import RasterizeConfig
+from jaxcloseup.splats.filters import sampling_intervals, smoothed
 from jaxcloseup.splats.regularizers import (
     depth_to_normal,
     normal_inconsistency,
@@ -33,70 +33,8 @@ from jaxcloseup.splats.selective_adam import scale_by_selective_adam
 from jaxcloseup.splats.surfels import Surfels, surfels_from_points
 
 
+_RENEWED_EVERY = 100  # steps between renewals of sampling intervals without density control
 _UNCHANGED_SHARE = 0.3  # share of the image loss on unchanged colors when images may change theirs
-
-
-@dataclasses.dataclass(frozen=True)
-class SurfelConfig:
-    """Surfels and their training; lengths are in extents of the capture.
-
-    Attributes:
-      capacity: largest number of surfels.
-      sh_degree: degree of the color's spherical harmonics, 0 to 3.
-      sh_every: steps after which rendering uses one more degree.
-      initial_opacity: opacity of surfels at the initial points.
-      depth: "median" or "expected". The regularizer compares normals with this depth, and a new
-        field renders it for labels; `with_expected_depth` changes the rendered one.
-      background: gray level in [0, 1] behind the scene; None is black.
-      color_ridge: in training, each image may change its colors by an affine map; this is the
-        resistance to it, see `fit_colors`, and None allows no change. Rendered images have no such
-        change: part of the loss compares their unchanged colors with the photographs.
-      ssim_weight: share of 1 - SSIM in the image loss; the absolute difference has the rest.
-      normal_weight: weight of the disagreement between normals and depth.
-      distortion_weight: weight of the spread of light along a ray, scaled to a mean depth of 1.
-      regularize_from: first step with the normal and distortion losses.
-      opacity_weight: weight of the mean opacity.
-      scale_weight: weight of the mean scale.
-      means_lr: learning rate of the means at step 0 and from step `means_lr_steps` on; it decays
-        exponentially in between.
-      means_lr_steps: steps over which `means_lr` decays.
-      late_lr_scale: factor on all learning rates from step `means_lr_steps` on.
-      sh_lr: Adam's learning rate of the constant color; view-dependent color has 1/20 of it.
-      opacity_lr: Adam's learning rate of the opacity logits.
-      scale_lr: Adam's learning rate of the log scales.
-      rotation_lr: Adam's learning rate of the quaternions.
-      max_scale: largest standard deviation of a surfel; None sets no bound. A very large surfel may
-        be hidden from every photograph, and fill a close-up.
-      selective_adam: leave surfels that a step does not see alone, see `scale_by_selective_adam`.
-      density: config of a density control, which moves, adds and removes surfels, see
-        `density_control`; None has none.
-      raster: static sizes of the rasterizer.
-    """
-
-    capacity: int = 200_000
-    sh_degree: int = 3
-    sh_every: int = 1000
-    initial_opacity: float = 0.5
-    depth: str = "median"
-    background: float | None = None
-    color_ridge: float | None = None
-    ssim_weight: float = 0.2
-    normal_weight: float = 0.05
-    distortion_weight: float = 1.0
-    regularize_from: int = 3000
-    opacity_weight: float = 0.01
-    scale_weight: float = 0.01
-    means_lr: tuple[float, float] = (1.6e-4, 1.6e-6)
-    means_lr_steps: int = 30_000
-    late_lr_scale: float = 1.0
-    sh_lr: float = 2.5e-3
-    opacity_lr: float = 5e-2
-    scale_lr: float = 5e-3
-    rotation_lr: float = 1e-3
-    max_scale: float | None = None
-    selective_adam: bool = False
-    density: Hashable | None = dataclasses.field(default_factory=McmcConfig)
-    raster: RasterizeConfig = dataclasses.field(default_factory=RasterizeConfig)
 
 
 @struct.dataclass
@@ -108,12 +46,15 @@ class SurfelBuffers:
       degree: `[]` int32 degree of spherical harmonics that is rendered.
       regularize: `[]` 1 where the normal and distortion losses count, else 0.
       expected: `[]` 1 where `Rendering.depth` is the expected depth, 0 where it is the median.
+      interval: `[N]` between the pixels of the photographs that show surfels finest, in world
+        units; None without a smoothing filter, see `filters`.
     """
 
     alive: jax.Array
     degree: jax.Array
     regularize: jax.Array
     expected: jax.Array
+    interval: jax.Array | None = None
 
 
 class SurfelFieldAux(NamedTuple):
@@ -130,8 +71,10 @@ class SurfelFieldAux(NamedTuple):
     prior: jax.Array
 
 
-def surfel_field(config: SurfelConfig, *, extent: float) -> RadianceField:
-    """Surfels as a field of whole images, with `render`, `loss` and `adapt` compiled.
+def surfel_field(
+    config: SurfelConfig | GaussianConfig, *, extent: float, photographs: Camera | None = None
+) -> RadianceField:
+    """Splats as a field of whole images, with `render`, `loss` and `adapt` compiled.
 
     Where `Rendering.overflow` is not 0, `config.raster.capacity` was too small and the image is
     wrong. Check it outside `jax.jit`; then build the field again with twice the capacity and repeat
@@ -147,6 +90,8 @@ def surfel_field(config: SurfelConfig, *, extent: float) -> RadianceField:
     Args:
       config: static.
       extent: size of the capture in world units, such as `camera_extent`.
+      photographs: stacked `[V]` cameras, at the finest size that steps read: surfels are convolved
+        in space with the size of their pixels, see `filters`. None has no such filter.
 
     Raises:
       ValueError: a setting is out of range.
@@ -168,10 +113,17 @@ def surfel_field(config: SurfelConfig, *, extent: float) -> RadianceField:
             capacity=config.capacity,
             sh_degree=config.sh_degree,
             opacity=config.initial_opacity,
+            num_scales=config.num_scales,
         )
         expected = jnp.float32(config.depth == "expected")
         schedule = _schedule(config, jnp.zeros((), jnp.int32))
-        return control.init(surfels), SurfelBuffers(alive, *schedule, expected)
+        buffers = SurfelBuffers(alive, *schedule, expected, interval=intervals(surfels))
+        return control.init(surfels), buffers
+
+    def intervals(surfels):
+        if photographs is None:
+            return None
+        return sampling_intervals(surfels.means, photographs, near=config.raster.near)
 
     def render(
         params: Surfels,
@@ -188,6 +140,7 @@ def surfel_field(config: SurfelConfig, *, extent: float) -> RadianceField:
     @jax.jit
     def draw(params, buffers, camera):
         surfels = control.before_render(_limit_degree(params, buffers.degree), camera)
+        surfels = smoothed(surfels, buffers.interval)
         background = None if config.background is None else jnp.full(3, config.background)
         image = render_surfels(surfels, buffers.alive, camera, config.raster, background=background)
         penalty = buffers.regularize * _penalty(image, camera, config)
@@ -202,7 +155,16 @@ def surfel_field(config: SurfelConfig, *, extent: float) -> RadianceField:
         degree, regularize = _schedule(config, state.step)
         buffers = state.buffers.replace(degree=degree, regularize=regularize)
         state = control.adapt(key, state.replace(buffers=buffers))
-        return state.replace(params=_bound_scales(state.params, config, extent))
+        state = state.replace(params=_bound_scales(state.params, config, extent))
+        return state if photographs is None else renew_intervals(state)
+
+    def renew_intervals(state):
+        """After every density control, which moves surfels far."""
+        every = _RENEWED_EVERY if config.density is None else config.density.every
+        due = state.step % every == 0
+        old, params = state.buffers.interval, state.params
+        new = jax.lax.cond(due, lambda: intervals(params), lambda: old)
+        return state.replace(buffers=state.buffers.replace(interval=new))
 
     loss = jax.jit(functools.partial(_loss, config=config))
     return RadianceField(init=init, render=render, loss=loss, adapt=adapt)
@@ -223,7 +185,7 @@ def camera_extent(cameras: Camera) -> jax.Array:
     return 1.1 * jnp.max(jnp.linalg.norm(offset, axis=-1))
 
 
-def surfel_optimizer(config: SurfelConfig, *, extent: float) -> optax.GradientTransformation:
+def surfel_optimizer(config: SplatConfig, *, extent: float) -> optax.GradientTransformation:
     """Adam with one learning rate for each kind of parameter, and the density control's records.
 
     Its `update` is compiled.
@@ -238,7 +200,7 @@ def surfel_optimizer(config: SurfelConfig, *, extent: float) -> optax.GradientTr
     return optimizer._replace(update=jax.jit(optimizer.update))
 
 
-def means_lr_at(config: SurfelConfig, step: jax.Array) -> jax.Array:
+def means_lr_at(config: SplatConfig, step: jax.Array) -> jax.Array:
     """Learning rate `[]` of the means at a step, in extents, without `late_lr_scale`."""
     first, last = config.means_lr
     share = jnp.minimum(step.astype(jnp.float32) / config.means_lr_steps, 1)
@@ -272,7 +234,7 @@ def _scale_by_learning_rates(config, extent):
     return optax.GradientTransformation(init, update)
 
 
-def _density_control(config: SurfelConfig, extent: float) -> DensityControl:
+def _density_control(config: SplatConfig, extent: float) -> DensityControl:
     def means_lr(step):
         return _late_lr_scale_at(config, step) * means_lr_at(config, step) * extent
 
@@ -302,14 +264,16 @@ def _limit_degree(surfels, degree):
 
 def _penalty(image, camera, config):
     """Weighted normal and distortion losses `[H, W]`."""
-    surface = image.aux.median_depth if config.depth == "median" else image.depth
-    inconsistency = normal_inconsistency(
-        image.aux.normal, depth_to_normal(camera, surface), image.alpha
-    )
     typical = safe_divide(jnp.sum(image.alpha * image.depth), jnp.sum(image.alpha))
     distortion = scale_free_distortion(image.aux.distortion, jax.lax.stop_gradient(typical))
     # Distortion is unbounded for surfaces very near a virtual camera.
     distortion = distortion / (1 + distortion)
+    if image.normal is None:
+        return config.distortion_weight * distortion
+    surface = image.aux.median_depth if config.depth == "median" else image.depth
+    inconsistency = normal_inconsistency(
+        image.aux.normal, depth_to_normal(camera, surface), image.alpha
+    )
     return config.normal_weight * inconsistency + config.distortion_weight * distortion
 
 
@@ -326,7 +290,7 @@ def _prior(surfels, alive, config, extent):
 
 
 def _loss(
-    rendering: Rendering, target_rgb: jax.Array, weight: jax.Array, *, config: SurfelConfig
+    rendering: Rendering, target_rgb: jax.Array, weight: jax.Array, *, config: SplatConfig
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     chex.assert_equal_shape([rendering.rgb, target_rgb])
     chex.assert_shape(weight, target_rgb.shape[:-1])

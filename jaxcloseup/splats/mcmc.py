@@ -74,7 +74,8 @@ def relocate(
 
     Where n - 1 surfels join one of opacity o, the n coincident surfels get opacity
     1 - (1 - o)^(1/n) and smaller scales, so that together they absorb as much light, integrated
-    over the disc's area, as the one did. The published rule keeps the integral along a line.
+    over the disc's area, or over the ellipse that a volumetric Gaussian has in an image, as the one
+    did. The published rule keeps the integral along a line.
 
     Args:
       key: random key; consumed.
@@ -160,7 +161,7 @@ def add_position_noise(
     learning_rate: jax.Array,
     config: McmcConfig,
 ) -> Surfels:
-    """Move means by Gaussian noise within their discs, faint ones most.
+    """Move means by Gaussian noise within their discs or ellipsoids, faint ones most.
 
     Args:
       key: random key; consumed.
@@ -174,6 +175,6 @@ def add_position_noise(
     amount = jnp.where(alive, faint * learning_rate * config.noise, 0)
     variance = jnp.exp(2 * surfels.log_scales)
     step = jax.random.normal(key, surfels.log_scales.shape, surfels.means.dtype) * variance
-    tangents = quaternion_to_matrix(surfels.quaternions)[..., :2]
-    moved = jnp.sum(tangents * step[:, None], axis=-1) * amount[:, None]
+    axes = quaternion_to_matrix(surfels.quaternions)[..., : step.shape[1]]
+    moved = jnp.sum(axes * step[:, None], axis=-1) * amount[:, None]
     return surfels.replace(means=surfels.means + moved)

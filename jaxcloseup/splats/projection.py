@@ -17,13 +17,12 @@ from jax import lax
 
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.geometry.rotations import quaternion_rows
+from jaxcloseup.splats.filters import LOW_PASS, pixel_spread, widen
 from jaxcloseup.splats.kernel import ALPHA_MIN
 from jaxcloseup.splats.rasterize import Footprints
 from jaxcloseup.splats.surfels import Surfels
 
 
-LOW_PASS = 2.0  # 1/px^2: no splat is drawn smaller than a Gaussian of sigma = sqrt(1/2) pixel
-PIXEL_VARIANCE = 1 / 12  # px^2, along each side of a square pixel
 EDGE_ON = 1e-4  # |cos| between normal and line of sight below which a disc is not drawn
 MAX_LOG_SCALE = 30.0  # beyond it, products of scales leave the range of float32
 
@@ -34,21 +33,21 @@ Vector = tuple[jax.Array, jax.Array, jax.Array]
 
 
 class Discs(NamedTuple):
-    """`N` discs in one camera's frame, in world units.
+    """`N` discs, or ellipsoids, in one camera's frame, in world units.
 
     Attributes:
       center: centers.
       tangent_u: first unit tangents.
       tangent_v: second unit tangents.
       normal: unit normals.
-      scales: standard deviations `[N]` along the two tangents.
+      scales: standard deviations `[N]` along the two tangents and, of ellipsoids, the normal.
     """
 
     center: Vector
     tangent_u: Vector
     tangent_v: Vector
     normal: Vector
-    scales: tuple[jax.Array, jax.Array]
+    scales: tuple[jax.Array, ...]
 
 
 def surfel_columns(surfels: Surfels) -> Surfels:
@@ -168,8 +167,8 @@ def project_discs(
     ]
     vectors = _scale(discs.scales[0], discs.tangent_u), _scale(discs.scales[1], discs.tangent_v)
     if antialias:
-        spread = _pixel_spread(homography, depth, centered & ~edge_on)
-        homography, vectors = _widen(homography, vectors, spread)
+        spread = pixel_spread(homography, depth, centered & ~edge_on)
+        homography, vectors = widen(homography, vectors, spread)
         opacity = opacity / (spread[0] * spread[2])
 
     # Neither the box nor the disc's range of depth has a derivative.
@@ -210,32 +209,6 @@ def _cross(a, b):
 
 def _scale(factor, vector):
     return tuple(factor * component for component in vector)
-
-
-def _pixel_spread(homography, depth, known):
-    """Cholesky factor (l11, l21, l22) of I + s^2 J J^T of each disc; the identity if not known."""
-    (ux, uy), (vx, vy) = (
-        [jnp.where(known, depth * slope, 0) for slope in row[1:]] for row in homography[:2]
-    )
-    uu, uv, vv = (
-        PIXEL_VARIANCE * sums for sums in (ux * ux + uy * uy, ux * vx + uy * vy, vx * vx + vy * vy)
-    )
-    first = jnp.sqrt(1 + uu)
-    below = uv / first
-    # 1 + vv - below^2, without taking large numbers from each other.
-    cross = PIXEL_VARIANCE * (ux * vy - vx * uy)
-    second = jnp.sqrt((1 + uu + vv + cross * cross) / (1 + uu))
-    return first, below, second
-
-
-def _widen(homography, vectors, spread):
-    """Homography and vectors of discs whose covariance of (u, v) is L L^T."""
-    first, below, second = spread
-    u = _scale(1 / first, homography[0])
-    v = tuple((b - below * a) / second for a, b in zip(u, homography[1], strict=True))
-    one, other = vectors
-    one = tuple(first * a + below * b for a, b in zip(one, other, strict=True))
-    return (u, v, homography[2]), (one, _scale(second, other))
 
 
 def _disc_box(center, vectors, cutoff, camera, near):

@@ -32,6 +32,7 @@ def surfels_where_wrong(
     *,
     count: int,
     sh_degree: int,
+    num_scales: int = 2,
 ) -> tuple[Surfels, jax.Array]:
     """Surfels at pixels of a photograph, drawn in proportion to the error of its render.
 
@@ -44,6 +45,7 @@ def surfels_where_wrong(
       depth: `[H, W]` rendered z-depth; 0 is undefined.
       count: number of surfels.
       sh_degree: degree of their harmonics; only the constant color is not 0.
+      num_scales: 2 of discs, 3 of volumetric Gaussians, which are round.
 
     Returns:
       `count` surfels, and `[count]` bool: False where too few pixels had an error.
@@ -68,7 +70,7 @@ def surfels_where_wrong(
     colors = rgb_to_sh(pick(photograph))[:, None]
     surfels = Surfels(
         means=means,
-        log_scales=jnp.stack([scale, scale], axis=-1),
+        log_scales=jnp.stack([scale] * num_scales, axis=-1),
         quaternions=_turn_to(normal),
         opacity_logits=jnp.full(count, math.log(OPACITY / (1 - OPACITY)), means.dtype),
         sh=jnp.pad(colors, ((0, 0), (0, (sh_degree + 1) ** 2 - 1), (0, 0))),

@@ -1,5 +1,7 @@
 """Surfels: oriented discs with a Gaussian profile, the parameters of 2-D Gaussian splatting.
 
+With a third scale, along the normal, they are the volumetric Gaussians of 3-D Gaussian splatting.
+
 Parameters are stored before their activations, as logarithms and logits, so any number is valid.
 """
 
@@ -18,11 +20,12 @@ from jaxcloseup.splats.spherical_harmonics import rgb_to_sh
 
 @struct.dataclass
 class Surfels:
-    """`N` discs in world units.
+    """`N` discs, or volumetric Gaussians, in world units.
 
     Attributes:
       means: `[N, 3]` centers.
-      log_scales: `[N, 2]` logarithms of the standard deviations along the two tangents.
+      log_scales: `[N, 2]` logarithms of the standard deviations along the two tangents; `[N, 3]`,
+        with that along the normal, of volumetric Gaussians.
       quaternions: `[N, 4]` (w, x, y, z), any length; the rotation's columns are the two tangents
         and the normal, in the world frame.
       opacity_logits: `[N]` logits of the opacity.
@@ -44,6 +47,7 @@ def surfels_from_points(
     capacity: int,
     sh_degree: int,
     opacity: float = 0.1,
+    num_scales: int = 2,
 ) -> tuple[Surfels, jax.Array]:
     """Randomly oriented surfels at points, as large as the gaps between them.
 
@@ -55,6 +59,7 @@ def surfels_from_points(
       capacity: number `N` of rows; rows without a point are dead.
       sh_degree: degree `L` of the color's harmonics, 0 to 3; view-dependent ones start at 0.
       opacity: initial opacity.
+      num_scales: 2 of discs, 3 of volumetric Gaussians.
 
     Returns:
       The surfels, and `alive [N]` bool, True where a row has a point.
@@ -74,7 +79,7 @@ def surfels_from_points(
     higher = jnp.zeros((points.shape[0], (sh_degree + 1) ** 2 - 1, 3), points.dtype)
     surfels = Surfels(
         means=points,
-        log_scales=jnp.stack([jnp.log(gaps), jnp.log(gaps)], axis=-1),
+        log_scales=jnp.stack([jnp.log(gaps)] * num_scales, axis=-1),
         quaternions=jax.random.normal(key_rotation, (points.shape[0], 4), points.dtype),
         opacity_logits=jnp.full(points.shape[0], math.log(opacity / (1 - opacity)), points.dtype),
         sh=jnp.concatenate([constant, higher], axis=1),
