@@ -294,6 +294,7 @@ def test_every_setting_is_listed_with_values_that_it_may_have(parsed_flags, caps
 def test_flags_know_all_names():
     """Modules that define flags import no JAX, so they repeat the names of what imports it."""
     assert {name: tuple(method.presets) for name, method in METHODS.items()} == names.PRESETS
+    assert list(names.METHODS) == list(METHODS)
     assert names.ARMS == KINDS
 
 

@@ -6,12 +6,17 @@
 from absl import flags
 
 from experiments.training import set_flag
-from experiments.training.names import PRESETS
+from experiments.training.names import METHODS, PRESETS
 from jaxcloseup.choices import ALPHA_MODES, FORMATS, SPLITS
 
 
 flags.adopt_module_key_flags(set_flag)
-flags.DEFINE_enum("method", "surfels", list(PRESETS), "radiance field")
+flags.DEFINE_enum(
+    "method",
+    "surfels",
+    list(METHODS),
+    "radiance field: " + "; ".join(f"{name}, {what}" for name, what in METHODS.items()),
+)
 flags.DEFINE_enum(
     "preset",
     "quick",
