@@ -3,8 +3,9 @@
     python -m experiments.run --scene=table
 
 Stages: `baseline` trains on the photographs; `control` and `closeup` both continue from it for the
-same number of steps, without and with pseudo-labels of random close-ups; `test_time` continues from
-it with labels of the very close-ups that are scored. The scene is a built-in one or a folder.
+same number of steps, without and with pseudo-labels of random close-ups; `detail` adds to renders
+what the photographs show beyond them; `test_time` learns labels of the very close-ups that are
+scored. The scene is a built-in one or a folder.
 """
 
 from absl import flags

@@ -103,6 +103,7 @@ def init_state(
 def train_step(
     state: TrainState,
     views: Views | Windows,
+    lr_scale: jax.Array | None = None,
     *,
     field: RadianceField,
     optimizer: optax.GradientTransformation,
@@ -114,6 +115,7 @@ def train_step(
     Args:
       state: what is trained.
       views: training photographs.
+      lr_scale: `[]` factor on the optimizer's updates; None: 1.
       field: static; what is trained.
       optimizer: static.
       config: static.
@@ -129,7 +131,7 @@ def train_step(
         batch = sample_batch(keys.batch, views, config.num_rays)
         return loss_of(params, buffers, batch, keys.render)
 
-    return _update(state, loss, (views,), field, optimizer, config, spread)
+    return _update(state, loss, (views,), field, optimizer, config, spread, lr_scale)
 
 
 def pseudo_step(
@@ -215,7 +217,7 @@ def closeup_step(
 def labeled_step(
     state: TrainState,
     views: Views | Windows,
-    labels: Views,
+    labels: Views | Windows,
     settings: PseudoSettings,
     *,
     field: RadianceField,
@@ -231,7 +233,7 @@ def labeled_step(
     Args:
       state: what is trained.
       views: training photographs.
-      labels: from `label_views`.
+      labels: from `label_views`, or windows of finer ones.
       settings: `label_loss_weight` and `lr_scale` count.
       field: static.
       optimizer: static.

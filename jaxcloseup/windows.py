@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxcloseup.geometry.cameras import Camera
-from jaxcloseup.photographs import Batch, camera_at, to_float
+from jaxcloseup.geometry.cameras import Camera, pixels_to_points
+from jaxcloseup.geometry.visibility import sample_where_visible
+from jaxcloseup.photographs import Batch, Views, camera_at, to_float
 from jaxcloseup.pyramids import Pyramid
 
 
@@ -20,11 +21,14 @@ class Windows:
       cameras: stacked cameras of the coarsest level, whose size all windows have.
       pyramid: `[V, P, 4]` colors and weights of the photographs.
       shares: `[L]` probability of each level, finest first.
+      places: `[K, 3]` centers of windows, of which each is drawn alike: a view, and x and y as
+        shares of its width and height; None: windows lie anywhere.
     """
 
     cameras: Camera
     pyramid: Pyramid
     shares: jax.Array
+    places: jax.Array | None = None
 
     def __len__(self) -> int:
         """Number of photographs."""
@@ -44,32 +48,108 @@ def photograph_windows(cameras: Camera, pyramid: Pyramid, *, whole_share: float)
     return Windows(cameras, pyramid, jnp.array(shares, jnp.float32))
 
 
+def windows_that_see(
+    key: jax.Array,
+    windows: Windows,
+    cameras: Camera,
+    depths: jax.Array,
+    views: Views,
+    view_depths: jax.Array,
+    *,
+    count: int = 4096,
+    tolerance: float = 0.05,
+) -> Windows:
+    """The same photographs, with windows around what other cameras see; consumes `key`.
+
+    Pixels of these cameras are drawn uniformly, and for each one of the photographs that see its
+    surface; a pixel that none sees draws a place in any photograph.
+
+    Args:
+      key: random key.
+      windows: the photographs.
+      cameras: stacked `[Q]`.
+      depths: `[Q, H, W]` their z-depths; 0 is undefined.
+      views: the photographs as small as their depths, V views.
+      view_depths: `[V, H, W]` z-depths of the photographs.
+      count: number K of places.
+      tolerance: relative difference of depths up to which a photograph sees a surface.
+    """
+    key_camera, key_pixel, key_view, key_any = jax.random.split(key, 4)
+    which = jax.random.randint(key_camera, (count,), 0, depths.shape[0])
+    size = jnp.array([cameras.width, cameras.height], jnp.float32)
+    pixels = jax.random.uniform(key_pixel, (count, 2)) * size[None]
+    column, row = jnp.floor(pixels).astype(jnp.int32).T
+    depth = depths[which, row, column]
+
+    def point(camera, pixel, depth):
+        return pixels_to_points(camera_at(cameras, camera), pixel, depth)
+
+    points = jax.vmap(point)(which, pixels, jnp.where(depth > 0, depth, 1))
+
+    def look(camera, own_depth, weight):
+        landed, _, weight = sample_where_visible(camera, own_depth, weight, points, tolerance)
+        return landed, weight
+
+    landed, seen = jax.vmap(look)(views.cameras, view_depths, views.weight)
+    seen = jnp.where(depth[None] > 0, seen, 0)
+    # Any photograph is as good as another where none sees the point.
+    view = jax.random.categorical(key_view, jnp.log(seen + 1e-6), axis=0)
+    chosen = view, jnp.arange(count)
+    size = jnp.array([views.cameras.width, views.cameras.height], jnp.float32)
+    anywhere = jax.random.uniform(key_any, (count, 2))
+    place = jnp.where(seen[chosen][:, None] > 0, landed[chosen] / size[None], anywhere)
+    return windows.replace(places=jnp.concatenate([view[:, None].astype(place.dtype), place], 1))
+
+
 def sample_window(key: jax.Array, windows: Windows) -> Batch:
-    """Draw a photograph uniformly, a level by its share, and a place uniformly; consumes `key`."""
+    """Draw a place, of any photograph or of those given, and a level by its share; consumes `key`.
+
+    The window lies around the place as far as the photograph reaches.
+    """
     key_view, key_level, key_y, key_x = jax.random.split(key, 4)
-    view = jax.random.randint(key_view, (), 0, len(windows))
     level = jax.random.categorical(key_level, jnp.log(windows.shares))
     sizes = jnp.asarray(windows.pyramid.sizes, jnp.int32)
     room = sizes[level] - sizes[-1] + 1
-    corner = jnp.stack(
-        [jax.random.randint(key_y, (), 0, room[0]), jax.random.randint(key_x, (), 0, room[1])]
-    )
+    if windows.places is None:
+        view = jax.random.randint(key_view, (), 0, len(windows))
+        corner = jnp.stack(
+            [jax.random.randint(key_y, (), 0, room[0]), jax.random.randint(key_x, (), 0, room[1])]
+        )
+    else:
+        view, center = _draw_place(key_view, windows, ())
+        extent, own = sizes[level].astype(center.dtype), sizes[-1].astype(center.dtype)
+        corner = jnp.floor(center * extent - own / 2).astype(jnp.int32)
+        corner = jnp.clip(corner, 0, room - 1)
     return cut_window(windows, view, level, corner)
+
+
+def _draw_place(key, windows, shape):
+    """A view `[...]`, and y and x `[..., 2]` as shares of its height and width."""
+    place = windows.places[jax.random.randint(key, shape, 0, len(windows.places))]
+    return place[..., 0].astype(jnp.int32), place[..., :0:-1]
 
 
 def sample_window_pixels(key: jax.Array, windows: Windows, count: int) -> Batch:
     """Draw `count` pixels with replacement, for fields that render single rays; consumes `key`.
 
-    Each is one of a photograph drawn uniformly, of a level by its share, of its pixels uniformly.
+    Each is one of a photograph drawn uniformly, of a level by its share, of its pixels uniformly;
+    or of a window around a given place.
     """
     key_view, key_level, key_y, key_x = jax.random.split(key, 4)
     pyramid = windows.pyramid
-    view = jax.random.randint(key_view, (count,), 0, len(windows))
     level = jax.random.categorical(key_level, jnp.log(windows.shares), shape=(count,))
     sizes, starts = (jnp.asarray(x, jnp.int32) for x in (pyramid.sizes, pyramid.starts))
     height, width = sizes[level].T
-    y = jax.random.randint(key_y, (count,), 0, height)
-    x = jax.random.randint(key_x, (count,), 0, width)
+    if windows.places is None:
+        view = jax.random.randint(key_view, (count,), 0, len(windows))
+        y = jax.random.randint(key_y, (count,), 0, height)
+        x = jax.random.randint(key_x, (count,), 0, width)
+    else:
+        view, center = _draw_place(key_view, windows, (count,))
+        within = jax.random.uniform(key_y, (count, 2)) - 0.5
+        extent, own = sizes[level].astype(center.dtype), sizes[-1].astype(center.dtype)
+        pixel = jnp.floor(center * extent + within * own[None]).astype(jnp.int32)
+        y, x = jnp.clip(pixel, 0, sizes[level] - 1).T
     values = to_float(pyramid.values[view, starts[level] + y * width + x])
     return Batch(
         cameras=camera_at(windows.cameras, view).replace(

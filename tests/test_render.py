@@ -89,7 +89,7 @@ def test_a_camera_path_may_be_fine_tuned_for(render, tmp_path, capsys):
 
 
 def test_nothing_is_fine_tuned_where_the_gate_lets_no_labels_in(capture_folder, monkeypatch):
-    monkeypatch.setattr(fine_tuning, "weigh", lambda *_: (None, {"weight": 0.0}))
+    monkeypatch.setattr(fine_tuning, "weigh", lambda *_: {"weight": 0.0})
     programs = Programs(dataclasses.replace(KEPT, gated=True), load_scene(str(capture_folder)))
     start = LabelStart("state", None)
     assert fine_tuning.fine_tune(programs, start, None, most=None) == "state"

@@ -19,7 +19,7 @@ from experiments.jobs.evaluate import evaluate_folders
 from experiments.jobs.run import run
 from experiments.methods import METHODS, CoarseConfig, WindowConfig, pseudo_settings
 from experiments.methods.surfels import REDUCED
-from experiments.training.gate import AGREEMENT, verdict, weigh_labels
+from experiments.training.gate import AGREEMENT, gated, verdict, weigh_labels
 from experiments.training.loop import TrainingError, run_stage
 from experiments.training.programs import Programs
 from experiments.training.setup import initial_points, initial_state
@@ -189,7 +189,8 @@ def test_labels_weigh_what_they_deserve(off):
         return Rendering(jnp.full(rgb.shape, 0.5), depth, jnp.ones(depth.shape))
 
     settings = pseudo_settings(REDUCED.labels)
-    changed, found = weigh_labels(label_sources(views, off * depths), render, settings)
+    found = weigh_labels(label_sources(views, off * depths), render, settings)
+    changed = gated(REDUCED.labels, found)
     low, high = AGREEMENT
     expected = np.clip((found["agreement"] - low) / (high - low), 0, 1)
     assert found["weight"] == pytest.approx(expected)

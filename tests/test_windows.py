@@ -10,7 +10,8 @@ import plane
 import pytest
 from splat_scenes import CONFIG, random_scene, to_surfels
 
-from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.geometry.cameras import Camera, pixels_to_points, points_to_pixels
+from jaxcloseup.photographs import camera_at
 from jaxcloseup.pyramids import photograph_pyramid
 from jaxcloseup.splats import render_surfels
 from jaxcloseup.windows import (
@@ -18,6 +19,7 @@ from jaxcloseup.windows import (
     photograph_windows,
     sample_window,
     sample_window_pixels,
+    windows_that_see,
 )
 
 
@@ -97,6 +99,53 @@ def test_pixels_come_from_all_levels_with_the_stated_shares(windows, key):
         assert np.all(seen < 5 * seen.mean() + 5) and seen.min() >= (0 if index == 0 else 1)
         halves = np.bincount(y[there] >= height // 2), np.bincount(x[there] >= width // 2)
         np.testing.assert_allclose(np.array(halves) / there.sum(), 0.5, atol=0.02)
+
+
+def test_windows_lie_around_places_as_far_as_the_photograph_reaches(windows, key):
+    there = windows.replace(places=jnp.array([[2.0, 0.5, 0.25], [0.0, 1.0, 0.0]]))
+    cameras = jax.vmap(lambda key: sample_window(key, there).cameras)(jax.random.split(key, 500))
+    view = np.searchsorted([-0.5, 0.5], cameras.position[:, 0])
+    level = 2 - np.rint(np.log2(cameras.intrinsics[:, 0] / 20)).astype(int)
+    own = np.asarray(windows.pyramid.intrinsics)[view, level]
+    corner = np.rint(own[:, 2:] - cameras.intrinsics[:, 2:]).astype(int)
+    assert set(view) == {0, 2} and set(level) == {0, 1, 2}
+    for index, (height, width) in enumerate(windows.pyramid.sizes):
+        # The middle of the upper half, and the upper right corner.
+        middle, edge = (width // 2 - 8, max(height // 4 - 6, 0)), (width - 16, 0)
+        for one, expected in ((2, middle), (0, edge)):
+            found = corner[(view == one) & (level == index)]
+            np.testing.assert_array_equal(found, [expected] * len(found))
+
+
+def test_pixels_lie_around_places(windows, key):
+    there = windows.replace(places=jnp.array([[1.0, 0.5, 0.5]]))
+    batch = sample_window_pixels(key, there, 4000)
+    level = 2 - np.rint(np.log2(batch.cameras.intrinsics[:, 0] / 20)).astype(int)
+    assert not np.any(batch.cameras.position[:, 0])
+    for index, (height, width) in enumerate(windows.pyramid.sizes):
+        away = np.asarray(batch.pixels)[level == index] - [width / 2, height / 2]
+        assert np.abs(away[:, 0]).max() <= 8.5 and np.abs(away[:, 1]).max() <= 6.5
+        np.testing.assert_allclose(away.mean(0), 0, atol=0.5)
+
+
+def test_windows_that_see_are_where_photographs_show_what_cameras_see(windows, key):
+    """Places lie on the plane; lifted there, they are inside of the wanted view."""
+    wanted = plane.camera_above(0.7, 0.1, 1.5)
+    views, depths = plane.make_views([plane.camera_above(x, 0, 4.0) for x in (-4.5, 0.0, 1.0)])
+    cameras = jax.tree.map(lambda leaf: leaf[None], wanted)
+    depth = jnp.asarray(plane.photograph(wanted)[1], jnp.float32).at[: wanted.height // 2].set(0)
+    seen = cameras, depth[None], views, jnp.asarray(depths, jnp.float32)
+    places = np.asarray(windows_that_see(key, windows, *seen, count=600).places)
+    assert places.shape == (600, 3) and (places[:, 1:] >= 0).all() and (places[:, 1:] <= 1).all()
+    inside = []
+    for view, x, y in places:
+        camera = camera_at(views.cameras, int(view))
+        pixel = jnp.array([x * camera.width, y * camera.height])
+        landed, _ = points_to_pixels(wanted, pixels_to_points(camera, pixel, jnp.float32(4.0)))
+        inside.append(bool(jnp.all((landed >= 0) & (landed <= wanted.width))) and view > 0)
+    # Half of the pixels have no depth, and draw any place; the first photograph sees none.
+    assert 0.45 < np.mean(inside) < 0.75
+    assert set(places[np.array(inside), 0]) == {1.0, 2.0}
 
 
 def test_a_window_learns_as_that_part_of_a_whole_image():

@@ -77,6 +77,21 @@ def _traced(labels):
 
 
 @dataclasses.dataclass(frozen=True)
+class TargetConfig:
+    """How target views, the wanted ones, are labeled and learned, other than random close-ups.
+
+    Attributes:
+      label: as in `LabelConfig`.
+      label_loss_weight: as there.
+      lr_scale: as there.
+    """
+
+    label: str = "warp"
+    label_loss_weight: float = 0.5
+    lr_scale: float = 1.0
+
+
+@dataclasses.dataclass(frozen=True)
 class WindowConfig:
     """How steps read photographs finer than they are reduced.
 
@@ -122,6 +137,7 @@ class Preset:
       gated: let left-out photographs decide how much labels weigh, which may be nothing.
       windows: how steps read finer photographs; None: they read reduced photographs alone.
       coarse: what trains before stage 1; None: stage 1 begins with the initial points.
+      targets: how target views are labeled; None: as random close-ups.
     """
 
     method: str
@@ -135,6 +151,14 @@ class Preset:
     gated: bool = False
     windows: WindowConfig | None = None
     coarse: CoarseConfig | None = None
+    targets: TargetConfig | None = None
+
+    @property
+    def target_labels(self) -> LabelConfig:
+        """How target views are labeled."""
+        if self.targets is None:
+            return self.labels
+        return dataclasses.replace(self.labels, **vars(self.targets))
 
 
 class Method(NamedTuple):

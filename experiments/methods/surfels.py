@@ -11,7 +11,14 @@ import jax.numpy as jnp
 import optax
 
 from experiments import progress
-from experiments.methods.method import CoarseConfig, LabelConfig, Method, Preset, WindowConfig
+from experiments.methods.method import (
+    CoarseConfig,
+    LabelConfig,
+    Method,
+    Preset,
+    TargetConfig,
+    WindowConfig,
+)
 from jaxcloseup.artifacts.gaussians import as_gaussians
 from jaxcloseup.artifacts.surfel_ply import write_surfels
 from jaxcloseup.field import RadianceField, Rendering
@@ -43,11 +50,13 @@ class SplatTraining:
 
     Attributes:
       steps_per_target: steps for each target view.
+      fewest_target_steps: steps for all of them, at least.
       smoothed_at: divisor of the photographs' size whose pixels bound how small splats are, by the
         smoothing filter in space, see `filters`; at least training's size. None has no filter.
     """
 
     steps_per_target: int = 5
+    fewest_target_steps: int = 1
     smoothed_at: int | None = None
 
 
@@ -109,6 +118,8 @@ QUICK = dataclasses.replace(
         means_lr_steps=1800,
         color_ridge=0.1,
         selective_adam=True,
+        steps_per_target=20,
+        fewest_target_steps=60,
         density=McmcConfig(start=0, stop=700, growth=1.0, noise=0.0),
         raster=RasterizeConfig(capacity=2**17, block=48, chunk=16, antialias=True),
     ),
@@ -121,6 +132,7 @@ QUICK = dataclasses.replace(
         steps=1500,
     ),
     windows=WindowConfig(),
+    targets=TargetConfig("residual", label_loss_weight=0.5, lr_scale=5.0),
     score_downscale=4,
     baseline_steps=2500,
 )
@@ -254,7 +266,9 @@ METHOD = Method(
     make_field=make_field,
     make_optimizer=make_optimizer,
     renders_pixels=False,
-    target_steps=lambda config, count: config.steps_per_target * count,
+    target_steps=lambda config, count: max(
+        config.steps_per_target * count, config.fewest_target_steps
+    ),
     max_points=lambda config: config.capacity,
     with_expected_depth=with_expected_depth,
     export=export,

@@ -20,16 +20,16 @@ from experiments.reporting.audits import (
 )
 from experiments.reporting.page import Picture, figure, figures, folded, head, table
 from experiments.reporting.showcase import Exhibit
-from experiments.reporting.summary import conclusion, tables
+from experiments.reporting.summary import best_stage, conclusion, tables
 from jaxcloseup.artifacts.images import webp_data_uri
 from jaxcloseup.files import write_file
 
 
 _STAGES = (
-    "<p class=quiet><i>closeup</i> and <i>test_time</i> continue the baseline with pseudo-labels. "
-    "<i>control</i> and <i>test_time_control</i> continue it for as many steps without, so compare "
-    "with these. <i>detail</i> adds to the renders of a stage, without training, what the "
-    "photographs show beyond it. Higher PSNR and SSIM are better, and lower LPIPS.</p>"
+    "<p class=quiet><i>closeup</i> learns pseudo-labels of random close-ups, and <i>test_time</i> "
+    "those of the very close-ups that are scored. <i>control</i> and <i>test_time_control</i> take "
+    "as many steps without, so compare with these. <i>detail</i> adds to the renders of a stage, "
+    "without training, what the photographs show beyond it. Higher PSNR and SSIM are better, and lower LPIPS.</p>"
 )
 
 
@@ -90,7 +90,7 @@ def write_report(
         f"<p class=quiet>{html.escape(results['method'])}, preset "
         f"{html.escape(results['preset'])}, seed {results['seed']}; held-out views are scored at "
         f"{sizes}, on 8-bit images.</p>",
-        *_exhibition(shown, list(results["stages"])[-1]),
+        *_exhibition(shown, best_stage(results["stages"])),
         *_moving(dolly),
         "<h2>Scores</h2>",
         "<div class=tables>",

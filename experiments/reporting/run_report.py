@@ -12,6 +12,7 @@ from experiments.evaluation.scores import Target
 from experiments.reporting.pictures import comparisons, label_pictures
 from experiments.reporting.report import write_report
 from experiments.reporting.showcase import Exhibit, exhibits
+from experiments.reporting.summary import best_stage
 from experiments.training.programs import Programs
 from experiments.training.setup import Training, timed
 from experiments.training.stages import Outcome
@@ -47,7 +48,7 @@ def report_run(
     programs, scene = training.programs, training.programs.scene
     with timed(training.seconds, "report"):
         targets = outcome.held_out.targets
-        brief = list(dict.fromkeys(["baseline", list(outcome.scores)[-1]]))
+        brief = list(dict.fromkeys(["baseline", best_stage(outcome.scores)]))
         pictures = comparisons(output_dir / "compare", targets, outcome.images, in_report=brief)
         _, _, key = jax.random.split(jax.random.key(about["seed"]), 3)
         pictures += label_pictures(
@@ -84,8 +85,8 @@ def report_run(
 
 
 def _showcase(programs: Programs, outcome: Outcome) -> list[Exhibit]:
-    """The close-ups that the page begins with, as the last stage renders them."""
-    targets, stage = outcome.held_out.targets, list(outcome.scores)[-1]
+    """The close-ups that the page begins with, as the best stage renders them."""
+    targets, stage = outcome.held_out.targets, best_stage(outcome.scores)
     split = next((name for name in (f"test{FINER}", "test") if targets.get(name)), None)
     if split is None:
         return []

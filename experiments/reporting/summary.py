@@ -1,6 +1,6 @@
 """What a run found, in a sentence, and in a small table of each kind of view."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from experiments.evaluation.metrics_text import COLUMNS, FINER, SPLIT_TITLES, format_metric
@@ -10,6 +10,12 @@ _DEPTH = ("depth_error_median", "point_depth_error_median")
 # Perceptual distances where their networks are at hand, else colors that were corrected.
 _LAST = ("lpips_vgg", "lpips_alex", "cc_psnr")
 _SHORT = {"cc_psnr": "color-corrected"} | dict.fromkeys(_DEPTH, "depth off by")
+
+
+def best_stage(stages: Iterable[str]) -> str:
+    """The stage whose renders are shown first."""
+    stages = list(stages)
+    return "detail" if "detail" in stages else stages[-1]
 
 
 def used_labels(results: Mapping[str, Any]) -> bool:
@@ -70,7 +76,11 @@ def tables(results: Mapping[str, Any]) -> dict[str, tuple[list[str], list[list[s
     stages, found = results["stages"], {}
     names = {stage: stage for stage in stages}
     if not used_labels(results):
-        for stage, control in (("closeup", "control"), ("test_time", "test_time_control")):
+        targets = results["config"].get("targets")
+        gated = {"closeup": "control"}
+        if targets is None or targets["label"] == "warp":
+            gated["test_time"] = "test_time_control"
+        for stage, control in gated.items():
             if stage in names and control in names:
                 del names[stage]
                 names[control] = f"{control}, {stage}"

@@ -1,5 +1,6 @@
 """The arms of a sweep: the rows of the paper's Table 1, ceilings, and any settings of labels."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import jax
@@ -83,6 +84,8 @@ def make_arm(name: str, preset: Preset) -> Arm:
                 f"labels with a value ({', '.join(sorted(_LABEL_SETTINGS | {'depth_error'}))}): "
                 "change other settings of the whole sweep with --set"
             )
+    if kind == "test_time":
+        preset = dataclasses.replace(preset, labels=preset.target_labels)
     of_kind = with_settings(preset, NAMED_ARMS.get(kind, ()))
     labels = with_settings(of_kind, changed, flag=f"--arms={name}: ").labels
     depth_error = _depth_error(name, errors)

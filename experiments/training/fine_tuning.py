@@ -1,15 +1,82 @@
-"""Fine-tuning a stored state for target views: the cameras that somebody wants rendered."""
+"""Fine-tuning for target views: the cameras that somebody wants rendered."""
 
+import functools
 import pathlib
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 
-from experiments.training.gate import weigh
+from experiments.training.gate import gated, weigh
 from experiments.training.loop import TrainingError
 from experiments.training.programs import Programs
-from experiments.training.setup import LabelStart, label_targets
+from experiments.training.setup import LabelStart, label_targets, rendered_depths
 from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.photographs import Views
+from jaxcloseup.pseudo import PseudoSettings
+from jaxcloseup.pyramids import photograph_pyramid
 from jaxcloseup.train import TrainState
+from jaxcloseup.windows import Windows, photograph_windows, windows_that_see
+
+
+_FINER = 2  # times the photographs' training size, at which labels with detail are learned too
+_WHOLE_SHARE = 0.4  # of their steps that see whole views, not windows of finer ones
+
+
+class TargetData(NamedTuple):
+    """What steps for target views learn from, as `Programs.run` takes it.
+
+    Attributes:
+      photographs: as training reads them, or windows of them that see what the targets see.
+      labels: of the target views.
+      settings: of these labels.
+      steps: how many.
+    """
+
+    photographs: Views | Windows
+    labels: Views | Windows
+    settings: PseudoSettings
+    steps: int
+
+
+def may_label(programs: Programs, gate: Mapping[str, Any] | None) -> bool:
+    """Whether the gate, if there is one, lets labels of target views in."""
+    warped = programs.preset.target_labels.label == "warp"
+    return not warped or gate is None or gate["weight"] > 0
+
+
+def target_data(
+    programs: Programs,
+    start: LabelStart,
+    cameras: Camera,
+    gate: Mapping[str, Any] | None,
+    kept: pathlib.Path | None = None,
+) -> TargetData:
+    """What a state learns from for target views.
+
+    Args:
+      programs: the run's.
+      start: the state, and the photographs with its depths.
+      cameras: stacked `[Q]`, of the target views.
+      gate: of warped labels, from `weigh`.
+      kept: file with the detail of the state, see `find_detail`.
+    """
+    preset, photographs = programs.preset, programs.photographs
+    settings = gated(preset.target_labels, gate)
+    how = preset.target_labels, settings, kept
+    labels = label_targets(programs, start, cameras, *how)
+    steps = programs.method.target_steps(preset.field, len(labels))
+    if isinstance(photographs, Windows) and preset.target_labels.label == "residual":
+        finer = label_targets(programs, start, _larger(cameras), *how)
+        pyramid = photograph_pyramid(finer, labels)
+        labels = photograph_windows(cameras, pyramid, whole_share=_WHOLE_SHARE)
+        render = functools.partial(programs.render, start.state)
+        depths = rendered_depths(render, cameras, programs.scene)
+        seen = cameras, depths, start.sources.views, start.sources.depths
+        key = jax.random.fold_in(start.state.key, start.state.step)
+        photographs = jax.jit(windows_that_see)(key, photographs, *seen)
+    return TargetData(photographs, labels, settings, steps)
 
 
 def fine_tune(
@@ -35,23 +102,36 @@ def fine_tune(
     Raises:
       TrainingError: no step was finite.
     """
-    preset, method, state = programs.preset, programs.method, start.state
-    settings, gate = weigh(programs, start)
-    if gate is not None and not gate["weight"]:
+    gate, state = weigh(programs, start), start.state
+    if not may_label(programs, gate):
         print("nothing is fine-tuned")
         return state
-    labels = label_targets(programs, start, cameras, preset.labels, settings, kept)
-    steps = method.target_steps(preset.field, cameras.intrinsics.shape[0])
-    steps = min(steps, most or steps)
-    coverage = float(jnp.mean(labels.weight))
+    data = target_data(programs, start, cameras, gate, kept)
+    steps = min(data.steps, most or data.steps)
+    coverage = _coverage(data.labels)
     print(f"labels on {coverage:.0%} of the pixels to be rendered; {steps} steps", flush=True)
     if coverage == 0:
         print("nothing is fine-tuned")
         return state
-    views = programs.photographs
-    state, values = programs.run("target_views", state, views, labels, settings, count=steps)
+    state, values = programs.run("target_views", state, *data[:3], count=steps)
     if values["skipped"] == steps:
         raise TrainingError(f"loss or gradient was not finite in each of {steps} steps for them")
     numbers = {key: value for key, value in values.items() if isinstance(value, float)}
     print("  ".join(f"{key} {value:.4g}" for key, value in numbers.items()))
     return state
+
+
+def _larger(cameras):
+    return cameras.replace(
+        intrinsics=_FINER * cameras.intrinsics,
+        height=_FINER * cameras.height,
+        width=_FINER * cameras.width,
+    )
+
+
+def _coverage(labels):
+    """Mean weight of the labels."""
+    if isinstance(labels, Windows):
+        weight = labels.pyramid.values[..., 3]
+        return float(jnp.mean(weight, dtype=jnp.float32)) / 255
+    return float(jnp.mean(labels.weight))

@@ -13,9 +13,8 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from experiments import progress
 from experiments.evaluation.audit import audit_left_out
-from experiments.methods import pseudo_settings
+from experiments.methods import LabelConfig, pseudo_settings
 from experiments.training.programs import Programs
 from experiments.training.setup import LabelStart
 from jaxcloseup.field import Rendering
@@ -40,29 +39,35 @@ def verdict(found: Mapping[str, Any]) -> str:
     )
 
 
-def weigh(programs: Programs, start: LabelStart) -> tuple[PseudoSettings, dict[str, Any] | None]:
-    """The preset's settings of labels after its gate, and the gate's record, if it has one.
+def weigh(programs: Programs, start: LabelStart) -> dict[str, Any] | None:
+    """The gate's record, if the preset has one: see `weigh_labels`.
 
     Labels with detail have weights of their own, and no gate.
     """
     preset = programs.preset
-    settings = pseudo_settings(preset.labels)
-    if not preset.gated or preset.labels.label == "residual":
-        return settings, None
+    if not preset.gated or "warp" not in (preset.labels.label, preset.target_labels.label):
+        return None
     render = functools.partial(programs.render, start.state)
-    settings, found = weigh_labels(start.sources, render, settings)
-    print(f"gate: {verdict(found)}")
-    if not found["weight"]:
-        progress.skip("closeup", "test_time")
-    return settings, found
+    found = weigh_labels(start.sources, render, pseudo_settings(preset.labels))
+    print(f"     gate: {verdict(found)}")
+    return found
+
+
+def gated(labels: LabelConfig, gate: Mapping[str, Any] | None) -> PseudoSettings:
+    """The settings of labels; the gate scales the weight of warped ones."""
+    settings = pseudo_settings(labels)
+    if gate is None or labels.label != "warp":
+        return settings
+    weight = jnp.float32(gate["weight"])
+    return settings.replace(label_loss_weight=weight * settings.label_loss_weight)
 
 
 def weigh_labels(
     sources: LabelSources,
     render: Callable[[Camera], Rendering],
     settings: PseudoSettings,
-) -> tuple[PseudoSettings, dict[str, Any]]:
-    """Scale the weight of labels by how well they agree on left-out photographs.
+) -> dict[str, Any]:
+    """How much labels may weigh, by how well they agree on left-out photographs.
 
     Args:
       sources: the training photographs with their depths.
@@ -70,10 +75,10 @@ def weigh_labels(
       settings: settings of the labels.
 
     Returns:
-      The settings with the scaled `label_loss_weight`, and a record for JSON. `weight`: the factor,
-      in [0, 1]. `agreement`: share of the pixels of left-out photographs on which labels agree
-      closely. `left_out`: for each pair of tolerances, the PSNR of labels and of the model on the
-      labeled pixels, and the share of these pixels.
+      A record for JSON. `weight`: a factor on `label_loss_weight`, in [0, 1]. `agreement`: share of
+      the pixels of left-out photographs on which labels agree closely. `left_out`: for each pair of
+      tolerances, the PSNR of labels and of the model on the labeled pixels, and the share of these
+      pixels.
     """
     candidates = [
         settings.replace(
@@ -89,5 +94,4 @@ def weigh_labels(
         {"rgb_tolerance": rgb, "depth_tolerance": depth} | row
         for (rgb, depth), row in zip(TOLERANCES, rows, strict=True)
     ]
-    found = {"weight": weight, "agreement": agreement, "left_out": evidence}
-    return settings.replace(label_loss_weight=weight * settings.label_loss_weight), found
+    return {"weight": weight, "agreement": agreement, "left_out": evidence}

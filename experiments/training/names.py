@@ -1,6 +1,6 @@
 """Names that flags accept; importing them must cost nothing, see `define_flags`."""
 
-STAGES = ("baseline", "control", "closeup", "test_time", "detail")
+STAGES = ("baseline", "control", "closeup", "detail", "test_time")
 PRESETS = {  # by method; the first one is the default
     "nerf": ("quick", "paper", "released"),
     "dsnerf": ("quick", "paper"),

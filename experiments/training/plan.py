@@ -9,7 +9,7 @@ from jaxcloseup.scene import Scene
 # Seconds of a step, or of a whole part, of a default run of `table` on two cores.
 _STEP = {
     **{"coarse_baseline": 0.044, "baseline": 0.1, "control": 0.1, "closeup": 0.2},
-    **{"test_time_control": 0.15, "test_time": 0.25},
+    **{"test_time_control": 0.1, "test_time": 0.2},
 }
 _PART = {
     **{"refine_baseline": 11, "depths": 30, "gate": 5, "closeup_labels": 30, "detail": 46},
@@ -49,13 +49,13 @@ def plan_run(preset: Preset, scene: Scene, to_run: Sequence[str]) -> dict[str, f
     if "closeup" in to_run:
         parts += ["closeup_labels"] if preset.labels.label == "residual" else []
         parts += ["closeup", "closeup_evaluation"]
+    parts += ["detail", "detail_evaluation"] if "detail" in to_run else []
     if "test_time" in to_run and scene.test is not None:
         targets = method.target_steps(preset.field, len(scene.test))
         steps |= dict.fromkeys(("test_time", "test_time_control"), targets)
         parts += ["test_time_labels"]
         for stage in ("test_time_control",) * ("control" in to_run) + ("test_time",):
             parts += [stage, f"{stage}_evaluation"]
-    parts += ["detail", "detail_evaluation"] if "detail" in to_run else []
     parts += ["audit"] + ["dolly"] * (scene.test is not None) + ["report"]
     slower = _RAYS if method.renders_pixels else 1
     return {

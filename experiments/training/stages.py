@@ -12,7 +12,8 @@ from experiments.evaluation.audit import audit_labels, left_out_curve
 from experiments.evaluation.renders import write_truth
 from experiments.evaluation.scores import NO_PERCEPTUAL, Perceptual
 from experiments.training.detail import detail_path, detailed, find_detail
-from experiments.training.gate import weigh
+from experiments.training.fine_tuning import may_label, target_data
+from experiments.training.gate import gated, weigh
 from experiments.training.names import STAGES
 from experiments.training.programs import Programs
 from experiments.training.scoring import HeldOut, Scorer, hold_out
@@ -20,7 +21,6 @@ from experiments.training.setup import (
     LabelStart,
     Training,
     label_closeups,
-    label_targets,
     say_which_points_fit,
     start_labels,
     timed,
@@ -90,56 +90,73 @@ def run_stages(
     scorer = Scorer(training, held_out, output_dir, perceptual)
     scorer.score("baseline", baseline)
     with timed(training.seconds, "gate"):
-        settings, gate = weigh(programs, start)
+        gate = weigh(programs, start)
+    settings = gated(preset.labels, gate)
     kept = detail_path(output_dir, "baseline")
-    use_labels = gate is None or gate["weight"] > 0
-    controls: dict[int, TrainState] = {}
     latest = "baseline", baseline
 
-    def control(name, steps):
-        if steps not in controls:
-            controls[steps] = training.train(
-                name, "photographs", baseline, photographs, steps=steps
-            )
-            scorer.score(name, controls[steps])
-        return controls[steps]
-
-    def fine_tune(stage, control_name, kind, *data, steps):
-        without = None
-        if "control" in to_run or not use_labels:
-            without = control(control_name, steps)
-        # Without labels a stage is its control: the same steps on the same photographs.
-        state = without
-        if use_labels:
-            state = training.train(stage, kind, start.state, photographs, *data, steps=steps)
-        scorer.score(stage, state)
-        return state
-
-    if "control" in to_run:
-        latest = "control", control("control", preset.closeup_steps)
-    if "closeup" in to_run:
-        kind, labels = closeup_labels(training, start, seed, kept)
+    def continue_from(state, stage, kind, *data):
         steps = preset.closeup_steps
-        state = fine_tune("closeup", "control", kind, labels, settings, steps=steps)
-        latest = ("closeup" if use_labels else "control"), state
-    if "test_time" in to_run and scene.test is None:
-        print(f"no test_time: {scene.name} holds out no close-ups (--split=closest does)")
-    elif "test_time" in to_run:
-        with timed(training.seconds, "test_time_labels"):
-            targets = scene.test.cameras
-            labels = label_targets(programs, start, targets, preset.labels, settings, kept)
-        steps = programs.method.target_steps(preset.field, len(scene.test))
-        names = "test_time", "test_time_control"
-        fine_tune(*names, "target_views", labels, settings, steps=steps)
+        state = training.train(stage, kind, state, photographs, *data, steps=steps)
+        scorer.score(stage, state)
+        return stage, state
+
+    # Without labels `closeup` is its control: the same steps on the same photographs.
+    use_labels = gate is None or preset.labels.label != "warp" or gate["weight"] > 0
+    if "control" in to_run or ("closeup" in to_run and not use_labels):
+        latest = continue_from(baseline, "control", "photographs")
+    if "closeup" in to_run and use_labels:
+        kind, labels = closeup_labels(training, start, seed, kept)
+        latest = continue_from(start.state, "closeup", kind, labels, settings)
+    elif "closeup" in to_run:
+        scorer.score("closeup", latest[1])
     detail, render = None, functools.partial(programs.render, latest[1])
     if "detail" in to_run:
         detail, render = add_detail_stage(training, scorer, output_dir, *latest)
+    if "test_time" in to_run and scene.test is None:
+        print(f"no test_time: {scene.name} holds out no close-ups (--split=closest does)")
+    elif "test_time" in to_run:
+        by_detail = preset.target_labels.label == "residual"
+        # The detail of the latest state is there, or made anyway.
+        name, state = latest if by_detail else ("baseline", baseline)
+        begin = start._replace(state=state) if by_detail else start
+        kept = detail_path(output_dir, name)
+        train_for_targets(training, scorer, begin, gate, kept, controlled="control" in to_run)
     with timed(training.seconds, "audit"):
         audit, left_out = audit_all(programs, start, held_out.exact, settings, seed)
     return Outcome(
         *(start, settings, gate, held_out, scorer.scores, scorer.images),
         *(audit, left_out, detail, render),
     )
+
+
+def train_for_targets(
+    training: Training,
+    scorer: Scorer,
+    start: LabelStart,
+    gate: Mapping[str, Any] | None,
+    kept: pathlib.Path,
+    *,
+    controlled: bool,
+) -> None:
+    """Train and score `test_time`, and its control: as many steps on the same photographs alone."""
+    programs, stage, control = training.programs, "test_time", "test_time_control"
+    with timed(training.seconds, "test_time_labels"):
+        data = target_data(programs, start, programs.scene.test.cameras, gate, kept)
+
+    def train(name, kind, *labels):
+        begin = start.state, data.photographs
+        state = training.train(name, kind, *begin, *labels, steps=data.steps)
+        scorer.score(name, state)
+        return state
+
+    labeled = may_label(programs, gate)
+    if controlled or not labeled:
+        without = train(control, "photographs", data.settings.lr_scale)
+    if labeled:
+        train(stage, "target_views", data.labels, data.settings)
+    else:
+        scorer.score(stage, without)
 
 
 def add_detail_stage(
