@@ -1,5 +1,7 @@
 """Slow NumPy float64 oracles of volumetric fields, from the papers, without the package's code."""
 
+import functools
+import itertools
 import math
 
 import numpy as np
@@ -132,7 +134,7 @@ def pixel_ray(camera, pixel):
     return pose[:, 3], direction, np.linalg.norm(direction)
 
 
-def march(camera, pixel, near, far, rounds, *, spacing=1.0, scale=1.0):
+def march(camera, pixel, near, far, rounds, *, spacing=1.0, scale=1.0, blur=lambda w: w):
     """One pixel's color, depth and alpha, and the histograms of all rounds.
 
     `rounds` are pairs of a number of intervals and `look(origin, direction, edges) -> density, rgb`
@@ -145,7 +147,7 @@ def march(camera, pixel, near, far, rounds, *, spacing=1.0, scale=1.0):
         if edges is None:
             edges = np.arange(count + 1) / count
         else:
-            edges = quantile_edges(edges, weights, count)
+            edges = quantile_edges(edges, blur(weights), count)
         depth = unspace(edges, scale * near, scale * far, spacing) / scale
         density, rgb = look(origin, direction, depth)
         weights = absorb(density, depth, length)
@@ -159,8 +161,9 @@ def sigmoid(x):
     return 1 / (1 + np.exp(-x))
 
 
-def ngp(config, params, center, scale):
+def ngp(config, params, center, scale, pixel):
     """`rounds` for `march`, of Instant-NGP with proposals."""
+    del pixel
 
     def features(grid_config, table, points):
         x = (points - center) * scale
@@ -177,9 +180,170 @@ def ngp(config, params, center, scale):
         points = origin + (depth[1:, None] + depth[:-1, None]) / 2 * direction
         part = params["fine"]
         raw = mlp(part["density"], features(config.grid, part["grid"], points))
-        unit = np.tile(direction / np.linalg.norm(direction), (len(raw), 1))
-        looking = positional(unit, config.direction_octaves)
-        return scale * np.exp(raw[:, 0]), sigmoid(mlp(part["color"], raw, looking))
+        seen = looking(direction, len(raw), config.direction_octaves)
+        return scale * np.exp(raw[:, 0]), sigmoid(mlp(part["color"], raw, seen))
 
     proposals = [n for n in (config.num_coarse, config.num_middle) if n]
     return [*((n, propose) for n in proposals), (config.num_fine, render)]
+
+
+def widen(weights):
+    """mip-NeRF, section 3.1: the larger of each two neighbors, averaged, plus 0.01."""
+    last, result = len(weights) - 1, []
+    for k, own in enumerate(weights):
+        left, right = weights[max(k - 1, 0)], weights[min(k + 1, last)]
+        result.append((max(left, own) + max(own, right)) / 2 + 0.01)
+    return np.array(result)
+
+
+def frustum(begin, end, radius):
+    """Mean and variance along a cone's axis, and variance across (mip-NeRF, eq. 7)."""
+    m, h = (begin + end) / 2, (end - begin) / 2
+    mean = m + 2 * m * h**2 / (3 * m**2 + h**2)
+    along = h**2 / 3 - 4 / 15 * h**4 * (12 * m**2 - h**2) / (3 * m**2 + h**2) ** 2
+    across = radius**2 * (m**2 / 4 + 5 * h**2 / 12 - 4 * h**4 / (15 * (3 * m**2 + h**2)))
+    return mean, along, across
+
+
+def softplus(x):
+    return np.logaddexp(0, x)
+
+
+def looking(direction, count, octaves):
+    return positional(np.tile(direction / np.linalg.norm(direction), (count, 1)), octaves)
+
+
+def mipnerf(config, params, center, scale, pixel, network):
+    """`rounds` for `march`, of mip-NeRF, whose network's oracle is `network`."""
+
+    def render(origin, direction, depth):
+        origin, direction = (origin - center) * scale, direction * scale
+        encoded = []
+        for begin, end in itertools.pairwise(depth):
+            mean, along, across = frustum(begin, end, 2 / math.sqrt(12) * pixel * scale)
+            projected = np.outer(direction, direction)
+            covariance = along * projected
+            covariance += across * (np.eye(3) - projected / (direction @ direction))
+            waves = []
+            for k in range(config.position_octaves):
+                kept = np.exp(-0.5 * 4**k * np.diag(covariance))
+                at = 2**k * (origin + mean * direction)
+                waves += [np.sin(at) * kept, np.cos(at) * kept]
+            encoded.append(np.concatenate(waves))
+        seen = looking(direction, len(encoded), config.direction_octaves)
+        density, rgb = network(params, np.array(encoded), seen)
+        return scale * softplus(density - 1), 1.002 * sigmoid(rgb) - 0.001
+
+    return [(config.num_coarse, render), (config.num_fine, render)]
+
+
+def zip_samples(origin, direction, begin, end, radius):
+    """Six points and deviations in a frustum (Zip-NeRF, eq. 1 to 3), for some axes across."""
+    m, h = (begin + end) / 2, (end - begin) / 2
+    unit = direction / np.linalg.norm(direction)
+    across = np.cross(unit, np.eye(3)[np.argmin(np.abs(unit))])
+    across /= np.linalg.norm(across)
+    other = np.cross(unit, across)
+    for j, turn in enumerate((0, 2, 4, 3, 5, 1)):
+        root = math.sqrt((h**2 - m**2) ** 2 + 4 * m**4)
+        t = end**2 + 2 * m**2 + 3 / math.sqrt(7) * (2 * j / 5 - 1) * root
+        t = begin + h * t / (h**2 + 3 * m**2)
+        angle, away = turn * math.pi / 3, radius * t / math.sqrt(2)
+        turned = math.cos(angle) * across + math.sin(angle) * other
+        yield origin + t * direction + away * turned, 0.5 * away
+
+
+def zipnerf(config, params, center, scale, pixel):
+    """`rounds` for `march`, of Zip-NeRF."""
+
+    def features(grid, table, origin, direction, depth):
+        origin, direction = (origin - center) * scale, direction * scale
+        result = []
+        for begin, end in itertools.pairwise(depth):
+            total = 0
+            radius = 2 / math.sqrt(12) * pixel * scale
+            for x, deviation in zip_samples(origin, direction, begin, end, radius):
+                half = 1
+                if config.contracted:
+                    step, half = 1e-5, 2
+                    moved = [contract(x[None] + sign * np.eye(3) * step) for sign in (1, -1)]
+                    jacobian = (moved[0] - moved[1]) / (2 * step)
+                    deviation *= np.cbrt(np.linalg.det(jacobian))
+                    x = contract(x[None])[0]
+                found, _ = hash_encoding(table, grid, 0.5 * x / half + 0.5)
+                for level in range(grid.levels):
+                    cells = resolution(level, grid.levels, grid.coarsest, grid.finest)
+                    spread = 0.5 * deviation / half * cells
+                    found[level] *= math.erf(1 / math.sqrt(8 * spread**2))
+                total = total + found / 6
+            result.append(total.ravel())
+        return np.array(result)
+
+    def propose(part, origin, direction, depth):
+        raw = mlp(
+            part["density"], features(config.proposal, part["grid"], origin, direction, depth)
+        )
+        return scale * np.exp(raw[:, 0]), None
+
+    def render(origin, direction, depth):
+        part = params["fine"]
+        raw = mlp(part["density"], features(config.grid, part["grid"], origin, direction, depth))
+        seen = looking(direction, len(raw), config.direction_octaves)
+        return scale * np.exp(raw[:, 0]), sigmoid(mlp(part["color"], raw, seen))
+
+    counts = [n for n in (config.num_coarse, config.num_middle) if n]
+    proposals = [functools.partial(propose, part) for part in params["proposal"]]
+    return [*zip(counts, proposals, strict=True), (config.num_fine, render)]
+
+
+def blurred_penalty(edges, weights, proposed_edges, proposed, pulse, steps=200_001):
+    """Zip-NeRF's interlevel loss, by a blur on a fine grid."""
+    grid = np.linspace(edges[0] - 2 * pulse, edges[-1] + 2 * pulse, steps)
+    cdf = np.interp(grid, edges, np.concatenate([[0], np.cumsum(weights)]))
+    # The blurred density is a difference of the CDF, whose integral is again taken on the grid.
+    ahead, behind = (np.interp(grid + sign * pulse, grid, cdf) for sign in (1, -1))
+    density = (ahead - behind) / (2 * pulse)
+    mass = np.concatenate([[0], np.cumsum((density[1:] + density[:-1]) / 2 * np.diff(grid))])
+    blurred = np.diff(np.interp(proposed_edges, grid, mass))
+    return np.sum(np.maximum(blurred - proposed, 0) ** 2 / (proposed + 1e-5))
+
+
+def between(values, at):
+    """Linear interpolation `[...]` of rows `[n, ...]` at a continuous row."""
+    low = min(int(np.floor(at)), len(values) - 2)
+    return (1 - (at - low)) * values[low] + (at - low) * values[low + 1]
+
+
+def vector_matrix(factors, n, x):
+    """Products `[3, C]` of matrices and vectors at a position in [-1, 1]^3 (TensoRF, eq. 4)."""
+    u = np.clip((x + 1) / 2, 0, 1) * (n - 1)
+    result = []
+    for mode, (first, second, line) in enumerate(((0, 1, 2), (0, 2, 1), (1, 2, 0))):
+        plane = np.asarray(factors["planes"][mode], np.float64)[:n, :n]
+        vector = np.asarray(factors["lines"][mode], np.float64)[:n]
+        result.append(between(between(plane, u[first]), u[second]) * between(vector, u[line]))
+    return np.array(result)
+
+
+def tensorf(config, params, center, scale, pixel, vertices):
+    """`rounds` for `march`, of TensoRF with grids of so many vertices a side."""
+    del pixel
+
+    def density(origin, direction, depth):
+        points = origin + (depth[1:, None] + depth[:-1, None]) / 2 * direction
+        x = (points - center) * scale
+        total = np.array([vector_matrix(params["density"], vertices, p).sum() for p in x])
+        return x, scale * config.density_scale * softplus(total + config.density_shift)
+
+    def look(*ray):
+        return density(*ray)[1], None
+
+    def render(origin, direction, depth):
+        x, absorbed = density(origin, direction, depth)
+        products = np.array([vector_matrix(params["color"], vertices, p).ravel() for p in x])
+        features = mlp(params["basis"], products)
+        encoded = positional(features, config.octaves)
+        seen = looking(direction, len(x), config.octaves)
+        return absorbed, sigmoid(mlp(params["network"], encoded, seen))
+
+    return [(config.num_coarse, look), (config.num_fine, render)]

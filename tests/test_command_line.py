@@ -4,6 +4,7 @@ import importlib
 import json
 import os
 import pathlib
+import re
 import subprocess
 import sys
 
@@ -241,6 +242,9 @@ def test_a_preset_of_the_other_method_is_one_sentence(parsed_flags, tmp_path):
 @pytest.mark.parametrize(
     ("method", "text", "message"),
     [
+        ("ngp", "compute_dtype=bfloat16", "method ngp has no setting compute_dtype: choose"),
+        ("ngp", "grid.levels=0", "grid.levels must be between 1 and 64"),
+        ("nerf", "depth_share=2", "depth_share must be between 0 and 1"),
         ("nerf", "capacity=500", "method nerf has no setting capacity: choose one of .*, width"),
         ("surfels", "compute_dtype=bfloat16", "method surfels has no setting compute_dtype"),
         ("surfels", "num_rays=4", "method surfels has no setting num_rays"),
@@ -294,7 +298,6 @@ def test_every_setting_is_listed_with_values_that_it_may_have(parsed_flags, caps
 def test_flags_know_all_names():
     """Modules that define flags import no JAX, so they repeat the names of what imports it."""
     assert {name: tuple(method.presets) for name, method in METHODS.items()} == names.PRESETS
-    assert list(names.METHODS) == list(METHODS)
     assert names.ARMS == KINDS
 
 
@@ -346,6 +349,16 @@ def test_wrong_words_are_one_sentence(words, message):
     )
     assert done.returncode == 1 and done.stdout == "" and done.stderr.count("\n") == 1
     assert done.stderr.startswith(f"experiments.{words[0]}: {message}")
+
+
+def test_help_has_a_line_for_each_method_with_its_paper():
+    assert list(names.METHODS) == list(METHODS)
+    assert all(re.fullmatch(r".+ \(.+ et al\. 20\d\d\)", line) for line in names.METHODS.values())
+
+
+def test_an_unknown_method_is_one_sentence(parsed_flags):
+    with pytest.raises(flags.IllegalFlagValueError, match="should be one of <nerf"):
+        flags.FLAGS["method"].parse("nothing")
 
 
 def test_surfels_can_be_cloned_and_split(parsed_flags):

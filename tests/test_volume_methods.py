@@ -9,6 +9,7 @@ import numpy as np
 import plane
 import pytest
 import reference_volume as reference
+from reference import nerf_network
 from test_sweep import assert_same_step
 from tiny_runs import TINY
 
@@ -21,9 +22,13 @@ from experiments.training.sweep import stack_arms
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.scenes import load_scene
+from jaxcloseup.train import TrainState
 from jaxcloseup.volume import intervals
 from jaxcloseup.volume.hash_grid import HashGridConfig
+from jaxcloseup.volume.mipnerf import MipNerfConfig, mipnerf
 from jaxcloseup.volume.ngp import NgpConfig, ngp
+from jaxcloseup.volume.tensorf import TensorfBuffers, TensorfConfig, factor_products, tensorf
+from jaxcloseup.volume.zipnerf import ZipNerfConfig, zipnerf
 
 
 GRID = HashGridConfig(levels=3, features=2, log2_entries=8, coarsest=4, finest=16)
@@ -41,10 +46,99 @@ NGP = NgpConfig(
     contracted=True,
     distortion_weight=0.1,
 )
+MIP = MipNerfConfig(
+    depth=2,
+    width=12,
+    skip_after=0,
+    position_octaves=3,
+    direction_octaves=1,
+    direction_width=6,
+    num_coarse=6,
+    num_fine=5,
+)
+ZIP = ZipNerfConfig(
+    grid=GRID,
+    proposal=dataclasses.replace(GRID, levels=2),
+    width=8,
+    color_layers=1,
+    direction_octaves=1,
+    num_coarse=6,
+    num_middle=5,
+    num_fine=4,
+)
+TENSORF = TensorfConfig(
+    coarsest=3,
+    finest=6,
+    growths=2,
+    grow_every=2,
+    density_components=2,
+    color_components=2,
+    appearance=3,
+    width=6,
+    octaves=1,
+    density_shift=-1.0,
+    density_scale=2.0,
+    sparsity_weight=0.1,
+    smoothness_weight=0.2,
+    num_coarse=6,
+    num_fine=5,
+)
+VERTICES = 4  # after one growth
 CENTER, SCALE, NEAR, FAR = (0.2, -0.1, 0.3), 0.6, 0.5, 4.0
 # Each method: its configuration, what makes its field, and its oracle's rounds and spacing.
-FIELDS = {"ngp": (NGP, ngp, reference.ngp)}
+FIELDS = {
+    "ngp": (NGP, ngp, reference.ngp),
+    "mipnerf": (MIP, mipnerf, functools.partial(reference.mipnerf, network=nerf_network)),
+    "zipnerf": (ZIP, zipnerf, reference.zipnerf),
+    "tensorf": (TENSORF, tensorf, functools.partial(reference.tensorf, vertices=VERTICES)),
+}
 TRAINED = [*FIELDS, "dsnerf"]
+
+
+def ngp_penalty(config, params, histograms):
+    *proposals, last = histograms
+    total = sum(reference.proposal_penalty(*last, *proposed) for proposed in proposals)
+    return total + config.distortion_weight * reference.distortion(*last)
+
+
+def zip_penalty(config, params, histograms):
+    *proposals, last = histograms
+    total = config.distortion_weight * reference.distortion(*last)
+    for proposed, pulse in zip(proposals, (0.03, 0.003), strict=True):
+        total += config.proposal_weight * reference.blurred_penalty(*last, *proposed, pulse)
+    decay = 0
+    for part, grid in (
+        (params["fine"], config.grid),
+        *((part, config.proposal) for part in params["proposal"]),
+    ):
+        start = 0
+        for level in range(grid.levels):
+            side = reference.resolution(level, grid.levels, grid.coarsest, grid.finest) + 1
+            entries = min(side**3, 2**grid.log2_entries)
+            decay += np.mean(part["grid"][start : start + entries] ** 2)
+            start += entries
+    return total + config.decay_weight * decay
+
+
+def tensorf_penalty(config, params, histograms):
+    total = 0
+    for name in ("density", "color"):
+        planes = params[name]["planes"][:, :VERTICES, :VERTICES]
+        steps = [np.mean(np.diff(planes, axis=axis) ** 2) for axis in (1, 2)]
+        total += config.smoothness_weight * sum(steps)
+    lines, planes = params["density"]["lines"], params["density"]["planes"]
+    size = np.abs(lines[:, :VERTICES]).mean() + np.abs(planes[:, :VERTICES, :VERTICES]).mean()
+    return total + config.sparsity_weight * size
+
+
+# What the loss adds for a ray, from its histograms.
+PENALTIES = {
+    "ngp": ngp_penalty,
+    "mipnerf": lambda *_: None,
+    "zipnerf": zip_penalty,
+    "tensorf": tensorf_penalty,
+}
+BUFFERS = {"tensorf": TensorfBuffers(np.int32(VERTICES))}
 PIXELS = np.array([[2.5, 3.5], [6.5, 1.5], [4.0, 4.25]])
 
 
@@ -72,21 +166,24 @@ def params(name):
 def test_a_rendering_matches_the_oracle(name):
     config, _, oracle = FIELDS[name]
     with jax.enable_x64(True):
-        seen = jax.jit(field(name).render)(params(name), (), camera(), jnp.asarray(PIXELS), None)
-    rounds = oracle(config, params(name), np.array(CENTER), SCALE)
+        seen = jax.jit(field(name).render)(
+            params(name), BUFFERS.get(name, ()), camera(), jnp.asarray(PIXELS), None
+        )
+    rounds = oracle(config, params(name), np.array(CENTER), SCALE, 1 / np.sqrt(8 * 9))
+    blur = reference.widen if name == "mipnerf" else lambda weights: weights
     for i, pixel in enumerate(PIXELS):
         rgb, depth, alpha, histograms = reference.march(
-            camera(), pixel, NEAR, FAR, rounds, spacing=config.spacing, scale=SCALE
+            camera(), pixel, NEAR, FAR, rounds, spacing=config.spacing, scale=SCALE, blur=blur
         )
         assert alpha > 0.1
         np.testing.assert_allclose(seen.rgb[i], rgb, atol=1e-5)
         np.testing.assert_allclose(seen.depth[i], depth, atol=1e-5)
         np.testing.assert_allclose(seen.alpha[i], alpha, atol=1e-5)
-        penalty = sum(
-            reference.proposal_penalty(*histograms[-1], *proposed) for proposed in histograms[:-1]
-        )
-        penalty += config.distortion_weight * reference.distortion(*histograms[-1])
-        np.testing.assert_allclose(seen.aux.penalty[i], penalty, rtol=1e-4)
+        penalty = PENALTIES[name](config, params(name), histograms)
+        if penalty is None:
+            assert seen.aux.penalty is None
+        else:
+            np.testing.assert_allclose(seen.aux.penalty[i], penalty, rtol=1e-4)
 
 
 @pytest.mark.parametrize("name", FIELDS)
@@ -107,7 +204,9 @@ def test_gradients_are_finite_differences(name, monkeypatch):
                 key: jax.tree.map(lambda p, d, h=step: p + h * d, params(name)[key], along[key])
                 for key, step in steps.items()
             }
-            seen = field(name).render(moved, (), camera(), jnp.asarray(PIXELS), None)
+            seen = field(name).render(
+                moved, BUFFERS.get(name, ()), camera(), jnp.asarray(PIXELS), None
+            )
             plain = seen._replace(aux=seen.aux._replace(penalty=None))
             penalty = seen.aux.penalty
             penalty = jnp.zeros(()) if penalty is None else jnp.sum(penalty)
@@ -185,3 +284,31 @@ def test_an_arm_is_the_run_alone(name, capture_folder):
     assert not any(metrics["skipped"])
     arm = jax.tree.map(lambda leaf: leaf[1], together.replace(step=alone.step[None]))
     assert_same_step(arm, alone, start.state)
+
+
+def test_a_grid_that_grows_shows_the_same_scene():
+    """From 3 to 5 vertices: the old ones stay, and what lies between them is on their lines."""
+    config = dataclasses.replace(TENSORF, finest=5, growths=1, grow_every=4)
+    grown = tensorf(config, near=NEAR, far=FAR)
+    with jax.enable_x64(True):
+        shapes, _ = jax.eval_shape(grown.init, jax.random.key(0), *[jnp.zeros((1, 3))] * 2)
+        numbers = np.random.default_rng(5)
+        params = jax.tree.map(lambda x: numbers.normal(size=x.shape), shapes)
+        moments = {"mu": jax.tree.map(np.ones_like, params), "count": np.int32(7)}
+        x = numbers.uniform(-1, 1, (3, 20))
+
+        @jax.jit
+        def products(step):
+            state = TrainState(step, params, TensorfBuffers(np.int32(3)), moments, None)
+            after = grown.adapt(None, state)
+            seen = [
+                factor_products(s.params["color"], s.buffers.vertices, x) for s in (state, after)
+            ]
+            return after, *seen
+
+        for step in (3, 4):
+            after, before, now = products(np.int32(step))
+            np.testing.assert_allclose(now, before, atol=1e-12)
+            assert after.buffers.vertices == (5 if step == 4 else 3)
+            assert np.all(after.opt_state["mu"]["color"]["lines"] == (0 if step == 4 else 1))
+            assert after.opt_state["count"] == 7

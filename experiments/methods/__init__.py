@@ -1,6 +1,16 @@
 """The methods: one module each, and the table of them, written by hand."""
 
-from experiments.methods import dsnerf, gaussians, mip_gaussians, nerf, ngp, surfels
+from experiments.methods import (
+    dsnerf,
+    gaussians,
+    mip_gaussians,
+    mipnerf,
+    nerf,
+    ngp,
+    surfels,
+    tensorf,
+    zipnerf,
+)
 from experiments.methods.method import (
     CoarseConfig,
     LabelConfig,
@@ -14,7 +24,10 @@ from experiments.methods.method import (
 METHODS: dict[str, Method] = {
     "nerf": nerf.METHOD,
     "dsnerf": dsnerf.METHOD,
+    "mipnerf": mipnerf.METHOD,
     "ngp": ngp.METHOD,
+    "tensorf": tensorf.METHOD,
+    "zipnerf": zipnerf.METHOD,
     "surfels": surfels.METHOD,
     "gaussians": gaussians.METHOD,
     "mip_gaussians": mip_gaussians.METHOD,

@@ -13,5 +13,5 @@ def supervised(preset: Preset) -> Preset:
 
 
 METHOD = nerf.METHOD._replace(
-    presets={"quick": supervised(nerf.QUICK), "paper": supervised(nerf.PAPER)}
+    presets={"quick": supervised(nerf.QUICK), "paper": supervised(nerf.PAPER)},
 )

@@ -5,7 +5,7 @@ import dataclasses
 import optax
 
 from experiments.methods.method import LabelConfig, Method, Preset, WindowConfig
-from experiments.methods.volumes import DepthConfig, depth_supervision, unit_cube
+from experiments.methods.volumes import QUICK_LABELS, DepthConfig, depth_supervision, unit_cube
 from jaxcloseup.field import RadianceField
 from jaxcloseup.scene import Scene
 from jaxcloseup.train import TrainConfig
@@ -53,8 +53,6 @@ RELEASED = dataclasses.replace(
     ),
 )
 
-# A short training leaves depth errors of several per cent, under which the paper's labels are worse
-# than the model: only labels that the other views confirm closely are kept, at a pixel's weight.
 QUICK = Preset(
     method="nerf",
     field=NerfTrainingConfig(
@@ -69,9 +67,7 @@ QUICK = Preset(
         normalize=True,
     ),
     train=TrainConfig(num_rays=512, num_label_rays=512, label_rule="pooled"),
-    labels=LabelConfig(
-        rgb_tolerance=0.04, depth_tolerance=0.02, leave_out_source=True, source_tolerance=0.05
-    ),
+    labels=QUICK_LABELS,
     baseline_steps=1000,
     closeup_steps=200,
     downscale=8,

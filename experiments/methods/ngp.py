@@ -3,15 +3,7 @@
 import dataclasses
 
 from experiments.methods.method import LabelConfig, Method, Preset, WindowConfig
-from experiments.methods.volumes import (
-    AdamConfig,
-    DepthConfig,
-    adam,
-    depth_supervision,
-    unit_cube,
-)
-from jaxcloseup.field import RadianceField
-from jaxcloseup.scene import Scene
+from experiments.methods.volumes import QUICK_LABELS, AdamConfig, DepthConfig, adam, maker
 from jaxcloseup.train import TrainConfig
 from jaxcloseup.volume.hash_grid import HashGridConfig
 from jaxcloseup.volume.ngp import NgpConfig, ngp
@@ -43,16 +35,13 @@ QUICK = Preset(
         num_middle=0,
         num_fine=16,
         spacing=0.0,
-        contracted=True,
         distortion_weight=1e-3,
         initial_lr=1e-2,
         lr_decay_steps=2700,
         chunk=2048,
     ),
     train=TrainConfig(num_rays=1024, num_label_rays=1024, label_rule="pooled"),
-    labels=LabelConfig(
-        rgb_tolerance=0.04, depth_tolerance=0.02, leave_out_source=True, source_tolerance=0.05
-    ),
+    labels=QUICK_LABELS,
     baseline_steps=2500,
     closeup_steps=200,
     downscale=8,
@@ -60,23 +49,9 @@ QUICK = Preset(
 )
 
 
-def make_field(config: NgpTrainingConfig, scene: Scene, growth: int) -> RadianceField:
-    """Instant-NGP between the scene's near and far; nothing overflows."""
-    del growth
-    center, scale = unit_cube(scene)
-    return ngp(
-        config,
-        near=scene.near,
-        far=scene.far,
-        center=center,
-        scale=scale,
-        supervision=depth_supervision(config, scene),
-    )
-
-
 METHOD = Method(
     presets={"quick": QUICK, "paper": PAPER},
-    make_field=make_field,
+    make_field=maker(ngp),
     make_optimizer=adam,
     renders_pixels=True,
     target_steps=lambda config, count: config.target_steps,

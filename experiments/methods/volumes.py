@@ -1,11 +1,15 @@
 """What the volumetric methods share: Adam, and coordinates in which a scene has about unit size."""
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import optax
 
+from experiments.methods.method import LabelConfig
 from experiments.methods.sightings import find_sightings
+from jaxcloseup.field import RadianceField
 from jaxcloseup.scene import Scene
 from jaxcloseup.volume.depth_supervision import DepthSupervision
 
@@ -51,11 +55,40 @@ def depth_supervision(config: DepthConfig, scene: Scene) -> DepthSupervision | N
     return DepthSupervision(find_sightings(scene), config.depth_weight, config.depth_share)
 
 
+def maker(field: Callable[..., RadianceField]) -> Callable[[Any, Scene, int], RadianceField]:
+    """`Method.make_field` of a field of the library, between a scene's near and far.
+
+    Args:
+      field: `(config, near=, far=, center=, scale=, supervision=) -> RadianceField`.
+    """
+
+    def make_field(config: Any, scene: Scene, growth: int) -> RadianceField:
+        del growth  # nothing overflows
+        center, scale = unit_cube(scene)
+        return field(
+            config,
+            near=scene.near,
+            far=scene.far,
+            center=center,
+            scale=scale,
+            supervision=depth_supervision(config, scene),
+        )
+
+    return make_field
+
+
 def adam(config: AdamConfig, scene: Scene) -> optax.GradientTransformation:
     """Adam as for hash grids (Instant-NGP, section 4): entries with tiny gradients move too."""
     del scene
     rate = optax.exponential_decay(config.initial_lr, config.lr_decay_steps, config.lr_decay)
     return optax.adam(rate, b1=0.9, b2=0.99, eps=1e-15)
+
+
+# A short training leaves depth errors of several per cent, under which the paper's labels are worse
+# than the model: only labels that the other views confirm closely are kept, at a pixel's weight.
+QUICK_LABELS = LabelConfig(
+    rgb_tolerance=0.04, depth_tolerance=0.02, leave_out_source=True, source_tolerance=0.05
+)
 
 
 def unit_cube(scene: Scene) -> tuple[tuple[float, float, float], float]:

@@ -65,7 +65,8 @@ def interval_field(
     *,
     init: Callable[[jax.Array, jax.Array, jax.Array], tuple[Any, Any]],
     rounds: Sequence[Round],
-    penalty: Callable[[Any, Sequence[Histogram]], jax.Array] | None = None,
+    penalty: Callable[[Any, Any, Sequence[Histogram]], jax.Array] | None = None,
+    blur: Callable[[jax.Array], jax.Array] = lambda weights: weights,
     center: tuple[float, float, float] = (0.0, 0.0, 0.0),
     scale: float = 1.0,
     loss: Callable[..., tuple[jax.Array, dict[str, jax.Array]]] | None = None,
@@ -77,8 +78,9 @@ def interval_field(
       config: depths, spacing and chunking.
       init: `(key, points [P, 3], rgb [P, 3]) -> (params, buffers)`.
       rounds: first to last.
-      penalty: `(params, histograms) -> [R]`, added to the loss of each ray; gets one histogram a
-        round.
+      penalty: `(params, buffers, histograms) -> [R]`, added to the loss of each ray; gets one
+        histogram a round.
+      blur: `[R, S] -> [R, S]`, what weights become before the next round is drawn from them.
       center: world position that becomes the origin of the field's coordinates.
       scale: field units per world unit.
       loss: `photometric_loss` by default.
@@ -99,7 +101,8 @@ def interval_field(
             if not histograms:
                 edges = interval_quantiles(keys[0], count, rays.length.shape)
             else:
-                edges = resample(keys[2 * i], *histograms[-1], count)
+                before = histograms[-1]
+                edges = resample(keys[2 * i], before.edges, blur(before.weights), count)
             depth = unspaced(edges, *span, spacing=config.spacing) / scale
             samples = query(params, buffers, keys[2 * i + 1], rays, depth)
             light = composite_intervals(samples.rgb, samples.density, depth, rays.length)
@@ -108,7 +111,7 @@ def interval_field(
                 seen.append(light.over(config.background))
                 colored.append((depth, light.weights))
         fine, coarse_rgb = seen[-1], seen[0].rgb if len(seen) > 1 else None
-        more = None if penalty is None else penalty(params, histograms)
+        more = None if penalty is None else penalty(params, buffers, histograms)
         aux = VolumeAux(coarse_rgb, fine.median_depth, fine.expected_depth, more)
         return Traced(Rendering(fine.rgb, fine.depth, fine.alpha, aux), colored)
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxcloseup.field import RadianceField
 from jaxcloseup.volume.depth_supervision import DepthSupervision
 from jaxcloseup.volume.encodings import positional_encoding
-from jaxcloseup.volume.networks import apply_network, init_network
+from jaxcloseup.volume.networks import apply_network, init_network, rays_in_cache
 from jaxcloseup.volume.renderer import Samples, VolumeConfig, volume_field
 
 
@@ -47,15 +47,8 @@ class NerfConfig:
 
     @property
     def rays_at_once(self) -> int:
-        """Rays to render, or to differentiate, at once, so that one layer's activations are small.
-
-        Small is 2 MB on a CPU, the size of a core's cache, and 512 MB elsewhere. A whole image
-        needs about 4 times as much memory, a training step `2 depth + 4` times.
-        """
-        if self.chunk is not None:
-            return self.chunk
-        activations = 2**19 if jax.default_backend() == "cpu" else 2**27
-        return max(1, activations // ((self.num_coarse + self.num_fine) * self.width))
+        """Rays to render, or to differentiate, at once."""
+        return self.chunk or rays_in_cache(self.num_coarse + self.num_fine, self.width)
 
 
 def nerf(

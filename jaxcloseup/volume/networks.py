@@ -15,6 +15,7 @@ from jax.experimental.layout import Layout, with_layout_constraint
 
 
 Params = Any
+_LARGEST_LOG_DENSITY = 15.0
 
 
 class Raw(NamedTuple):
@@ -22,6 +23,20 @@ class Raw(NamedTuple):
 
     density: jax.Array
     rgb: jax.Array
+
+
+def rays_in_cache(samples: int, width: int) -> int:
+    """Rays to render, or to differentiate, at once, so that one layer's activations are small.
+
+    Small is 2 MB on a CPU, the size of a core's cache, and 512 MB elsewhere. A whole image needs
+    about 4 times as much memory, a training step `2 depth + 4` times.
+
+    Args:
+      samples: samples per ray.
+      width: features of each.
+    """
+    activations = 2**19 if jax.default_backend() == "cpu" else 2**27
+    return max(1, activations // (samples * width))
 
 
 def init_network(
@@ -114,6 +129,11 @@ def apply_mlp(layers: Params, x: jax.Array, of_rays: jax.Array | None = None) ->
             bias = dense(weights[1:], bias, (of_rays,), False)
         x = dense(weights[:1], bias, (x,), i + 1 < len(layers))
     return x
+
+
+def exponential_density(raw: jax.Array) -> jax.Array:
+    """Densities of any shape, `exp(raw)`, finite for all raw values (Instant-NGP, section 5.4)."""
+    return jnp.exp(jnp.minimum(raw, _LARGEST_LOG_DENSITY))
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(3,))

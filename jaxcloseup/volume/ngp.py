@@ -17,14 +17,13 @@ from jaxcloseup.volume.depth_supervision import DepthSupervision
 from jaxcloseup.volume.encodings import positional_encoding
 from jaxcloseup.volume.hash_grid import HashGridConfig, hash_features, init_hash_grid
 from jaxcloseup.volume.intervals import IntervalConfig, Round, interval_field
-from jaxcloseup.volume.networks import apply_mlp, init_mlp
+from jaxcloseup.volume.networks import apply_mlp, exponential_density, init_mlp
 from jaxcloseup.volume.rays import Rays
 from jaxcloseup.volume.regularizers import distortion, proposal_penalty
 from jaxcloseup.volume.renderer import Samples
 
 
 _GEOMETRY = 16  # outputs of the density network; the first is the logarithm of density
-_LARGEST_LOG_DENSITY = 15.0
 _FINE = HashGridConfig()
 _PROPOSAL = HashGridConfig(levels=5, log2_entries=17, finest=256)
 
@@ -113,8 +112,7 @@ def ngp(
         return apply_mlp(part["density"], features.reshape(grid.size, -1))
 
     def density(raw: jax.Array, edges: jax.Array) -> jax.Array:
-        per_field_unit = jnp.exp(jnp.minimum(raw[0], _LARGEST_LOG_DENSITY))
-        return scale * per_field_unit.reshape(edges.shape[0], -1)
+        return scale * exponential_density(raw[0]).reshape(edges.shape[0], -1)
 
     def propose(params, buffers, key, rays, edges) -> Samples:
         del buffers, key
@@ -130,8 +128,8 @@ def ngp(
         shape = edges.shape[0], edges.shape[1] - 1
         return Samples(density(raw, edges), jnp.moveaxis(rgb.reshape(3, *shape), 0, -1))
 
-    def penalty(params, histograms):
-        del params
+    def penalty(params, buffers, histograms):
+        del params, buffers
         *proposals, last = histograms
         total = sum(proposal_penalty(*last, *proposed) for proposed in proposals)
         if config.distortion_weight:

@@ -46,3 +46,46 @@ def distortion(edges: jax.Array, weights: jax.Array) -> jax.Array:
     apart = jnp.abs(middles[..., :, None] - middles[..., None, :])
     between = jnp.sum(weights * jnp.sum(weights[..., None, :] * apart, axis=-1), axis=-1)
     return between + jnp.sum(weights**2 * jnp.diff(edges, axis=-1), axis=-1) / 3
+
+
+def antialiased_proposal_penalty(
+    edges: jax.Array,
+    weights: jax.Array,
+    proposed_edges: jax.Array,
+    proposed: jax.Array,
+    pulse: float,
+) -> jax.Array:
+    """How much light the blurred last round has where a proposal says there is less (Zip-NeRF, 10).
+
+    Unlike `proposal_penalty` it is smooth in the edges: the last round's density of light is
+    blurred by a rectangular pulse, and integrated over each of the proposal's intervals. Teaches
+    the proposal alone.
+
+    Args:
+      edges: `[..., S + 1]` of the last round.
+      weights: `[..., S]` of the last round.
+      proposed_edges: `[..., P + 1]` of the proposal.
+      proposed: `[..., P]` weights of the proposal.
+      pulse: half of the pulse's width, positive.
+
+    Returns:
+      `[...]`.
+    """
+    edges, weights = jax.lax.stop_gradient((edges, weights))
+    ahead = proposed_edges[..., None] - edges[..., None, :]  # [..., P + 1, S + 1]
+
+    def share(u):  # of a blurred point at 0, that lies below u
+        return jnp.clip((u + pulse) / (2 * pulse), 0, 1)
+
+    def integral(u):
+        return jnp.maximum(u - pulse, 0) + pulse * share(u) ** 2
+
+    # An interval's light below a proposed edge is the mean of `share` over it; where it is narrow,
+    # a difference of integrals would cancel.
+    widths = jnp.diff(edges, axis=-1)[..., None, :]
+    narrow = widths < 1e-2 * pulse
+    exact = (integral(ahead[..., :-1]) - integral(ahead[..., 1:])) / jnp.where(narrow, 1, widths)
+    below = jnp.where(narrow, share(0.5 * (ahead[..., :-1] + ahead[..., 1:])), exact)
+    blurred = jnp.diff(jnp.sum(weights[..., None, :] * below, axis=-1), axis=-1)
+    excess = jnp.maximum(blurred - proposed, 0)
+    return jnp.sum(excess**2 / (proposed + 1e-5), axis=-1)

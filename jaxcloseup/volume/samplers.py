@@ -91,6 +91,17 @@ def resample(
     return _invert(edges, cdf, pdf, interval_quantiles(key, num_intervals, weights.shape[:-1]))
 
 
+def widen(weights: jax.Array) -> jax.Array:
+    """Weights `[..., S]` that reach into the intervals beside them (mip-NeRF, section 3.1).
+
+    The mean of the maxima over each interval and its left, and its right neighbor, plus 0.01.
+    """
+    ends = ((0, 0),) * (weights.ndim - 1)
+    padded = jnp.pad(weights, (*ends, (1, 1)), mode="edge")
+    larger = jnp.maximum(padded[..., :-1], padded[..., 1:])
+    return 0.5 * (larger[..., :-1] + larger[..., 1:]) + 0.01
+
+
 def _cdf(edges, weights):
     """Edges, and where the CDF of the raised weights begins and what it gains in each bin."""
     chex.assert_equal_shape_prefix([edges, weights], weights.ndim - 1)

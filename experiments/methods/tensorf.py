@@ -1,0 +1,62 @@
+"""TensoRF: presets and field."""
+
+import dataclasses
+
+from experiments.methods.method import LabelConfig, Method, Preset, WindowConfig
+from experiments.methods.volumes import QUICK_LABELS, AdamConfig, DepthConfig, adam, maker
+from jaxcloseup.train import TrainConfig
+from jaxcloseup.volume.tensorf import TensorfConfig, tensorf
+
+
+@dataclasses.dataclass(frozen=True)
+class TensorfTrainingConfig(TensorfConfig, DepthConfig, AdamConfig):
+    """A TensoRF and its training."""
+
+    initial_lr: float = 2e-2
+
+
+PAPER = Preset(
+    method="tensorf",
+    field=TensorfTrainingConfig(lr_decay_steps=30_000),
+    train=TrainConfig(num_rays=4096, num_label_rays=4096),
+    labels=LabelConfig(),
+    baseline_steps=30_000,
+    closeup_steps=500,
+)
+
+QUICK = Preset(
+    method="tensorf",
+    field=TensorfTrainingConfig(
+        coarsest=32,
+        finest=128,
+        growths=3,
+        grow_every=300,
+        density_components=4,
+        color_components=8,
+        appearance=16,
+        width=32,
+        density_shift=-2.0,
+        sparsity_weight=1e-3,
+        smoothness_weight=0.05,
+        num_coarse=48,
+        num_fine=20,
+        spacing=0.0,
+        initial_lr=1e-2,
+        lr_decay_steps=2200,
+        chunk=1024,
+    ),
+    train=TrainConfig(num_rays=512, num_label_rays=512, label_rule="pooled"),
+    labels=QUICK_LABELS,
+    baseline_steps=2000,
+    closeup_steps=200,
+    downscale=8,
+    windows=WindowConfig(),
+)
+
+METHOD = Method(
+    presets={"quick": QUICK, "paper": PAPER},
+    make_field=maker(tensorf),
+    make_optimizer=adam,
+    renders_pixels=True,
+    target_steps=lambda config, count: config.target_steps,
+)

@@ -1,0 +1,59 @@
+"""Zip-NeRF: presets and field."""
+
+import dataclasses
+
+from experiments.methods.method import LabelConfig, Method, Preset, WindowConfig
+from experiments.methods.volumes import QUICK_LABELS, AdamConfig, DepthConfig, adam, maker
+from jaxcloseup.train import TrainConfig
+from jaxcloseup.volume.hash_grid import HashGridConfig
+from jaxcloseup.volume.zipnerf import ZipNerfConfig, zipnerf
+
+
+@dataclasses.dataclass(frozen=True)
+class ZipNerfTrainingConfig(ZipNerfConfig, DepthConfig, AdamConfig):
+    """A Zip-NeRF and its training."""
+
+
+PAPER = Preset(
+    method="zipnerf",
+    field=ZipNerfTrainingConfig(lr_decay_steps=25_000),
+    train=TrainConfig(num_rays=2**14, num_label_rays=2**14),
+    labels=LabelConfig(),
+    baseline_steps=25_000,
+    closeup_steps=500,
+)
+
+QUICK = Preset(
+    method="zipnerf",
+    field=ZipNerfTrainingConfig(
+        grid=HashGridConfig(levels=6, features=2, log2_entries=17, coarsest=16, finest=1024),
+        proposal=HashGridConfig(levels=3, features=2, log2_entries=14, coarsest=8, finest=64),
+        width=32,
+        color_layers=1,
+        direction_octaves=2,
+        num_coarse=24,
+        num_middle=0,
+        num_fine=16,
+        spacing=0.0,
+        contracted=False,
+        proposal_weight=1.0,
+        distortion_weight=1e-3,
+        decay_weight=1e-2,
+        lr_decay_steps=2200,
+        chunk=1024,
+    ),
+    train=TrainConfig(num_rays=512, num_label_rays=512, label_rule="pooled"),
+    labels=QUICK_LABELS,
+    baseline_steps=2000,
+    closeup_steps=200,
+    downscale=8,
+    windows=WindowConfig(),
+)
+
+METHOD = Method(
+    presets={"quick": QUICK, "paper": PAPER},
+    make_field=maker(zipnerf),
+    make_optimizer=adam,
+    renders_pixels=True,
+    target_steps=lambda config, count: config.target_steps,
+)
