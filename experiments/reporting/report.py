@@ -29,7 +29,8 @@ _STAGES = (
     "<p class=quiet><i>closeup</i> learns pseudo-labels of random close-ups, and <i>test_time</i> "
     "those of the very close-ups that are scored. <i>control</i> and <i>test_time_control</i> take "
     "as many steps without, so compare with these. <i>detail</i> adds to the renders of a stage, "
-    "without training, what the photographs show beyond it. Higher PSNR and SSIM are better, and lower LPIPS.</p>"
+    "without training, what the photographs show beyond it. Higher PSNR and SSIM are better, and "
+    "lower LPIPS.</p>"
 )
 
 

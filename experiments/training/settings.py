@@ -28,13 +28,16 @@ BOUNDS = {
     "depth": (1, 64),  # layers
     "tile": (1, 64),
     "spacing": (-100, 1),
+    "density_shift": (-1e6, 1e6),
     "log2_entries": (1, 28),
     "color_layers": (0, 64),
     **dict.fromkeys(("levels", "features"), (1, 64)),
-    **dict.fromkeys(("position_octaves", "direction_octaves"), (0, 64)),
+    **dict.fromkeys(("position_octaves", "direction_octaves", "octaves"), (0, 64)),
     **dict.fromkeys(("baseline_steps", "closeup_steps", "target_steps", "steps"), (1, _MOST)),
     **dict.fromkeys(("steps_per_target", "fewest_target_steps", "means_lr_steps"), (1, _MOST)),
-    **dict.fromkeys(("lr_decay_steps", "every", "sh_every", "reset_every"), (1, _MOST)),
+    **dict.fromkeys(
+        ("lr_decay_steps", "every", "sh_every", "reset_every", "grow_every"), (1, _MOST)
+    ),
     **dict.fromkeys(("downscale", "score_downscale", "finest", "num_sources"), (1, _MOST)),
     "smoothed_at": (1, _MOST),
     **dict.fromkeys(("num_rays", "num_label_rays", "num_windows"), (1, _MOST)),
@@ -42,6 +45,7 @@ BOUNDS = {
         ("width", "direction_width", "proposal_width", "num_coarse", "num_fine", "coarsest"),
         (1, _MOST),
     ),
+    **dict.fromkeys(("density_components", "color_components", "appearance"), (1, _MOST)),
     **dict.fromkeys(("chunk", "block"), (1, _MOST)),
     **dict.fromkeys(
         ("label_loss_weight", "ssim_weight", "whole_share", "background", "depth_share"), (0, 1)

@@ -85,7 +85,7 @@ class TensorfConfig:
     def sizes(self) -> tuple[int, ...]:
         """Vertices along each side after 0, 1, ... growths: even steps of their logarithm."""
         steps = np.linspace(math.log(self.coarsest), math.log(self.finest), self.growths + 1)
-        return tuple(round(size) for size in np.exp(steps).tolist())
+        return tuple(max(2, round(size)) for size in np.exp(steps).tolist())
 
 
 def tensorf(
