@@ -82,6 +82,7 @@ def load_scene(
         files, sizes: by split, the path and the unpadded (width, height) of each photograph;
         applied_transform, applied_scale: `[3, 4]` or None, and a number, from the capture's
           original world to this one;
+        up: `[3]` direction that points up in the world, or None where the files do not say;
         notes: sentences on what was read and how it was split;
         times_nearer: for `closest` and `zoom`, how many times nearer (or finer) each `test` view is
           than the median training photograph;

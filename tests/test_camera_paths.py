@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import plane
 import pytest
+from tiny_capture import single_file
 
 from experiments.training.manifest import write_dataparser_transforms
 from experiments.viewing import camera_paths
@@ -19,6 +20,7 @@ from experiments.viewing.camera_paths import (
     focus_point,
     read_camera_path,
 )
+from experiments.viewing.orientation import up_direction
 from jaxcloseup.geometry.cameras import Camera, pixels_to_points, points_to_pixels
 from jaxcloseup.photographs import camera_at
 from jaxcloseup.scenes import SceneError, load_scene
@@ -301,3 +303,69 @@ def test_resizing_keeps_the_view():
         after, _ = points_to_pixels(larger, points)
         np.testing.assert_allclose(after, before * (width / 32), atol=1e-3)
     assert camera_paths.resized(camera, None, None) is camera
+
+
+def tilted(scene, rng, *, yaws, pitch, roll):
+    """Photographs by a person: any yaw and pitch, hardly any roll; and which way is up, at random.
+
+    Angles in degrees; `pitch` and `roll` are ranges. Returns the scene and up.
+    """
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turn *= np.linalg.det(turn)
+    poses = []
+    for yaw in np.radians(yaws):
+        look, level = (np.radians(rng.uniform(*limits)) for limits in (pitch, roll))
+        flat = np.array([np.cos(yaw), np.sin(yaw), 0])
+        forward = np.cos(look) * flat + np.sin(look) * np.array([0, 0, 1.0])
+        pose = camera_paths.look_at(-3 * forward, np.zeros(3), np.array([0, 0, 1.0]))
+        c, s = np.cos(level), np.sin(level)
+        pose[:, :3] = pose[:, :3] @ [[c, -s, 0], [s, c, 0], [0, 0, 1]]
+        poses.append(turn @ pose)
+    count = len(poses)
+    lens = jnp.tile(jnp.array([40.0, 40, 16, 12]), (count, 1))
+    cameras = Camera(jnp.asarray(np.array(poses), jnp.float32), lens, 24, 32)
+    return dataclasses.replace(scene, train=scene.train.replace(cameras=cameras)), turn[:, 2]
+
+
+@pytest.mark.parametrize(
+    ("yaws", "pitch", "roll", "most"),
+    [
+        (np.arange(0, 360, 15), (-60, -10), (0, 0), 0.2),
+        (np.arange(0, 120, 8), (-50, -40), (0, 0), 0.5),  # from one side: their mean up leans
+        (np.arange(0, 120, 8), (-50, -40), (-2, 2), 3),
+        (np.arange(0, 360, 15), (-80, 30), (-5, 5), 3),
+        ([40], (-5, -5), (0, 0), 6),  # one photograph: its own up
+    ],
+)
+def test_up_is_where_cameras_are_level(capture_folder, yaws, pitch, roll, most):
+    scene, rng = load_scene(str(capture_folder)), np.random.default_rng(0)
+    for _ in range(5):
+        taken, up = tilted(scene, rng, yaws=yaws, pitch=pitch, roll=roll)
+        found = up_direction(taken)
+        assert np.degrees(np.arccos(np.clip(found @ up, -1, 1))) < most
+        heights = np.asarray(camera_paths.orbit(taken, 8).cameras.position) @ found
+        np.testing.assert_allclose(heights, heights[0], atol=1e-4)
+
+
+def test_up_is_what_the_capture_says(tmp_path, capture_folder):
+    scene = load_scene(str(capture_folder))
+    said = dataclasses.replace(scene, metadata={**scene.metadata, "up": (0.0, 1.0, 0.0)})
+    np.testing.assert_array_equal(up_direction(said), [0, 1, 0])
+    assert scene.metadata["up"] is None
+    for fields in ({"orientation_override": "none"}, {"camera_angle_x": 0.8}):
+        single_file(tmp_path, 2, **fields)
+        np.testing.assert_array_equal(load_scene(tmp_path).metadata["up"], [0, 0, 1])
+    single_file(tmp_path, 2, orientation_override="up")
+    assert load_scene(tmp_path).metadata["up"] is None
+
+
+def test_nearly_an_axis_is_that_axis(capture_folder):
+    scene = dataclasses.replace(load_scene(str(capture_folder)))
+    cameras = ring(np.zeros(3), 3.0, 2.0)
+    for degrees, snaps in ((2, True), (6, False)):
+        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+        turn = jnp.asarray([[1, 0, 0], [0, c, -s], [0, s, c]], jnp.float32)
+        turned = cameras.replace(camtoworld=turn @ cameras.camtoworld)
+        up = up_direction(dataclasses.replace(scene, train=scene.train.replace(cameras=turned)))
+        expected = [0, 0, 1] if snaps else [0, -s, c]
+        np.testing.assert_allclose(up, expected, atol=1e-3)

@@ -156,6 +156,16 @@ def test_a_pipe_in_a_checkpoint_is_refused(tmp_path):
         Checkpoints(tmp_path, {}).load("baseline", {"a": jnp.zeros(3)})
 
 
+def test_a_checkpoint_of_the_far_future_is_refused(tmp_path):
+    """Orbax reads the times of all checkpoints before any is loaded."""
+    Checkpoints(tmp_path, {}).save("baseline", 1, {"a": jnp.zeros(3)}, {})
+    path = tmp_path / "baseline" / "1" / "_CHECKPOINT_METADATA"
+    fields = json.loads(path.read_text())
+    path.write_text(json.dumps(fields | {"commit_timestamp_nsecs": 10**22}))
+    with pytest.raises(CheckpointError, match="holds a checkpoint whose records are damaged"):
+        Checkpoints(tmp_path, {}).load("baseline", {"a": jnp.zeros(3)})
+
+
 def test_a_checkpoint_without_a_checksum_loads(tmp_path):
     Checkpoints(tmp_path, RUN).save("baseline", 2, state(2), {"growth": 1})
     file = tmp_path / "baseline" / "2" / "progress" / "metadata"

@@ -88,6 +88,18 @@ def test_a_camera_path_may_be_fine_tuned_for(render, tmp_path, capsys):
     assert (out.with_name("plain") / "rgb" / "0000.png").read_bytes() != tuned
 
 
+def test_a_path_that_sees_nothing_says_so(render, tmp_path, capsys):
+    entry = json.loads(path_file(tmp_path).read_text())["camera_path"][0]
+    below = dict(entry, camera_to_world=list(entry["camera_to_world"]))
+    below["camera_to_world"][11] = -5.0  # it looks down, and the plane is above it
+    file = path_file(tmp_path, camera_path=[below])
+    render(camera_path=str(file), support=False)
+    assert "\nall frames show nothing of the scene: " in capsys.readouterr().out
+    file = path_file(tmp_path, camera_path=[entry, below])
+    render(camera_path=str(file), support=False, output_dir=str(tmp_path / "two"))
+    assert "\n1 of 2 frames show nothing of the scene: " in capsys.readouterr().out
+
+
 def test_nothing_is_fine_tuned_where_the_gate_lets_no_labels_in(capture_folder, monkeypatch):
     monkeypatch.setattr(fine_tuning, "weigh", lambda *_: {"weight": 0.0})
     programs = Programs(dataclasses.replace(KEPT, gated=True), load_scene(str(capture_folder)))

@@ -33,6 +33,13 @@ const pixels = shown.map(image => {
 return pixels.length == 2 && pixels[0] != arguments[0] ? pixels : null;
 """
 
+# Whether the picture is seen without scrolling.
+IN_VIEW = """
+const [picture] = [...document.images].filter(image => image.naturalWidth > 300);
+const box = picture.getBoundingClientRect();
+return box.top >= 0 && box.bottom <= innerHeight;
+"""
+
 
 @pytest.fixture
 def viser():
@@ -60,8 +67,12 @@ def serve(viser):
 
 
 def test_a_closeup_is_chosen_and_rendered_in_a_browser(serve, kept, monkeypatch):
-    def darker(programs, start, cameras, *, most, kept):
+    told = []
+
+    def darker(programs, start, cameras, *, most, kept, tell):
         state = start.state
+        tell(3, 10)
+        told.append(page._status.content)
         assert start.sources.depths.shape == programs.scene.train.weight.shape
         assert cameras.intrinsics.shape == (1, 4)
         return state.replace(params=state.params.replace(sh=state.params.sh - 1))
@@ -85,6 +96,9 @@ def test_a_closeup_is_chosen_and_rendered_in_a_browser(serve, kept, monkeypatch)
             said = "Fine-tuned and rendered (" if "tune" in button else "Rendered ("
             browser.wait(HAS, said)
             pictures.append(browser.wait(PICTURES, pictures[-1][0]))
+        browser.call("POST", "/window/rect", {"width": 900, "height": 700})
+        browser.wait(IN_VIEW)
+    assert told == ["fine-tuning for this camera: 3 of 10 steps ..."]
     _, rendered, tuned, again = pictures
     assert tuned[1] == rendered[1]  # darker, but with the same support
     assert again == rendered  # every fine-tuning starts from the same state, which does not change

@@ -2,12 +2,13 @@
 
 import functools
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from experiments import progress
 from experiments.training.gate import gated, weigh
 from experiments.training.loop import TrainingError
 from experiments.training.programs import Programs
@@ -22,6 +23,7 @@ from jaxcloseup.windows import Windows, photograph_windows, windows_that_see
 
 _FINER = 2  # times the photographs' training size, at which labels with detail are learned too
 _WHOLE_SHARE = 0.4  # of their steps that see whole views, not windows of finer ones
+_REPORTS = 10
 
 
 class TargetData(NamedTuple):
@@ -86,6 +88,7 @@ def fine_tune(
     *,
     most: int | None,
     kept: pathlib.Path | None = None,
+    tell: Callable[[int, int], None] = lambda done, steps: None,
 ) -> TrainState:
     """Train a state for target views, with labels made once for them.
 
@@ -98,6 +101,7 @@ def fine_tune(
       cameras: stacked `[Q]`, of the target views.
       most: the largest number of steps in all; by default the method's.
       kept: file with the detail of the state, see `find_detail`.
+      tell: is told ten times how many steps are done, and how many there are.
 
     Raises:
       TrainingError: no step was finite.
@@ -113,8 +117,16 @@ def fine_tune(
     if coverage == 0:
         print("nothing is fine-tuned")
         return state
-    state, values = programs.run("target_views", state, *data[:3], count=steps)
-    if values["skipped"] == steps:
+    done = skipped = 0
+    with progress.part("fine-tuning"):
+        progress.count("fine-tuning", done, steps)
+        while done < steps:
+            tell(done, steps)
+            count = min(-(-steps // _REPORTS), steps - done)
+            state, values = programs.run("target_views", state, *data[:3], count=count)
+            done, skipped = done + count, skipped + values["skipped"]
+            progress.count("fine-tuning", done, steps)
+    if skipped == steps:
         raise TrainingError(f"loss or gradient was not finite in each of {steps} steps for them")
     numbers = {key: value for key, value in values.items() if isinstance(value, float)}
     print("  ".join(f"{key} {value:.4g}" for key, value in numbers.items()))

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.viewing.orientation import up_direction
 from jaxcloseup.captures.json_fields import number, read_object, rigid_transform
 from jaxcloseup.geometry.cameras import Camera, pixels_to_points
 from jaxcloseup.geometry.poses import closeup_position
@@ -157,13 +158,13 @@ def orbit(scene: Scene, frames: int, *, up: Sequence[float] | None = None) -> Sh
     Args:
       scene: the scene with the training cameras.
       frames: number of cameras.
-      up: `[3]` up direction in the world; default: the mean of the training cameras' up directions.
+      up: `[3]` up direction in the world; default: `up_direction` of the scene.
     """
     cameras = scene.train.cameras
     positions, rotations = (np.asarray(a, np.float64) for a in (cameras.position, cameras.rotation))
     forward = rotations[..., 2]
     center = focus_point(positions, forward, near=scene.near, far=scene.far)
-    up = _unit(-rotations[..., 1].mean(axis=0) if up is None else np.asarray(up, np.float64))
+    up = up_direction(scene) if up is None else _unit(np.asarray(up, np.float64))
     offset = positions - center
     height = np.median(offset @ up)
     flat = offset - (offset @ up)[:, None] * up

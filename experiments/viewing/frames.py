@@ -18,6 +18,7 @@ from jaxcloseup.artifacts.images import (
     write_png,
 )
 from jaxcloseup.detail import Detail
+from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.label_rules import label_depth
 from jaxcloseup.pseudo import LabelSources
@@ -26,6 +27,7 @@ from jaxcloseup.support import find_support
 from jaxcloseup.train import TrainState
 
 
+SOLID = 0.5  # opacity of a pixel that shows the scene
 _support = jax.jit(find_support)
 
 
@@ -56,13 +58,22 @@ def render_shots(
     limits = depth_range([label_depth(one, near=0, far=scene.far) for one in some], scene)
     sizes = shots.sizes or [(shots.cameras.width, shots.cameras.height)] * len(cameras)
     images: dict[str, Image] = {}
+    empty = 0
     shown = progress.track(zip(cameras, sizes, strict=True), "rendering frames", len(cameras))
     for (name, camera), (width, height) in shown:
-        images = render_pictures(
-            programs, state, camera, sources=sources, detail=detail, limits=limits
+        seen = programs.render(state, camera)
+        images = draw_pictures(
+            programs, seen, camera, sources=sources, detail=detail, limits=limits
         )
+        empty += not bool(np.any(np.asarray(seen.alpha)[:height, :width] >= SOLID))
         for kind, image in images.items():
             write_png(output_dir / kind / f"{name}.png", image[:height, :width])
+    if empty:
+        which = f"{empty} of {len(cameras)}" if empty < len(cameras) else "all"
+        print(
+            f"{which} frames show nothing of the scene: their cameras look past it, or the path is "
+            "in the coordinates of another program (see --camera_transform)"
+        )
     return [output_dir / kind for kind in images]
 
 
@@ -73,7 +84,6 @@ def render_pictures(
     *,
     sources: LabelSources | None,
     detail: Detail | None = None,
-    limits: tuple[float, float] | None = None,
 ) -> dict[str, Image]:
     """Render one camera's images by kind: `rgb`, `depth`, `normals`, `support` and `trust`.
 
@@ -86,13 +96,34 @@ def render_pictures(
       camera: camera of the images.
       sources: the training photographs with their depths, or None to leave out support.
       detail: of the state, or None to render the state alone.
+    """
+    seen = programs.render(state, camera)
+    return draw_pictures(programs, seen, camera, sources=sources, detail=detail)
+
+
+def draw_pictures(
+    programs: Programs,
+    seen: Rendering,
+    camera: Camera,
+    *,
+    sources: LabelSources | None,
+    detail: Detail | None = None,
+    limits: tuple[float, float] | None = None,
+) -> dict[str, Image]:
+    """The images of `render_pictures` from a rendering.
+
+    Args:
+      programs: the run's compiled programs.
+      seen: what they rendered with `camera`.
+      camera: camera of the images.
+      sources: as `render_pictures` takes it.
+      detail: likewise.
       limits: nearest and farthest depth of the color scale; default: `depth_range` of the image.
     """
     scene = programs.scene
-    seen = programs.render(state, camera)
     depth = label_depth(seen, near=0, far=scene.far)
     near, far = limits or depth_range([depth], scene)
-    solid = np.asarray(seen.alpha) >= 0.5
+    solid = np.asarray(seen.alpha) >= SOLID
     depth_colors = colorize_depth(seen.depth, near=near, far=far, valid=solid)
     images = {"rgb": seen.rgb, "depth": depth_colors}
     if seen.normal is not None:

@@ -19,6 +19,7 @@ from experiments.training.programs import Programs
 from experiments.training.setup import LabelStart, start_labels
 from experiments.viewing.camera_paths import focus_point
 from experiments.viewing.frames import render_pictures
+from experiments.viewing.orientation import up_direction
 from experiments.viewing.picking import (
     closeup_camera,
     rank_views,
@@ -89,7 +90,7 @@ class Viewer:
         gaps = np.linalg.norm(positions[:, None] - positions, axis=-1)
         gap = np.median(np.sort(gaps)[:, 1]) if len(gaps) > 1 else np.inf
         self._size = float(min(0.2 * gap, 0.04 * self._distance)) or 0.01 * self._distance
-        server.scene.set_up_direction(-rotations[..., 1].mean(axis=0))
+        server.scene.set_up_direction(up_direction(self._scene))
         self._add_scene()
         self._cameras = server.scene.add_frame("/cameras", show_axes=False)
         self._frustums = [self._add_photograph(i) for i in range(len(positions))]
@@ -167,7 +168,10 @@ class Viewer:
     def _add_controls(self):
         gui = self._server.gui
         gui.set_panel_label(f"{self._scene.name}, {self._stage}")
-        gui.add_markdown(_HELP)
+        # What is said and rendered comes first, so that nobody has to scroll to it.
+        black = np.zeros((1, 1, 3), np.uint8)
+        self._status = gui.add_markdown("")
+        self._image = gui.add_image(black, label="rendered", format="png", visible=False)
         self._nearer = gui.add_slider("times nearer", 1, 16, 0.5, 4)
         self._nearer.on_update(lambda event: self._place(event.client))
         self._sharpen = gui.add_checkbox("detail of the photographs", initial_value=True)
@@ -181,14 +185,15 @@ class Viewer:
         }
         for name, call in buttons.items():
             gui.add_button(name).on_click(call)
-        self._status = gui.add_markdown("")
-        black = np.zeros((1, 1, 3), np.uint8)
-        self._image = gui.add_image(black, label="rendered", format="png", visible=False)
         self._support = gui.add_image(black, label="support", format="png", visible=False)
+        gui.add_markdown(_HELP)
 
     def _say(self, sentence):
         self._status.content = sentence
         print(sentence, flush=True)
+
+    def _say_steps(self, done, steps):
+        self._status.content = f"fine-tuning for this camera: {done} of {steps} steps ..."
 
     def _later(self, what, job):
         try:
@@ -264,7 +269,9 @@ class Viewer:
         if tuned:
             cameras = jax.tree.map(lambda leaf: leaf[None], camera)
             kept = self._kept if start.state is self._state else None
-            state = fine_tune(self._programs, start, cameras, most=None, kept=kept)
+            state = fine_tune(
+                *(self._programs, start, cameras), most=None, kept=kept, tell=self._say_steps
+            )
         # A state tuned for one camera differs from the one whose detail is known.
         detail = self._find_detail() if self._sharpen.value and state is self._state else None
         images = render_pictures(

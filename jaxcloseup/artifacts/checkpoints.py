@@ -154,7 +154,13 @@ class Checkpoints:
                 enable_async_checkpointing=False,
                 multiprocessing_options=alone,
             )
-            self._managers[stage] = ocp.CheckpointManager(folder, options=options)
+            try:
+                self._managers[stage] = ocp.CheckpointManager(folder, options=options)
+            except (ValueError, KeyError, TypeError, OverflowError, OSError) as error:
+                raise CheckpointError(
+                    f"{folder} holds a checkpoint whose records are damaged ({reason(error)}): "
+                    "remove it to resume from an earlier one."
+                ) from error
         return self._managers[stage]
 
 

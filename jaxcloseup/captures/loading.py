@@ -24,6 +24,7 @@ from jaxcloseup.photographs import Views
 from jaxcloseup.scene import NearFarWarning, Scene, SceneError
 
 
+_UP = (0.0, 0.0, 1.0)
 _MIN_POINTS = 100  # fewer triangulated points say too little about where the scene is
 
 _log = logging.getLogger(__name__)
@@ -93,6 +94,7 @@ def _load(listing: Listing, reading: Reading) -> Scene:
         "sizes": {split: [photo.size for photo in part] for split, part in parts.items()},
         "applied_transform": transform,
         "applied_scale": scale,
+        "up": _UP if _is_oriented(listing) else None,
         "format": listing.format,
         "notes": listing.notes,
     }
@@ -118,6 +120,16 @@ def _load(listing: Listing, reading: Reading) -> Scene:
         # With a zoom, finer photographs would show the very crops that are held out.
         photographs_at=None if reading.zoom > 1 else functools.partial(_read_at, listing, reading),
     )
+
+
+def _is_oriented(listing: Listing) -> bool:
+    """Whether a capture says that z points up.
+
+    Blender's files give an angle of view. `orientation_override: none` tells nerfstudio to keep the
+    orientation, because a phone has measured it.
+    """
+    fields = listing.fields
+    return "camera_angle_x" in fields or fields.get("orientation_override") == "none"
 
 
 def _read_at(
