@@ -30,7 +30,7 @@ DTYPES = ("float32", "bfloat16")
 
 
 def run() -> None:
-    """Print a table of times, rates and memory; takes about two minutes on two idle cores."""
+    """Print a table of times, rates and memory."""
     calls, megabytes = {}, {}
     for dtype in DTYPES:
         config = dataclasses.replace(FULL, compute_dtype=dtype)
