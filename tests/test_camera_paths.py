@@ -183,6 +183,8 @@ FLAT = np.eye(4).ravel().tolist()
         ({"camera_to_world": [-1, *FLAT[1:]]}, "not a rotation and a position"),
         ({"fov": None}, r"camera_path\[1\]: fov is missing"),
         ({"fov": 180}, "fov must be between 0 and 180"),
+        ({"fov": 1e-300}, "fov of 1e-300 degrees is too small for any lens"),
+        ({"camera_to_world": [*FLAT[:3], 1e39, *FLAT[4:]]}, "is more than 1e\\+12 away"),
     ],
 )
 def test_a_broken_camera_path_raises_one_sentence(tmp_path, changes, message):

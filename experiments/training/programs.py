@@ -123,11 +123,12 @@ class Programs:
         """
         if finest not in self._pyramids:
             scene = self.scene
-            try:
-                found = scene_pyramid(scene, finest=finest)
-            except SceneError as error:  # such as full-size photographs that were not kept
-                print(f"only the photographs reduced for training are read: {error}")
-                found = scene_pyramid(dataclasses.replace(scene, photographs_at=None))
+            with progress.saying("reading photographs at their own size, or drawing them"):
+                try:
+                    found = scene_pyramid(scene, finest=finest)
+                except SceneError as error:  # such as full-size photographs that were not kept
+                    print(f"only the photographs reduced for training are read: {error}")
+                    found = scene_pyramid(dataclasses.replace(scene, photographs_at=None))
             self._pyramids[finest] = found
         return self._pyramids[finest]
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from experiments.viewing.orientation import up_direction
 from jaxcloseup.captures.json_fields import number, read_object, rigid_transform
+from jaxcloseup.captures.scale import FOCAL, LENGTH
 from jaxcloseup.geometry.cameras import Camera, pixels_to_points
 from jaxcloseup.geometry.poses import closeup_position
 from jaxcloseup.memory import installed_memory
@@ -99,6 +100,10 @@ def read_camera_path(path: pathlib.Path) -> Shots:
         if not 0 < fov < 180:
             raise CameraError(f"{label}: fov must be between 0 and 180 degrees, not {fov:g}")
         focals.append(height / 2 / math.tan(math.radians(fov) / 2))
+        if not focals[-1] <= FOCAL[1] * max(width, height):
+            raise CameraError(
+                f"{label}: fov of {fov:g} degrees is too small for any lens: raise it"
+            )
     fps = None
     if fields.get("fps") is not None:
         fps = _number(str(path), fields, "fps")
@@ -367,6 +372,8 @@ def _pose(label, entry):
             f"{label}: camera_to_world is not a rotation and a position: remove scales and "
             "reflections"
         )
+    if np.abs(matrix[:3, 3]).max() > LENGTH:
+        raise CameraError(f"{label}: camera_to_world is more than {LENGTH:g} away: correct it")
     return np.column_stack([rotation @ OPENGL, matrix[:3, 3]])
 
 

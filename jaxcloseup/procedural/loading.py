@@ -110,7 +110,6 @@ def procedural_scene(
         },
         metadata={
             "downscale": downscale,
-            "up": (0.0, 0.0, 1.0),
             "magnification": capture["magnification"].tolist(),
             "subjects": capture["subjects"].tolist(),
         },
