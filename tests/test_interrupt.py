@@ -60,7 +60,7 @@ def wait_for(lines, ending):
     raise AssertionError("".join(seen))
 
 
-PROGRAMS = ("run", "sweep", "render", "view", "evaluate", "bench")
+PROGRAMS = ("run", "sweep", "render", "view", "evaluate", "process", "bench")
 
 
 @pytest.mark.parametrize(

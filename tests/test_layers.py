@@ -64,6 +64,7 @@ ROOMS = {
     "reporting": {"methods", "evaluation", "training"},
     "viewing": {"methods", "evaluation", "progress", "training"},
     "benchmarks": {"methods", "evaluation", "training", "reporting", "viewing"},
+    "processing": set(),
     "jobs": {
         *("methods", "evaluation", "progress", "training", "reporting", "viewing", "command_line"),
     },

@@ -12,14 +12,13 @@ from rich.table import Table
 from experiments.command_line import set_up
 from experiments.evaluation.metrics_text import COLUMNS, format_metric
 from experiments.evaluation.scores import Perceptual, find_perceptual, score_image, summarize
-from jaxcloseup.captures.images import read_image, read_mask
+from jaxcloseup.captures.images import ENDINGS, read_image, read_mask
 from jaxcloseup.files import write_json
 from jaxcloseup.photographs import to_float
 from jaxcloseup.scenes import SceneError
 
 
 FLAGS = flags.FLAGS
-ENDINGS = {".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"}
 _NAMES_IN_MESSAGE = 3
 
 

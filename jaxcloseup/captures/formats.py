@@ -1,12 +1,14 @@
 """Detect the format of a capture folder and list its photographs."""
 
 import pathlib
+import shlex
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxcloseup.captures.colmap import holds_model, read_colmap
 from jaxcloseup.captures.frames import Frame
+from jaxcloseup.captures.images import ENDINGS
 from jaxcloseup.captures.llff import read_llff
 from jaxcloseup.captures.masks import attach_masks
 from jaxcloseup.captures.points import read_ply_points
@@ -78,10 +80,18 @@ def read_listing(
     found = [(kind, name) for kind, name in _detect(path) if format in (None, kind)]
     if not found:
         wanted = f" in the format {format}" if format else ""
-        raise SceneError(
-            f"{path} holds no capture{wanted}: add {_SEPARATE}, {_SINGLE}, {_LLFF}, or a COLMAP "
-            f"model in {', '.join(_MODELS)} or in the folder itself."
+        files = (
+            f"add {_SEPARATE}, {_SINGLE}, {_LLFF}, or a COLMAP model in {', '.join(_MODELS)} or in "
+            "the folder itself."
         )
+        if photographs := None if format else _photographs_in(path):
+            target = shlex.quote(f"{path.resolve().name}_capture")
+            raise SceneError(
+                f"{path} holds no capture but photographs: find their poses with jaxcloseup "
+                f"process --images={shlex.quote(str(photographs))} --output_dir={target}, or "
+                f"{files}"
+            )
+        raise SceneError(f"{path} holds no capture{wanted}: {files}")
     (kind, name), *others = found
     folder = _folder_of_model(path) if name == "." else path
     content = {"transforms": _read_transforms, "colmap": _read_model, "llff": _read_llff}[kind](
@@ -129,6 +139,14 @@ def _detect(path: pathlib.Path) -> list[tuple[str, str]]:
     found = [(kind, name) for kind, name in files if (path / name).is_file()]
     found += [("colmap", name) for name in (*_MODELS, ".") if holds_model(path / name)]
     return found + [("llff", _LLFF)] * (path / _LLFF).is_file()
+
+
+def _photographs_in(path: pathlib.Path) -> pathlib.Path | None:
+    """The folder with photographs, if there are any: this one, or `images` in it."""
+    for folder in (path, path / "images"):
+        if folder.is_dir() and any(one.suffix.lower() in ENDINGS for one in folder.iterdir()):
+            return folder
+    return None
 
 
 def _describe(kind: str, name: str, path: pathlib.Path) -> str:

@@ -15,6 +15,7 @@ from jaxcloseup.files import read_bytes
 from jaxcloseup.scene import SceneError
 
 
+ENDINGS = {".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"}  # of photographs
 MOST_PIXELS = 170_000_000  # a file of 100 kB may claim a billion of them
 _filters = threading.Lock()  # filters of warnings belong to all threads
 
