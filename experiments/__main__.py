@@ -15,6 +15,7 @@ PROGRAMS = {
     "run": "train on one scene, fine-tune on pseudo-labeled close-ups, evaluate, report",
     "sweep": "the same for several arms, seeds and scenes, and compare them",
     "render": "render a camera path of a run, or fine-tune for target cameras",
+    "mesh": "write the surface of a run as a colored mesh",
     "view": "look at a run in a browser, and choose close-ups there",
     "evaluate": "score a folder of images against another",
     "process": "make a capture with poses from photographs or a video",

@@ -1,4 +1,4 @@
-"""Vertices in PLY files, as NumPy structured arrays."""
+"""Vertices in PLY files, as NumPy structured arrays, and triangles beside them."""
 
 import pathlib
 
@@ -64,8 +64,15 @@ def read_vertices(path: str | pathlib.Path) -> np.ndarray:
     return np.frombuffer(data, dtype, count, start)
 
 
-def write_vertices(path: str | pathlib.Path, vertices: np.ndarray) -> None:
+def write_vertices(
+    path: str | pathlib.Path, vertices: np.ndarray, faces: np.ndarray | None = None
+) -> None:
     """Write a structured array `[P]` as a binary little-endian PLY file, whole or not at all.
+
+    Args:
+      path: path of the file.
+      vertices: `[P]`; its fields become properties.
+      faces: `[F, 3]` indices of the vertices of triangles; None writes no such element.
 
     Raises:
       OSError: one sentence that names the path and the reason.
@@ -73,9 +80,13 @@ def write_vertices(path: str | pathlib.Path, vertices: np.ndarray) -> None:
     fields = [(name, vertices.dtype[name].str[1:]) for name in vertices.dtype.names]
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
     lines += [f"property {_NAMES[kind]} {name}" for name, kind in fields]
-    header = "\n".join([*lines, "end_header\n"]).encode()
-    packed = vertices.astype([(name, "<" + kind) for name, kind in fields])
-    write_file(path, header + packed.tobytes())
+    data = vertices.astype([(name, "<" + kind) for name, kind in fields]).tobytes()
+    if faces is not None:
+        lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+        triangles = np.empty(len(faces), [("count", "u1"), ("indices", "<i4", 3)])
+        triangles["count"], triangles["indices"] = 3, faces
+        data += triangles.tobytes()
+    write_file(path, "\n".join([*lines, "end_header\n"]).encode() + data)
 
 
 def _parse_header(path: pathlib.Path, header: bytes) -> tuple[str, int, list[tuple[str, str]]]:

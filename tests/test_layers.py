@@ -35,6 +35,7 @@ MAY_IMPORT = {
     "windows": {"geometry", "photographs", "pyramids"},
     "gather": {"numerics", "geometry", "photographs", "pyramids"},
     "detail": {"numerics", "geometry", "gather", "pyramids"},
+    "tsdf": {"numerics", "geometry", "gather", "photographs"},
     "draws": {"geometry", "photographs", "pseudo", "pyramids", "windows"},
     "train": {
         *("numerics", "geometry", "field", "photographs"),
@@ -71,7 +72,7 @@ ROOMS = {
     "command_line": {"progress"},
 }
 LIBRARIES_OF_GEOMETRY = {"jax", "chex", "flax", "typing", "jaxcloseup"}
-LONGEST_MODULE, LONGEST_FUNCTION, MOST_PROGRAMS = 400, 80, 8
+LONGEST_MODULE, LONGEST_FUNCTION, MOST_PROGRAMS = 400, 80, 10
 # What tells one type of field from another.
 FIELD_TYPES = re.compile(
     r"isinstance\([^)]*(Surfel|Nerf|Mcmc|Adaptive|Buffers|Aux)"

@@ -1,4 +1,4 @@
-"""Write what a run produces: images, videos, PLY files of surfels, and checkpoints.
+"""Write what a run produces: images, videos, surfels and meshes as PLY files, and checkpoints.
 
 `checkpoints` is not re-exported, because Orbax is slow to import.
 """
@@ -17,6 +17,7 @@ from jaxcloseup.artifacts.images import (
     webp_data_uri,
     write_png,
 )
+from jaxcloseup.artifacts.mesh import Mesh, surface_mesh, write_mesh
 from jaxcloseup.artifacts.surfel_ply import read_surfels, write_surfels
 from jaxcloseup.artifacts.video import write_video
 
@@ -24,6 +25,7 @@ from jaxcloseup.artifacts.video import write_video
 __all__ = [
     "Gaussians",
     "Image",
+    "Mesh",
     "as_gaussians",
     "colorize_depth",
     "colorize_error",
@@ -33,8 +35,10 @@ __all__ = [
     "encode_webp_animation",
     "read_surfels",
     "side_by_side",
+    "surface_mesh",
     "to_uint8",
     "webp_data_uri",
+    "write_mesh",
     "write_png",
     "write_surfels",
     "write_video",
