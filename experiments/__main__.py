@@ -17,6 +17,7 @@ PROGRAMS = {
     "render": "render a camera path of a run, or fine-tune for target cameras",
     "mesh": "write the surface of a run as a colored mesh",
     "view": "look at a run in a browser, and choose close-ups there",
+    "compare": "compare several finished runs on one scene",
     "evaluate": "score a folder of images against another",
     "process": "make a capture with poses from photographs or a video",
     "bench": "measure speed and quality",

@@ -3,6 +3,7 @@ import dataclasses
 import io
 import json
 import re
+import shutil
 
 import cv2
 import jax
@@ -19,6 +20,7 @@ from experiments.jobs.evaluate import evaluate_folders
 from experiments.jobs.run import run
 from experiments.methods import METHODS, CoarseConfig, WindowConfig, pseudo_settings
 from experiments.methods.surfels import REDUCED
+from experiments.reporting.comparison import read_finished, say_which_is_best, write_comparison
 from experiments.training.gate import AGREEMENT, gated, verdict, weigh_labels
 from experiments.training.loop import TrainingError, run_stage
 from experiments.training.programs import Programs
@@ -236,6 +238,16 @@ def test_a_run_leaves_pictures_and_a_page_without_links(finished):
     links = re.findall(r"(?:src|href)=['\"]([^'\"]*)", page)
     assert links
     assert all(link.startswith(("data:", "#")) for link in links)
+
+
+def test_finished_runs_can_be_compared(finished, tmp_path):
+    _, output_dir = finished
+    other = shutil.copytree(output_dir, tmp_path / "other")
+    runs = read_finished([output_dir, other])
+    write_comparison(tmp_path / "both", runs)
+    page = (tmp_path / "both" / "report.html").read_text()
+    assert "0.00 dB better" in say_which_is_best(runs) and page.count("type=range") == 2
+    assert [run.stage for run in runs] == ["detail", "detail"]
 
 
 def test_a_run_cut_off_and_resumed_ends_the_same(

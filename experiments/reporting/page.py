@@ -1,7 +1,7 @@
 """What pages share: their style, and pictures under headings."""
 
 import html
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -60,6 +60,45 @@ def figure(image: np.ndarray, caption: str, *, quality: int = 90) -> str:
     )
 
 
+def slider(
+    left: np.ndarray,
+    right: np.ndarray,
+    names: tuple[str, str],
+    caption: str,
+    *,
+    quality: int = 90,
+) -> str:
+    """Return two images of one size, one over the other, and a slider that uncovers the left one.
+
+    It lies in an element of class `pair`, whose sliders all move together.
+
+    Args:
+      left: uint8 `[H, W, 3]`.
+      right: uint8 `[H, W, 3]`.
+      names: what the images are.
+      caption: text below them.
+      quality: that of `webp_data_uri`.
+    """
+    over, under = (webp_data_uri(image, quality=quality) for image in (left, right))
+    left_name, right_name = map(html.escape, names)
+    return (
+        "<figure class=slider><div>"
+        f"<img alt='{right_name}' src='{under}'><img alt='{left_name}' src='{over}'>"
+        f"<input type=range min=0 max=100 value=50 aria-label='from {left_name} to {right_name}' "
+        "oninput=\"this.closest('.pair').style.setProperty('--at', this.value + '%')\"></div>"
+        f"<figcaption>{html.escape(caption)}</figcaption></figure>"
+    )
+
+
+def score_tables(found: Mapping[str, tuple[Sequence[str], Sequence[Sequence[str]]]]) -> list[str]:
+    """Return tables side by side, each a header and rows, under their titles."""
+    parts = [
+        f"<div><h3>{html.escape(title)}</h3>{table(header, body)}</div>"
+        for title, (header, body) in found.items()
+    ]
+    return ["<div class=tables>", *parts, "</div>"]
+
+
 def table(header: Sequence[str], body: Sequence[Sequence[str]], *, names: int = 1) -> str:
     """Return a table of text.
 
@@ -104,7 +143,7 @@ img { display: block; width: 100% }
 details { margin: 1em 0; border-top: 1px solid #ccc; padding-top: 1em }
 summary { cursor: pointer; font-size: 1.25em; font-weight: bold }
 .moving { max-width: 590px }
-.pair { display: grid; gap: 0 1em;
+.pair { --at: 50%; display: grid; gap: 0 1em;
   grid-template-columns: repeat(auto-fit, minmax(min(100%, 340px), 1fr)) }
 .slider div { position: relative }
 .slider img + img { position: absolute; inset: 0; clip-path: inset(0 calc(100% - var(--at)) 0 0) }

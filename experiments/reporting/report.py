@@ -18,10 +18,18 @@ from experiments.reporting.audits import (
     labels_table,
     zoom_plots,
 )
-from experiments.reporting.page import Picture, figure, figures, folded, head, table
+from experiments.reporting.page import (
+    Picture,
+    figure,
+    figures,
+    folded,
+    head,
+    score_tables,
+    slider,
+    table,
+)
 from experiments.reporting.showcase import Exhibit
 from experiments.reporting.summary import best_stage, conclusion, tables
-from jaxcloseup.artifacts.images import webp_data_uri
 from jaxcloseup.files import write_file
 
 
@@ -54,8 +62,15 @@ def rows(results: Mapping[str, Any]) -> list[list[str]]:
 
 def print_results(results: Mapping[str, Any]) -> None:
     """Print what the run found, and a table of each kind of view."""
+    print_tables(tables(results), conclusion(results))
+
+
+def print_tables(
+    found: Mapping[str, tuple[Sequence[str], Sequence[Sequence[str]]]], sentence: str
+) -> None:
+    """Print tables, each a header and rows, under their titles, and a sentence."""
     console = Console()
-    for title, (header, body) in tables(results).items():
+    for title, (header, body) in found.items():
         shown = Table(title=title, title_justify="left")
         for i, name in enumerate(header):
             # Stages are never cut, however narrow the terminal is.
@@ -63,7 +78,7 @@ def print_results(results: Mapping[str, Any]) -> None:
         for row in body:
             shown.add_row(*row)
         console.print(shown)
-    console.print(conclusion(results), highlight=False)
+    console.print(sentence, highlight=False)
 
 
 def write_report(
@@ -94,12 +109,7 @@ def write_report(
         *_exhibition(shown, best_stage(results["stages"])),
         *_moving(dolly),
         "<h2>Scores</h2>",
-        "<div class=tables>",
-        *(
-            f"<div><h3>{html.escape(title)}</h3>{table(header, body)}</div>"
-            for title, (header, body) in tables(results).items()
-        ),
-        "</div>",
+        *score_tables(tables(results)),
         _STAGES,
     ]
     views = [picture for picture in pictures if picture.section in SPLIT_TITLES.values()]
@@ -143,16 +153,9 @@ def _exhibition(shown, stage):
         if one.cutout is None:
             parts += ["<div class=pair>", figure(one.render, psnr), truth, "</div>"]
             continue
-        render, cutout = map(webp_data_uri, (one.render, one.cutout))
-        caption = html.escape(
+        caption = (
             f"left: {one.photograph}, with pixels {one.pixel:.1f} times as large; right: {psnr}"
         )
-        parts.append(
-            "<div class=pair><figure class=slider><div style='--at: 50%'>"
-            f"<img alt='{html.escape(psnr)}' src='{render}'>"
-            f"<img alt='{html.escape(one.photograph)}' src='{cutout}'>"
-            "<input type=range min=0 max=100 value=50 aria-label='from photograph to render' "
-            "oninput=\"this.parentNode.style.setProperty('--at', this.value + '%')\"></div>"
-            f"<figcaption>{caption}</figcaption></figure>{truth}</div>"
-        )
+        pair = slider(one.cutout, one.render, (one.photograph, psnr), caption)
+        parts.append(f"<div class=pair>{pair}{truth}</div>")
     return parts

@@ -36,7 +36,7 @@ def conclusion(results: Mapping[str, Any]) -> str:
         change = psnr["detail"] - psnr[results["detail"]["stage"]]
         text = (
             f"{views} have a PSNR of {psnr['detail']:.1f} dB with the photographs' detail, "
-            f"{_than(change, 1)} than the trained field alone."
+            f"{than(change, 1)} than the trained field alone."
         )
     else:
         stage = next(name for name in ("closeup", "control", "baseline", *psnr) if name in psnr)
@@ -61,10 +61,11 @@ def _say_of_labels(results, psnr):
     change = psnr["closeup"] - psnr["control"]
     if round(abs(change), 2) == 0:
         return f"Labels{found} changed nothing."
-    return f"Labels{found} made the field {_than(change, 2)} than as many steps without."
+    return f"Labels{found} made the field {than(change, 2)} than as many steps without."
 
 
-def _than(change, digits):
+def than(change: float, digits: int) -> str:
+    """Say how much better or worse a PSNR is, in dB."""
     return f"{abs(change):.{digits}f} dB {'worse' if change < 0 else 'better'}"
 
 

@@ -17,7 +17,7 @@ from jaxcloseup.label_rules import LABEL_RULES
 from jaxcloseup.splats.rasterize import COMPOSITORS
 
 
-_GROUPS = ("field", "train", "labels")
+GROUPS = ("field", "train", "labels")
 _MOST = 2**31 - 1  # what an int32 counts
 # Other whole numbers lie between 0 and _MOST, other numbers between 0 and infinity.
 BOUNDS = {
@@ -92,7 +92,7 @@ def settings_of(preset: Preset, method: Method | None = None) -> dict[str, Setti
             continue
         if path == ("labels", "expected_depth") and method.with_expected_depth is None:
             continue
-        name = ".".join(part for part in path if part not in _GROUPS)
+        name = ".".join(part for part in path if part not in GROUPS)
         found[name] = Setting(path, kind, value)
     return found
 
