@@ -4,36 +4,19 @@
 
 The depth that the run renders in each training view is fused into signed distances on a grid, and
 marching cubes finds the surface where these are 0. Pixels do not count whose surface fewer than
-`--support` training views see. The mesh ends where no view says anything. On built-in scenes the
+`--min_views` training views see. The mesh ends where no view says anything. On built-in scenes the
 program also measures how far the mesh is from the exact surface; `--exact` fuses exact depth
 instead, which shows what fusion alone costs. The program needs the extra "mesh".
 """
 
-import datetime
-import importlib.util
-import math
-import sys
-import time
+from absl import flags
 
-import numpy as np
-from absl import app, flags
-
-from experiments.command_line import check_unused, prepare_to_stop, set_up, start
-from experiments.evaluation.mesh_error import CLOSE, mesh_error
-from experiments.training.loop import TrainingError
-from experiments.training.stored_run import RunError, load_run_scene, restore
-from experiments.viewing import surface
-from experiments.viewing.flags import run_from_flags
-from jaxcloseup.artifacts.checkpoints import CheckpointError
-from jaxcloseup.artifacts.mesh import write_mesh
-from jaxcloseup.files import write_json
-from jaxcloseup.memory import installed_memory
-from jaxcloseup.scene import Scene, SceneError
+from experiments.command_line import job, start
+from experiments.viewing import define_flags
 
 
-FLAGS = flags.FLAGS
-for _name in ("output_dir", "run", "stage", "data", "set"):
-    flags.declare_key_flag(_name)
+flags.adopt_module_key_flags(define_flags)  # these are in --help too
+flags.declare_key_flag("output_dir")
 flags.DEFINE_integer(
     "resolution",
     256,
@@ -49,7 +32,7 @@ flags.DEFINE_list(
     "training views see, but for the farthest 0.5 % on each side",
 )
 flags.DEFINE_integer(
-    "support",
+    "min_views",
     3,
     "training views that must see the surface at a pixel for it to count, its own included",
     lower_bound=1,
@@ -57,122 +40,9 @@ flags.DEFINE_integer(
 flags.DEFINE_bool("exact", False, "fuse the exact depth of a built-in scene, not the run's")
 
 
-class MeshError(Exception):
-    """There can be no such mesh. The message is one sentence that says what to do."""
-
-
-def main(argv: list[str]) -> None:
+def main(_: list[str]) -> None:
     """Write the mesh of the run that the flags name."""
-    if len(argv) > 1:
-        raise app.UsageError(f"unexpected argument: {argv[1]}")
-    set_up()
-    if importlib.util.find_spec("skimage") is None:
-        sys.exit(
-            'experiments.mesh: scikit-image is missing: install jaxcloseup with the extra "mesh"'
-        )
-    try:
-        _mesh()
-    except (
-        *(MeshError, RunError, SceneError),
-        *(CheckpointError, TrainingError, OSError),
-    ) as error:
-        sys.exit(f"experiments.mesh: {error}")
-
-
-def _mesh() -> None:
-    # Cheap checks come before loading the scene and the state.
-    region = _region()
-    if FLAGS.voxel is not None and not 0 < FLAGS.voxel < math.inf:
-        raise MeshError(f"--voxel={FLAGS.voxel:g} must be a length above 0, in world units")
-    record, stage = run_from_flags()
-    stamp = datetime.datetime.now().strftime("%Y-%m-%d_%H%M%S")
-    output_dir = check_unused(FLAGS.output_dir or record.folder / "meshes" / stamp)
-    prepare_to_stop(output_dir)
-    scene = load_run_scene(record, FLAGS.data)
-    if FLAGS.exact and scene.surface is None:
-        raise MeshError("--exact needs a built-in scene, whose surface is known: leave it out")
-    finer = surface.finer_by(scene, renders_pixels=False)
-    if FLAGS.exact:
-        see = surface.exact_view(scene)
-    else:
-        programs, state = restore(record, scene, stage)
-        see = surface.rendered_view(programs, state)
-        finer = surface.finer_by(scene, renders_pixels=programs.method.renders_pixels)
-    maps = surface.see_training_views(scene, see, finer=finer, support=FLAGS.support)
-    if region is None:
-        points = surface.seen_points(maps.views.cameras, maps.depths, maps.views.weight)
-        if not len(points):
-            raise MeshError(
-                f"no pixel shows a surface that {FLAGS.support} training views see: choose a "
-                "smaller --support"
-            )
-        region = surface.box_around(points)
-    grid = surface.make_grid(region, FLAGS.voxel or np.ptp(region, axis=0).max() / FLAGS.resolution)
-    _check_memory(grid)
-    counts = " x ".join(map(str, grid.shape))
-    print(
-        f"fusing {len(maps.depths)} depth maps into {counts} voxels of {grid.voxel:.3g}", flush=True
-    )
-    began = time.perf_counter()
-    mesh = surface.fuse_mesh(maps, grid)
-    print(f"fused in {time.perf_counter() - began:.0f} s")
-    if not len(mesh.faces):
-        raise MeshError(
-            "no surface lies in the region: choose another --region, smaller voxels or a smaller "
-            "--support"
-        )
-    write_mesh(output_dir / "mesh.ply", mesh)
-    about = {
-        "stage": None if FLAGS.exact else stage,
-        "voxel": grid.voxel,
-        "region": np.asarray(region).tolist(),
-        "support": FLAGS.support,
-        "vertices": len(mesh.vertices),
-        "triangles": len(mesh.faces),
-        "error": _measure(scene, mesh, finer),
-    }
-    write_json(output_dir / "mesh.json", about)
-    print(f"mesh: {output_dir / 'mesh.ply'}, {len(mesh.faces)} triangles")
-
-
-def _measure(scene: Scene, mesh: surface.Mesh, finer: int) -> dict[str, float] | None:
-    """How far the mesh is from the exact surface, where that is known; printed too."""
-    if scene.surface is None:
-        return None
-    print("comparing with the exact surface that the training views see", flush=True)
-    error = mesh_error(mesh, surface.exact_points(scene, finer))
-    print(
-        f"Chamfer distance {error['chamfer']:.4f} (mesh to surface {error['mesh_to_surface']:.4f}, "
-        f"surface to mesh {error['surface_to_mesh']:.4f}) at an extent of {error['extent']:.2f}; "
-        f"{error['mesh_close']:.1%} of the mesh and {error['surface_close']:.1%} of the surface "
-        f"are within {CLOSE:.0%} of the extent of each other"
-    )
-    return error
-
-
-def _region() -> np.ndarray | None:
-    if FLAGS.region is None:
-        return None
-    try:
-        box = np.array(list(map(float, FLAGS.region))).reshape(2, 3)
-        if not (np.isfinite(box).all() and (box[0] < box[1]).all()):
-            raise ValueError
-    except ValueError:
-        raise MeshError(
-            f"--region={','.join(FLAGS.region)} must be six finite numbers x0,y0,z0,x1,y1,z1, the "
-            "smallest coordinates before the largest"
-        ) from None
-    return box
-
-
-def _check_memory(grid: surface.Grid) -> None:
-    needed = math.prod(grid.shape) * surface.BYTES_PER_VOXEL
-    if needed > (held := installed_memory()):
-        raise MeshError(
-            f"{' x '.join(map(str, grid.shape))} voxels take {needed / 2**30:.1f} GiB, but this "
-            f"computer has {held / 2**30:.1f}: choose a smaller --resolution, larger --voxel or "
-            "smaller --region"
-        )
+    job("mesh").main()
 
 
 if __name__ == "__main__":

@@ -67,7 +67,8 @@ ROOMS = {
     "benchmarks": {"methods", "evaluation", "training", "reporting", "viewing"},
     "processing": set(),
     "jobs": {
-        *("methods", "evaluation", "progress", "training", "reporting", "viewing", "command_line"),
+        *("methods", "evaluation", "progress", "training", "reporting", "viewing", "processing"),
+        "command_line",
     },
     "command_line": {"progress"},
 }

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 
 from experiments.processing.jobs import ProcessingError
-from experiments.processing.photographs import FEWEST, Copied
+from experiments.processing.names import FEWEST
+from experiments.processing.photographs import Copied
 from experiments.processing.progress import progress
 from jaxcloseup.files import check_file, write_file
 

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from experiments.processing.names import MOST_EXHAUSTIVE
 
-PAIRINGS = ("exhaustive", "sequential", "retrieval")
-MOST_EXHAUSTIVE = 100  # photographs; above, `auto` takes the similar ones of each
+
 _NEIGHBORS = 10  # on each side in a video
 _SIMILAR = {"sequential": 5, "retrieval": 30}  # photographs for each
 _WORDS, _SAMPLES, _ROUNDS = 64, 50_000, 10  # of the vocabulary: words, descriptors, iterations
@@ -33,7 +33,7 @@ def pairs_to_match(pairing: str, descriptors: Sequence[np.ndarray]) -> list[tupl
     neighbors, since photographs are often numbered in the order in which they were taken.
 
     Args:
-      pairing: one of `PAIRINGS`.
+      pairing: one of `names.PAIRINGS`.
       descriptors: for each photograph, `[F, 128]` SIFT descriptors; F may be 0.
     """
     count = len(descriptors)

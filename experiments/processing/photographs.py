@@ -16,14 +16,15 @@ import PIL.ImageOps
 from PIL.ExifTags import IFD, Base
 
 from experiments.processing.jobs import ProcessingError
+from experiments.processing.names import FEWEST
 from experiments.processing.progress import progress
 from jaxcloseup.artifacts.images import encode_png
 from jaxcloseup.captures.images import ENDINGS, read_file, read_image
 from jaxcloseup.files import write_file
-from jaxcloseup.scene import SceneError, printable
+from jaxcloseup.messages import printable
+from jaxcloseup.scene import SceneError
 
 
-FEWEST = 3  # photographs that a model needs
 _AT_ONCE = 4  # in memory
 _LONGEST_STEM = 60  # characters
 _QUALITY = 95  # of a JPEG that was turned

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from experiments.processing.frames import extract_frames
 from experiments.processing.jobs import ProcessingError, do
+from experiments.processing.names import LENSES
 from experiments.processing.pairs import choose_pairing
 from experiments.processing.photographs import Copied, copy_photographs, list_files
 from experiments.processing.stages import Stages
@@ -16,8 +17,6 @@ from experiments.processing.summary import draw_from_above, other_models, why_le
 from jaxcloseup.version import __version__
 
 
-# COLMAP's camera models; the solver goes on to richer ones.
-LENSES = {"perspective": "SIMPLE_RADIAL", "fisheye": "SIMPLE_RADIAL_FISHEYE"}
 IMAGES, MODEL, PICTURE = "images", "sparse/0", "cameras.png"  # in the capture's folder
 _WORK, _DATABASE = "colmap", "colmap/database.db"
 
@@ -29,8 +28,8 @@ class Request(NamedTuple):
       images: folder of photographs, or None.
       video: a video file where `images` is None.
       count: largest number of frames of the video.
-      lens: a key of `LENSES`.
-      pairs: which photographs are matched: `auto` or one of `pairs.PAIRINGS`.
+      lens: a key of `names.LENSES`.
+      pairs: which photographs are matched: `auto` or one of `names.PAIRINGS`.
     """
 
     images: pathlib.Path | None

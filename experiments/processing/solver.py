@@ -24,6 +24,7 @@ from typing import Any
 
 import pycolmap
 
+from experiments.processing.names import FEWEST
 from experiments.processing.pairs import pairs_to_match
 
 
@@ -32,7 +33,6 @@ _LONGEST_SIDE = 2400  # pixels; features of larger photographs are found in redu
 _MOST_FEATURES = 8192  # in a photograph
 _AT_ONCE = 4  # photographs for each thread between two lines of progress
 _SECONDS = 2.0  # between two lines of progress on matches
-_FEWEST = 3  # photographs of a model
 _ENOUGH = 30  # photographs of a lens, for eight parameters instead of four
 _RICHER = {"SIMPLE_RADIAL": "OPENCV", "SIMPLE_RADIAL_FISHEYE": "OPENCV_FISHEYE"}
 Say = Callable[[int, int], None]
@@ -93,7 +93,7 @@ def match(say: Say, *, database: str, pairing: str, names: Sequence[str]) -> dic
     Args:
       say: called with the count of pairs that are done and that of all.
       database: path of COLMAP's database.
-      pairing: one of `pairs.PAIRINGS`.
+      pairing: one of `names.PAIRINGS`.
       names: the photographs, in the order in which they were taken.
 
     Returns:
@@ -156,7 +156,7 @@ def map_photographs(say: Say, *, database: str, images: str, folder: str) -> lis
 
     pycolmap.set_random_seed(SEED)
     options = pycolmap.IncrementalPipelineOptions(
-        num_threads=1, random_seed=SEED, min_model_size=_FEWEST
+        num_threads=1, random_seed=SEED, min_model_size=FEWEST
     )
     models = pycolmap.incremental_mapping(
         database,

@@ -14,12 +14,12 @@ from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection
 from matplotlib.ticker import MaxNLocator
 
+from experiments.processing.names import FEWEST
 from jaxcloseup.captures.colmap import read_colmap
 from jaxcloseup.files import write_file
 
 
 _FEW_FEATURES = 50  # in a photograph; fewer seldom give a pose
-_FEWEST = 3  # photographs of another model
 _SHOWN = 3  # names in a line
 _MOST_POINTS = 20_000  # in the picture
 
@@ -43,7 +43,7 @@ def why_left_out(
     for name in names:
         if name in solved:
             continue
-        if any(name in other for other in others if len(other - solved) >= _FEWEST):
+        if any(name in other for other in others if len(other - solved) >= FEWEST):
             reasons[name] = "belongs to another model, which shares too little with the larger one"
         elif features[name] < _FEW_FEATURES:
             reasons[name] = f"has only {features[name]} features: blank, dark or blurred"
@@ -60,7 +60,7 @@ def other_models(models: Sequence[Mapping[str, Any]]) -> list[int]:
     for model in models[1:]:
         new = set(model["photographs"]) - known
         known |= new
-        sizes += [len(new)] if len(new) >= _FEWEST else []
+        sizes += [len(new)] if len(new) >= FEWEST else []
     return sizes
 
 
