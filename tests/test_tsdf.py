@@ -15,6 +15,7 @@ from tiny_runs import HALF
 
 from experiments import mesh as program
 from experiments.evaluation import mesh_error
+from experiments.jobs import mesh as job
 from experiments.training import stored_run
 from experiments.viewing import surface
 from jaxcloseup.artifacts.mesh import Mesh, surface_mesh, write_mesh
@@ -242,12 +243,12 @@ def test_a_mistake_is_one_sentence(run, monkeypatch):
         ({"region": ["0", "0", "0", "1", "1"]}, "--region=0,0,0,1,1 must be six finite numbers"),
         ({"region": ["0", "0", "0", "1", "1", "0"]}, "must be six finite numbers"),
         ({"exact": True}, "--exact needs a built-in scene"),
-        ({"support": 99}, "no pixel shows a surface that 99 training views see"),
+        ({"min_views": 99}, "no pixel shows a surface that 99 training views see"),
         ({"voxel": 1e-5}, "voxels take .* GiB, .* choose a smaller --resolution"),
         ({"region": ["0", "0", "5", "1", "1", "6"]}, "no surface lies in the region"),
     ):
         with pytest.raises(SystemExit, match=f"experiments.mesh: .*{sentence}"):
             run(**flags_)
-    monkeypatch.setattr(program.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(job.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(SystemExit, match='install jaxcloseup with the extra "mesh"'):
         run()
