@@ -114,6 +114,10 @@ def test_surfels_run_through_all_stages_from_random_points(capture_folder, tmp_p
     said = capsys.readouterr().out
     assert "windows of photographs of 32 x 24 pixels, their own size" in said
     assert "growing to" not in said
+    parts = [tuple(map(int, found)) for found in re.findall(r"^\[(\d+)/(\d+)\] ", said, re.M)]
+    assert parts[0][0] == 1 and parts[-1][0] == parts[-1][1]  # the report is the last one
+    assert parts == sorted(parts, key=lambda part: part[0]) and len(set(parts)) > 8
+    assert "\n[1/" in said and "compiling the steps" in said and "writing the report" in said
     assert results["history"]["coarse_baseline"][-1]["step"] == 20
     assert json.loads((tmp_path / "results.json").read_text()) == results
     stages = results["stages"]

@@ -84,12 +84,12 @@ def run(
     manifest = about | about_scene(scene, load_options)
     write_manifest(output_dir, manifest)
     write_dataparser_transforms(output_dir, scene)
-    with timed_compiling(training.seconds):
-        shown = {"words": in_words, "compiled": lambda: training.seconds["compile"]}
-        with progress.showing(plan_run(preset, scene, to_run), **shown):
+    shown = {"words": in_words, "compiled": lambda: training.seconds.get("compile", 0.0)}
+    with progress.showing(plan_run(preset, scene, to_run), **shown):
+        with timed_compiling(training.seconds):
             outcome = run_stages(training, seed, output_dir, to_run=to_run, perceptual=perceptual)
-            dolly = _dolly(training, outcome)
-            results = report_run(output_dir, training, outcome, about, dolly=dolly)
+        dolly = _dolly(training, outcome)
+        results = report_run(output_dir, training, outcome, about, dolly=dolly)
     print(f"compiling took {training.seconds['compile']:.0f} s of the run")
     write_manifest(output_dir, manifest, training.seconds)
     return results
