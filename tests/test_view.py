@@ -33,9 +33,10 @@ const pixels = shown.map(image => {
 return pixels.length == 2 && pixels[0] != arguments[0] ? pixels : null;
 """
 
-# Whether the picture is seen without scrolling.
+# Whether the picture is seen at the top of the panel, which pressing a button has scrolled.
 IN_VIEW = """
 const [picture] = [...document.images].filter(image => image.naturalWidth > 300);
+for (let one = picture; one; one = one.parentElement) one.scrollTop = 0;
 const box = picture.getBoundingClientRect();
 return box.top >= 0 && box.bottom <= innerHeight;
 """
