@@ -4,8 +4,8 @@
 
 The page shows surfels as Gaussian splats, and a NeRF as the points that it started from. A click on
 the scene puts a close-up camera in front of that point; a click on a training camera moves you to
-it. The run's own renderer makes the pictures below the buttons. All visitors share one close-up
-camera and one picture. The program needs the extra "viewer".
+it. The run's own renderer makes the pictures below the buttons. Each visitor has a close-up camera
+and pictures of their own. The program needs the extra "viewer".
 """
 
 from absl import flags

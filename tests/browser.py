@@ -61,7 +61,13 @@ class Browser:
         script = "return [...document.querySelectorAll('button')].find("
         script += "one => one.innerText.trim() == arguments[0])"
         element = self.wait(script, text)
-        self.call("POST", f"/element/{next(iter(element.values()))}/click", {})
+        for last in (False, False, True):
+            try:
+                return self.call("POST", f"/element/{next(iter(element.values()))}/click", {})
+            except urllib.error.HTTPError:  # a panel that is still opening
+                if last:
+                    raise
+                time.sleep(1)
 
     def click_in_the_middle(self):
         """Click in the middle of the window."""

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reference_splats import rotation_of
+from reference_splats import rotation_of, sh_color
 from splat_scenes import random_scene, to_surfels
 
 from jaxcloseup.artifacts.gaussians import as_gaussians
@@ -36,3 +36,18 @@ def test_only_alive_and_finite_surfels_are_kept():
     found = as_gaussians(broken, jnp.arange(16) != 0)
     np.testing.assert_array_equal(found.means, surfels.means[2:])
     assert all(len(array) == 14 for array in found)
+
+
+def test_colors_from_a_position_are_those_of_all_degrees():
+    scene = random_scene(5)
+    surfels, position = to_surfels(scene), np.array([0.3, -0.2, 5.0])
+    bent = surfels.replace(sh=surfels.sh.at[3, 1, 0].set(jnp.nan))
+    found = as_gaussians(bent, jnp.ones(16, bool), position)
+    assert len(found.rgb) == len(as_gaussians(bent, jnp.ones(16, bool)).rgb) == 15
+    kept = np.arange(16) != 3
+    means, sh = (np.asarray(a, np.float64)[kept] for a in (surfels.means, surfels.sh))
+    expected = [
+        sh_color(terms, (mean - position) / np.linalg.norm(mean - position))
+        for mean, terms in zip(means, sh, strict=True)
+    ]
+    np.testing.assert_allclose(found.rgb, np.clip(expected, 0, 1), atol=1e-5)

@@ -9,6 +9,7 @@ import PIL.Image
 import pytest
 
 from jaxcloseup.artifacts.images import (
+    color_counts,
     colorize_depth,
     colorize_error,
     colorize_normals,
@@ -175,6 +176,9 @@ def test_support_is_drawn_in_steps_with_unseen_pixels_in_magenta():
         assert [colors[group] for group in groups] == row.tolist()
         steps = [sum(colors[group]) for group in "abcde"]
         assert steps == sorted(steps, reverse=True) and len(set(steps)) == 5
+    colors, strip = color_counts(count[0])
+    np.testing.assert_array_equal(colors, often)
+    np.testing.assert_array_equal(strip, picture[-24:, 368:])
     # The legend shows the same colors in the same order.
     legend = picture[-12, 8:360:60].tolist()
     assert legend == [sharp[i].tolist() for i in (0, 2, 4, 5, 6, 8)]

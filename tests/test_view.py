@@ -6,18 +6,22 @@ import queue
 import socket
 import sys
 import types
+import unittest.mock
 
 import jax
+import numpy as np
 import pytest
 from absl import flags
 from absl.testing import flagsaver
 from browser import free_port, open_browser
+from reference_splats import sh_color
 from tiny_runs import TINY
 
 from experiments import view as program
 from experiments.training.loop import TrainingError
 from experiments.training.programs import Programs
 from experiments.training.stored_run import load_run_scene, read_run, restore
+from jaxcloseup.artifacts.images import color_counts, to_uint8
 
 
 HAS = "return document.body.innerText.includes(arguments[0])"
@@ -73,7 +77,7 @@ def test_a_closeup_is_chosen_and_rendered_in_a_browser(serve, kept, monkeypatch)
     def darker(programs, start, cameras, *, most, kept, tell):
         state = start.state
         tell(3, 10)
-        told.append(page._status.content)
+        told.extend(visitor._status.content for visitor in page._visitors.values())
         assert start.sources.depths.shape == programs.scene.train.weight.shape
         assert cameras.intrinsics.shape == (1, 4)
         return state.replace(params=state.params.replace(sh=state.params.sh - 1))
@@ -105,11 +109,85 @@ def test_a_closeup_is_chosen_and_rendered_in_a_browser(serve, kept, monkeypatch)
     assert again == rendered  # every fine-tuning starts from the same state, which does not change
 
 
+def visit(page):
+    """A visitor without a browser: its client, which only keeps what it is told."""
+    from experiments.viewing.visitor import Visitor
+
+    client = unittest.mock.MagicMock()
+    client.gui.add_image.side_effect = lambda image, *, visible, **_: types.SimpleNamespace(
+        image=image, visible=visible
+    )
+    client.gui.add_checkbox.side_effect = lambda _, initial_value: types.SimpleNamespace(
+        value=initial_value, on_update=lambda call: call
+    )
+    return Visitor(page, client), client
+
+
+def test_each_visitor_has_a_camera_a_picture_and_colors_of_their_own(serve, kept):
+    record = read_run(kept)
+    programs, state = restore(record, load_run_scene(record), "closeup")
+    sh = state.params.sh.at[:, 1:].set(jax.random.normal(jax.random.key(0), (3,)))
+    state = state.replace(params=state.params.replace(sh=sh))
+    page, _ = serve(programs, state)
+    (one, client), (other, second) = visit(page), visit(page)
+    second.camera.position = second.camera.position + np.array([0.4, 0.2, 0.0])
+    client.camera.fov = second.camera.fov = 0.8
+    one._sharpen.value = other._sharpen.value = False
+    one._on_render(None, tuned=False)
+    page.work(timeout=1)
+    assert one._image.visible and not other._image.visible
+    other._on_render(None, tuned=False)
+    page.work(timeout=1)
+    assert np.abs(one._picture - np.float32(other._picture)).mean() > 1
+    for visitor in (one, other):
+        expected = programs.render(state, visitor._own_camera()).rgb
+        np.testing.assert_array_equal(visitor._picture, to_uint8(expected))
+
+    surfels, alive = state.params, np.asarray(state.buffers.alive)
+    drawn = []
+    for visitor in (one, other):
+        visitor._on_move(None)
+        visitor._rest.join(timeout=10)
+        position = visitor._client.camera.position
+        colors = [
+            sh_color(terms, (mean - position) / np.linalg.norm(mean - position))
+            for mean, terms in zip(
+                *(np.asarray(a)[alive] for a in (surfels.means, sh)), strict=True
+            )
+        ]
+        drawn.append(visitor._drawn.rgbs)
+        np.testing.assert_allclose(drawn[-1], np.clip(colors, 0, 1), atol=1e-4)
+    assert np.abs(drawn[0] - drawn[1]).max() > 0.02
+
+    one._supported.value = True
+    one._on_support()
+    page.work(timeout=1)
+    assert one._legend.visible and not other._legend.visible
+    # All five photographs see the middle of the plane: a color of the map, tinted.
+    middle = np.abs(np.asarray(surfels.means)[alive]).max(axis=1) < 0.3
+    assert (page.counts[middle] == 5).all()
+    tint = color_counts(page.counts)[0]
+    expected = 0.7 * tint + 0.3 * 255 * drawn[0]
+    np.testing.assert_allclose(one._drawn.rgbs, expected, atol=1)
+    np.testing.assert_array_equal(other._drawn.rgbs, drawn[1])
+    one._supported.value = False
+    one._on_support()
+    np.testing.assert_array_equal(one._drawn.rgbs, drawn[0])
+    one.leave()
+    one._drawn.rgbs = None
+    one._draw()
+    assert one._drawn.rgbs is None
+
+
 def test_the_page_shows_the_points_of_a_nerf(serve, kept):
     programs = Programs(TINY, load_run_scene(read_run(kept)))
     page, _ = serve(programs, types.SimpleNamespace(params={}))
     with pytest.raises(queue.Empty):
         page.work(timeout=0)
+    visitor, client = visit(page)
+    visitor._draw()
+    drawn = client.scene.add_point_cloud.called
+    assert drawn == bool(len(programs.scene.points)) and not client.scene.add_gaussian_splats.called
 
 
 def test_the_page_shows_failures_and_stays_up(serve, kept, capsys):
@@ -120,14 +198,15 @@ def test_the_page_shows_failures_and_stays_up(serve, kept, capsys):
     def fail(error):
         raise error
 
-    page._later("trying", lambda: fail(TrainingError("the loss was not finite")))
-    page._later("trying more", lambda: "done")
-    assert "still busy" in page._status.content
+    said = []
+    page.later("trying", lambda: fail(TrainingError("the loss was not finite")), said.append)
+    page.later("trying more", lambda: "done", said.append)
+    assert "still busy" in said[-1]
     page.work()
-    assert page._status.content == "the loss was not finite"
-    page._later("trying", lambda: fail(ValueError("a bug")))
+    assert said[-1] == "the loss was not finite"
+    page.later("trying", lambda: fail(ValueError("a bug")), said.append)
     page.work()
-    assert page._status.content == "trying failed (ValueError): see the terminal for details."
+    assert said[-1] == "trying failed (ValueError): see the terminal for details."
     assert "ValueError: a bug" in capsys.readouterr().err
 
 

@@ -177,8 +177,8 @@ class Method(NamedTuple):
       with_expected_depth: `(buffers, expected) -> buffers` of a field that renders its expected
         depth (true) or its median depth (false) as depth; None for fields without a choice.
       export: `(folder, stage, params, buffers) -> None` writes a stage's state for other programs.
-      gaussians: `(params, buffers) -> Gaussians`, what viewers draw; None: they draw the scene's
-        points.
+      gaussians: `(params, buffers, position) -> Gaussians`, what viewers draw, with the colors that
+        are seen from `position[3]`; None: they draw the scene's points.
       background: `(config) -> float`, gray level in [0, 1] behind the scene.
       refine: `(key, config, params, buffers, render, scene, pyramid) -> (params, buffers)` gives
         what `CoarseConfig` trained the room and the detail of `config`; `render` renders a camera,
@@ -193,6 +193,6 @@ class Method(NamedTuple):
     max_points: Callable[[Any], int | None] = lambda config: None
     with_expected_depth: Callable[[Any, bool], Any] | None = None
     export: Callable[[pathlib.Path, str, Any, Any], None] = lambda *state: None
-    gaussians: Callable[[Any, Any], Gaussians] | None = None
+    gaussians: Callable[[Any, Any, Any], Gaussians] | None = None
     background: Callable[[Any], float] = lambda config: 0.0
     refine: Callable[..., tuple[Any, Any]] | None = None

@@ -272,8 +272,8 @@ METHOD = Method(
     max_points=lambda config: config.capacity,
     with_expected_depth=with_expected_depth,
     export=export,
-    gaussians=lambda surfels, buffers: as_gaussians(
-        smoothed(surfels, buffers.interval), buffers.alive
+    gaussians=lambda surfels, buffers, position: as_gaussians(
+        smoothed(surfels, buffers.interval), buffers.alive, position
     ),
     background=lambda config: config.background or 0.0,
     refine=refine,

@@ -6,6 +6,7 @@
 from jaxcloseup.artifacts.gaussians import Gaussians, as_gaussians
 from jaxcloseup.artifacts.images import (
     Image,
+    color_counts,
     colorize_depth,
     colorize_error,
     colorize_normals,
@@ -27,6 +28,7 @@ __all__ = [
     "Image",
     "Mesh",
     "as_gaussians",
+    "color_counts",
     "colorize_depth",
     "colorize_error",
     "colorize_normals",

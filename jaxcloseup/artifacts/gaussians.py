@@ -7,11 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcloseup.geometry.rotations import quaternion_to_matrix
+from jaxcloseup.numerics import safe_divide, safe_norm
 from jaxcloseup.splats.spherical_harmonics import sh_to_rgb
 from jaxcloseup.splats.surfels import Surfels
 
 
 _MIN_LOG_SCALE = -20.0  # the smallest that compressed PLY can hold
+_colors = jax.jit(sh_to_rgb)
 
 
 class Gaussians(NamedTuple):
@@ -20,7 +22,7 @@ class Gaussians(NamedTuple):
     Attributes:
       means: `[M, 3]` centers.
       covariances: `[M, 3, 3]` covariances R diag(scale^2) R^T.
-      rgb: `[M, 3]` mean colors over all directions, in [0, 1].
+      rgb: `[M, 3]` colors in [0, 1].
       opacities: `[M]` opacities in [0, 1].
     """
 
@@ -41,17 +43,32 @@ def thickened(log_scales: np.ndarray) -> np.ndarray:
     return np.concatenate([log_scales, np.maximum(thin, _MIN_LOG_SCALE)], axis=1)
 
 
-def as_gaussians(surfels: Surfels, alive: jax.Array) -> Gaussians:
-    """Convert those of `N` surfels that are alive (`alive [N]`) and finite."""
+def as_gaussians(
+    surfels: Surfels, alive: jax.Array, position: np.ndarray | None = None
+) -> Gaussians:
+    """Convert those of `N` surfels that are alive (`alive [N]`) and finite.
+
+    Args:
+      surfels: `N` surfels.
+      alive: `[N]` bool.
+      position: `[3]` where a camera is that sees their colors, by all spherical harmonics; None:
+        the mean colors over all directions.
+    """
     rotations = np.asarray(quaternion_to_matrix(surfels.quaternions))
     axes = rotations * np.exp(thickened(np.asarray(surfels.log_scales)))[:, None, :]
-    rgb = sh_to_rgb(surfels.sh[:, :1], jnp.zeros_like(surfels.means))
+    sh, directions = surfels.sh[:, :1], jnp.zeros_like(surfels.means)
+    if position is not None:
+        ahead = surfels.means - jnp.asarray(position, surfels.means.dtype)[None]
+        sh, directions = surfels.sh, safe_divide(ahead, safe_norm(ahead, keepdims=True))
+    rgb = _colors(sh, directions)
     found = Gaussians(
         np.asarray(surfels.means),
         axes @ axes.swapaxes(1, 2),
         np.clip(rgb, 0, 1),
         np.asarray(jax.nn.sigmoid(surfels.opacity_logits)),
     )
-    finite = [np.isfinite(one).reshape(len(one), -1).all(axis=1) for one in found]
+    # Those that are left out must not depend on the position.
+    checked = (*found, np.asarray(surfels.sh))
+    finite = [np.isfinite(one).reshape(len(one), -1).all(axis=1) for one in checked]
     kept = np.asarray(alive) & np.all(finite, axis=0)
     return Gaussians(*(one[kept] for one in found))

@@ -19,6 +19,7 @@ Image = np.ndarray | jax.Array
 _LABEL_HEIGHT = 24
 _LEGEND_WIDTH = 360
 _UNSEEN = (230, 0, 126)  # magenta
+_FOOTPRINTS, _COUNTS = (1, 2, 4, 8), (-9, -5, -3, -2)  # where colors of support change
 
 
 def to_uint8(image: Image) -> np.ndarray:
@@ -140,23 +141,37 @@ def colorize_support(count: Image, footprint: Image) -> np.ndarray:
     Returns:
       uint8 `[H', W', 3]`; small images are enlarged so that their legends are readable.
     """
-    count, footprint = np.asarray(count), np.asarray(footprint)
-    unseen = count < 1
-    panels = []
-    for values, steps, last in (
-        (footprint, (1, 2, 4, 8), "coarser"),
-        (-count, (-9, -5, -3, -2), "1"),
-    ):
-        step = np.searchsorted(np.array(steps) * (1 + 1e-4 * np.sign(steps)), values)
-        colors = _map(np.linspace(0.95, 0.1, len(steps) + 1), cv2.COLORMAP_VIRIDIS)
-        colors = np.concatenate([colors.reshape(-1, 3), [_UNSEEN]]).astype(np.uint8)
-        image = colors[np.where(unseen, len(steps) + 1, step)]
+    unseen, panels = np.asarray(count) < 1, []
+    for values, steps in ((np.asarray(footprint), _FOOTPRINTS), (-np.asarray(count), _COUNTS)):
+        image, legend = _in_steps(values, unseen, steps)
         factor = -(-_LEGEND_WIDTH // image.shape[1])
         image = image.repeat(factor, axis=0).repeat(factor, axis=1)
-        texts = [f"<={s}" if s > 0 else f">={-s}" for s in steps] + [last, "unseen"]
-        panels.append(np.concatenate([image, _legend(colors, texts, image.shape[1])]))
+        panels.append(np.concatenate([image, legend(image.shape[1])]))
     titles = ["finest photograph's pixel, in pixels here", "photographs that saw it"]
     return side_by_side(panels, labels=titles)
+
+
+def color_counts(count: Image) -> tuple[np.ndarray, np.ndarray]:
+    """Colors uint8 `[..., 3]` of numbers of photographs `[...]`, as in `colorize_support`.
+
+    The second array is their legend, an image.
+    """
+    count = np.asarray(count)
+    colors, legend = _in_steps(-count, count < 1, _COUNTS)
+    return colors, legend(_LEGEND_WIDTH)
+
+
+def _in_steps(values, unseen, steps):
+    """Colors of values, and a function that draws their legend with a given width."""
+    step = np.searchsorted(np.array(steps) * (1 + 1e-4 * np.sign(steps)), values)
+    colors = _map(np.linspace(0.95, 0.1, len(steps) + 1), cv2.COLORMAP_VIRIDIS)
+    colors = np.concatenate([colors.reshape(-1, 3), [_UNSEEN]]).astype(np.uint8)
+    texts = [f"<={s}" if s > 0 else f">={-s}" for s in steps]
+    texts += ["coarser" if steps[0] > 0 else "1", "unseen"]
+    return (
+        colors[np.where(unseen, len(steps) + 1, step)],
+        lambda width: _legend(colors, texts, width),
+    )
 
 
 def side_by_side(
