@@ -179,3 +179,19 @@ def test_a_state_that_is_not_finite_is_refused(tmp_path):
     Checkpoints(tmp_path, RUN).save("baseline", 2, {"noise": bad}, {})
     with pytest.raises(CheckpointError, match=r"'noise'.* is not finite"):
         Checkpoints(tmp_path, RUN).load("baseline", noise(0))
+
+
+def test_a_state_of_a_version_that_lacked_a_field_loads_where_the_field_is_none(tmp_path):
+    Checkpoints(tmp_path, RUN).save("baseline", 1, {"alive": jnp.ones(3)}, {})
+    like = {"alive": jnp.zeros(3), "interval": None}
+    _, found, _ = Checkpoints(tmp_path, RUN).load("baseline", like)
+    assert found["interval"] is None and found["alive"].sum() == 3
+    like["interval"] = jnp.zeros(3)
+    with pytest.raises(CheckpointError, match=r"interval.* is missing"):
+        Checkpoints(tmp_path, RUN).load("baseline", like)
+
+
+def test_arrays_of_another_shape_are_refused(tmp_path):
+    Checkpoints(tmp_path, RUN).save("baseline", 1, {"alive": jnp.ones(3)}, {})
+    with pytest.raises(CheckpointError, match=r"alive.* is float32\[3\] instead of float32\[4\]"):
+        Checkpoints(tmp_path, RUN).load("baseline", {"alive": jnp.zeros(4)})

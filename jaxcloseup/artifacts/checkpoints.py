@@ -116,19 +116,18 @@ class Checkpoints:
         if step is None:
             return None
         items = ocp.args.Composite(
-            # Under other names the state comes back as nested dicts.
-            state=ocp.args.StandardRestore(None if stored_as else _plain(like)),
+            # As nested dicts: Orbax would refuse a state that lacks a field that is None in `like`.
+            state=ocp.args.StandardRestore(),
             progress=ocp.args.JsonRestore(),
         )
         try:
             found = manager.restore(step, args=items)
-            plain = found["state"]
-            if stored_as:
-                plain = jax.tree_util.tree_map_with_path(
-                    lambda path, _: _follow(found["state"], path, stored_as), like
-                )
+            plain = jax.tree_util.tree_map_with_path(
+                lambda path, leaf: _follow(found["state"], path, leaf, stored_as or {}),
+                _plain(like),
+            )
             progress = _checked(plain, found["progress"])
-        except (ValueError, KeyError, TypeError, OSError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:
             raise CheckpointError(
                 f"{self.folder / stage / str(step)} does not hold this run's state "
                 f"({reason(error)}): remove it to resume from an earlier one."
@@ -219,10 +218,18 @@ def _checksum(plain, progress):
     return value
 
 
-def _follow(tree, path, stored_as):
+def _follow(tree, path, like, stored_as):
     """The leaf of nested dicts and lists that lies at a pytree's path, under other names."""
     for key in path:
         name = jax.tree_util.keystr((key,), simple=True)
         name = stored_as.get(name, name)
-        tree = tree[int(name)] if isinstance(tree, list | tuple) else tree[name]
+        try:
+            tree = tree[int(name)] if isinstance(tree, list | tuple) else tree[name]
+        except (KeyError, IndexError):
+            raise ValueError(f"{jax.tree_util.keystr(path)} is missing") from None
+    if (tree.shape, tree.dtype) != (like.shape, like.dtype):
+        raise ValueError(
+            f"{jax.tree_util.keystr(path)} is {tree.dtype}{list(tree.shape)} instead of "
+            f"{like.dtype}{list(like.shape)}"
+        )
     return tree
