@@ -1,5 +1,6 @@
 """Start the process that solves, follow its progress, and say in a sentence why it failed."""
 
+import contextlib
 import importlib.util
 import json
 import os
@@ -62,14 +63,14 @@ def do(job: str, what: str, unit: str, log: pathlib.Path, **arguments: Any) -> A
             process.stdin.write(json.dumps({"job": job, **arguments}) + "\n")
             process.stdin.flush()
             for line in process.stdout:
-                answer = json.loads(line)
+                answer = json.loads(line) if line.endswith("\n") else {}
                 if "done" in answer:
                     report(answer["done"], answer["of"])
         except BrokenPipeError:
             pass
-        finally:
+        with contextlib.suppress(BrokenPipeError):
             process.stdin.close()
-            code = process.wait()
+        code = process.wait()
     if "result" not in answer:
         reason = f"ended with code {code}" if code >= 0 else f"was ended by {_signal(-code)}"
         if code == -signal.SIGKILL:

@@ -59,9 +59,9 @@ def list_files(folder: pathlib.Path) -> tuple[list[pathlib.Path], dict[str, str]
     left_out = {}
     for path in files:
         if path.suffix.lower() in _NEEDS_CONVERSION:
-            left_out[path.name] = "has a format that is not read: export it as JPEG"
+            left_out[printable(path.name)] = "has a format that is not read: export it as JPEG"
         elif path.suffix.lower() not in ENDINGS:
-            left_out[path.name] = "is not a photograph"
+            left_out[printable(path.name)] = "is not a photograph"
     if len(photographs) < FEWEST:
         others = f" beside {len(left_out)} files that are not" if left_out else ""
         raise ProcessingError(

@@ -127,7 +127,8 @@ def make_capture(request: Request, folder: pathlib.Path, stages: Stages) -> dict
 
 
 def _gather(request: Request, folder: pathlib.Path) -> dict[str, Any]:
-    """Write the photographs of the capture."""
+    """Write the photographs of the capture, instead of what an interrupted process wrote."""
+    shutil.rmtree(folder, ignore_errors=True)
     if request.images is None:
         copied, frames = extract_frames(request.video, request.count, folder)
         return {"copied": [each._asdict() for each in copied], "left_out": {}, "frames": frames}

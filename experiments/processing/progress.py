@@ -42,7 +42,8 @@ def progress(what: str, unit: str) -> Iterator[Report]:
                 print(_line(what, *said, rate(done)), flush=True)
 
         yield report
-        print(_line(what, *said, rate(said[0])), flush=True)
+        if first is not None:
+            print(_line(what, *said, rate(said[0])), flush=True)
         return
 
     columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()]

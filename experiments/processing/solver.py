@@ -31,7 +31,7 @@ from experiments.processing.pairs import pairs_to_match
 SEED = 0
 _LONGEST_SIDE = 2400  # pixels; features of larger photographs are found in reduced ones
 _MOST_FEATURES = 8192  # in a photograph
-_AT_ONCE = 4  # photographs for each thread between two lines of progress
+_AT_ONCE = 2  # photographs for each thread between two lines of progress
 _SECONDS = 2.0  # between two lines of progress on matches
 _ENOUGH = 30  # photographs of a lens, for eight parameters instead of four
 _RICHER = {"SIMPLE_RADIAL": "OPENCV", "SIMPLE_RADIAL_FISHEYE": "OPENCV_FISHEYE"}

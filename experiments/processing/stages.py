@@ -38,12 +38,15 @@ class Stages:
                 f"{self._file} cannot be read ({error}): name a new folder, or remove it"
             ) from error
         other = [name for name, value in made_from.items() if before.get(name) != value]
+        if not stages:  # nothing came of it
+            return
         if other:
             name = other[0]
+            what = f"{name} was {before.get(name)!s:.80} and is {made_from[name]!s:.80}"
+            what = "the files changed" if name == "files" else what
             raise ProcessingError(
-                f"--output_dir={folder} holds a capture made from something else ({name} was "
-                f"{before.get(name)!s:.80} and is {made_from[name]!s:.80}): name a new folder, or "
-                "remove it"
+                f"--output_dir={folder} holds a capture made from something else ({what}): name a "
+                "new folder, or remove it"
             )
         self._held["stages"] = stages
 
