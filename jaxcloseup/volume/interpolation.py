@@ -9,8 +9,8 @@ def weighted_rows(table: jax.Array, rows: jax.Array, weights: jax.Array) -> jax.
     """Sums over the corners of cells: `weights` times the `rows` of a table.
 
     On a CPU single numbers are gathered fastest, and whole rows are added up fastest. A loop over
-    corners keeps XLA from computing rows and weights anew for each number that it adds: a step
-    takes half the time of what JAX derives.
+    corners keeps XLA from computing rows and weights anew for each number that it adds: the
+    derivative takes half the time of one sum over all corners.
 
     Args:
       table: `[E, F]` trained features of vertices.
