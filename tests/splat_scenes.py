@@ -43,7 +43,7 @@ SCENES = {
     "far and small": random_scene(2, depth=(2.0, 3.0), log_scale=(-6.0, -3.0)),
 }
 VOLUMES = {
-    f"volumes {name}": random_scene(seed, num_scales=3, **kwargs)
+    f"volumes {name}": random_scene(seed, count=8, num_scales=3, **kwargs)
     for name, seed, kwargs in [
         ("in front", 0, dict(log_scale=(-4.0, -1.2))),
         ("through the camera", 1, dict(depth=(-0.5, 1.5), log_scale=(-3.0, -1.0))),
