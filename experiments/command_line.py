@@ -78,6 +78,12 @@ def start(main: Callable[[list[str]], None]) -> None:
 
 def job(name: str) -> types.ModuleType:
     """The module of `experiments.jobs` with this name; what it imports takes seconds."""
+    # Notes about missing accelerators, new fonts, every file of a checkpoint, and repeats of what
+    # the program prints do not concern the user. Some are written during imports.
+    for noisy in ("jax._src.xla_bridge", "matplotlib", "jaxcloseup"):
+        logging.getLogger(noisy).setLevel(logging.WARNING)
+    # Orbax logs errors with a traceback, and raises them too.
+    logging.getLogger("absl").setLevel(logging.CRITICAL)
     with progress.showing():
         return importlib.import_module(f"experiments.jobs.{name}")
 
@@ -161,17 +167,12 @@ def _describe_flag(flag):
 
 
 def set_up() -> None:
-    """Set up the compilation cache, and silence messages that do not concern the user."""
+    """Set up the compilation cache, and the form of warnings."""
     with contextlib.suppress(AttributeError):  # not a file
         sys.stdout.reconfigure(line_buffering=True)  # also where a file or a pipe is read along
     set_up_compilation_cache(FLAGS.compilation_cache)
-    # The program's own warnings are sentences for the user. Notes about missing accelerators, about
-    # every file of a checkpoint, and repeats of what the program prints are not.
+    # The program's own warnings are sentences for the user.
     warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
-    logging.getLogger("jax._src.xla_bridge").setLevel(logging.WARNING)
-    logging.getLogger("jaxcloseup").setLevel(logging.WARNING)
-    # Orbax logs errors with a traceback, and raises them too.
-    logging.getLogger("absl").setLevel(logging.CRITICAL)
 
 
 def set_up_compilation_cache(folder: str | None) -> None:

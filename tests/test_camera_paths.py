@@ -180,6 +180,7 @@ FLAT = np.eye(4).ravel().tolist()
         ({"camera_to_world": [math.nan, *FLAT[1:]]}, "must be 16 finite numbers"),
         ({"camera_to_world": [*FLAT[:12], 1, 2, 3, 1]}, "may be transposed"),
         ({"camera_to_world": [2, *FLAT[1:]]}, "not a rotation and a position"),
+        ({"camera_to_world": [1e300, *FLAT[1:]]}, "not a rotation and a position"),
         ({"camera_to_world": [-1, *FLAT[1:]]}, "not a rotation and a position"),
         ({"fov": None}, r"camera_path\[1\]: fov is missing"),
         ({"fov": 180}, "fov must be between 0 and 180"),

@@ -61,6 +61,7 @@ CAPACITY = r"config\.field\.capacity must be"
         ("manifest.json", lambda a: a | {"scene": 3}, "manifest.json: scene must be a text"),
         ("manifest.json", lambda _: NESTED, "manifest.json cannot be read .it is nested too deep"),
         (RUN, without("resolution"), "run.json: resolution must be a list"),
+        (RUN, lambda a: a | {"resolution": [32] * 99}, "resolution must be a width and a height"),
         (RUN, without("seed"), "run.json: seed must be a whole number"),
         (RUN, lambda a: a | {"seed": 2**70}, "run.json: seed must be a whole number"),
         (RUN, lambda a: a | {"config": None}, "run.json: config must be an object"),

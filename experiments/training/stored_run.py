@@ -80,6 +80,11 @@ def read_run(folder: pathlib.Path) -> StoredRun:
         raise RunError(f"--run={folder} is of a sweep or unknown: name a run of experiments.run")
     for fields, (name, kinds) in zip((about, identity), _FIELDS.items(), strict=True):
         _check_fields(folder / name, fields, kinds)
+    if len(identity["resolution"]) != 2:
+        raise RunError(
+            f"{folder / 'checkpoints/run.json'}: resolution must be a width and a height: restore "
+            "the file from a copy of the run"
+        )
     version = identity.get("version")
     try:
         preset, absent = preset_from_config(identity["config"], identity.get("method"))

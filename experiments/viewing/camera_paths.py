@@ -366,8 +366,9 @@ def _pose(label, entry):
             f"{label}: camera_to_world must end in the row 0, 0, 0, 1: it may be transposed"
         )
     rotation = matrix[:3, :3]
-    error = np.abs(rotation.T @ rotation - np.eye(3)).max()
-    if error > _RIGID or np.linalg.det(rotation) < 0:
+    with np.errstate(all="ignore"):
+        error = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if not error <= _RIGID or np.linalg.det(rotation) < 0:
         raise CameraError(
             f"{label}: camera_to_world is not a rotation and a position: remove scales and "
             "reflections"
