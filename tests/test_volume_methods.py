@@ -14,15 +14,13 @@ from test_sweep import assert_same_step
 from tiny_runs import TINY
 
 from experiments.methods import METHODS
-from experiments.training.arms import make_arm
 from experiments.training.programs import Programs
 from experiments.training.settings import plain_config
-from experiments.training.setup import initial_state, start_labels
-from experiments.training.sweep import stack_arms
+from experiments.training.setup import initial_state
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.scenes import load_scene
-from jaxcloseup.train import TrainState
+from jaxcloseup.train import TrainState, train_step
 from jaxcloseup.volume import intervals
 from jaxcloseup.volume.hash_grid import HashGridConfig
 from jaxcloseup.volume.mipnerf import MipNerfConfig, mipnerf
@@ -277,19 +275,24 @@ def test_a_resumed_training_is_the_same_to_the_last_bit(name, capture_folder, tm
     jax.tree.map(np.testing.assert_array_equal, ended.opt_state, whole.opt_state)
 
 
-@pytest.mark.parametrize("name", TRAINED)
-def test_an_arm_is_the_run_alone(name, capture_folder):
+@pytest.mark.parametrize("name", ["ngp", "tensorf"])
+def test_a_batch_of_steps_is_these_steps_alone(name, capture_folder):
+    """The arms of a sweep are such a batch; `test_sweep` has all that fields do not see of it."""
     with jax.numpy_dtype_promotion("standard"):
         programs, state = trained(name, capture_folder)
-        start = start_labels(programs, state, seed=0)
-        arms = [make_arm(arm, programs.preset).settings for arm in ("control", "rgb_tolerance=0.5")]
-        states, *data = stack_arms(arms, [start] * 2, len(jax.devices()))
-        together, metrics = programs.run("arms", states, start.sources.views, *data, count=1)
-        data = start.sources.views, start.sources, arms[1]
-        alone, _ = programs.run("random_closeups", start.state, *data, count=1)
-    assert not any(metrics["skipped"])
+        views = programs.scene.train
+        other, _ = programs.run("photographs", state, views, count=1)
+        other = other.replace(step=state.step)
+        states = jax.tree.map(lambda *x: jnp.stack(x), state, other).replace(step=state.step)
+        axes = TrainState(step=None, params=0, buffers=0, opt_state=0, key=0)
+        bound = {"field": programs.field, "optimizer": programs.optimizer}
+        step = functools.partial(train_step, **bound, config=programs.preset.train)
+        batch = jax.jit(jax.vmap(step, in_axes=(axes, None), out_axes=(axes, 0)))
+        together, metrics = batch(states, views)
+        alone, _ = programs.run("photographs", other, views, count=1)
+    assert not np.any(metrics["skipped"])
     arm = jax.tree.map(lambda leaf: leaf[1], together.replace(step=alone.step[None]))
-    assert_same_step(arm, alone, start.state)
+    assert_same_step(arm, alone, other)
 
 
 def test_a_grid_that_grows_shows_the_same_scene():
