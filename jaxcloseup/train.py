@@ -217,7 +217,7 @@ def closeup_step(
 def labeled_step(
     state: TrainState,
     views: Views | Windows,
-    labels: Views | Windows,
+    labels: Views,
     settings: PseudoSettings,
     *,
     field: RadianceField,
@@ -233,7 +233,7 @@ def labeled_step(
     Args:
       state: what is trained.
       views: training photographs.
-      labels: from `label_views`, or windows of finer ones.
+      labels: from `label_views`.
       settings: `label_loss_weight` and `lr_scale` count.
       field: static.
       optimizer: static.

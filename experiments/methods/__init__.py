@@ -16,6 +16,7 @@ from experiments.methods.method import (
     LabelConfig,
     Method,
     Preset,
+    TargetConfig,
     WindowConfig,
     pseudo_settings,
 )
@@ -39,6 +40,7 @@ __all__ = [
     "LabelConfig",
     "Method",
     "Preset",
+    "TargetConfig",
     "WindowConfig",
     "pseudo_settings",
 ]

@@ -16,13 +16,10 @@ from experiments.training.setup import LabelStart, label_targets, rendered_depth
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.photographs import Views
 from jaxcloseup.pseudo import PseudoSettings
-from jaxcloseup.pyramids import photograph_pyramid
 from jaxcloseup.train import TrainState
-from jaxcloseup.windows import Windows, photograph_windows, windows_that_see
+from jaxcloseup.windows import Windows, windows_that_see
 
 
-_FINER = 2  # times the photographs' training size, at which labels with detail are learned too
-_WHOLE_SHARE = 0.4  # of their steps that see whole views, not windows of finer ones
 _REPORTS = 10
 
 
@@ -37,7 +34,7 @@ class TargetData(NamedTuple):
     """
 
     photographs: Views | Windows
-    labels: Views | Windows
+    labels: Views
     settings: PseudoSettings
     steps: int
 
@@ -66,13 +63,9 @@ def target_data(
     """
     preset, photographs = programs.preset, programs.photographs
     settings = gated(preset.target_labels, gate)
-    how = preset.target_labels, settings, kept
-    labels = label_targets(programs, start, cameras, *how)
+    labels = label_targets(programs, start, cameras, preset.target_labels, settings, kept)
     steps = programs.method.target_steps(preset.field, len(labels))
     if isinstance(photographs, Windows) and preset.target_labels.label == "residual":
-        finer = label_targets(programs, start, _larger(cameras), *how)
-        pyramid = photograph_pyramid(finer, labels)
-        labels = photograph_windows(cameras, pyramid, whole_share=_WHOLE_SHARE)
         render = functools.partial(programs.render, start.state)
         depths = rendered_depths(render, cameras, programs.scene)
         seen = cameras, depths, start.sources.views, start.sources.depths
@@ -112,7 +105,7 @@ def fine_tune(
         return state
     data = target_data(programs, start, cameras, gate, kept)
     steps = min(data.steps, most or data.steps)
-    coverage = _coverage(data.labels)
+    coverage = float(jnp.mean(data.labels.weight))
     print(f"labels on {coverage:.0%} of the pixels to be rendered; {steps} steps", flush=True)
     if coverage == 0:
         print("nothing is fine-tuned")
@@ -131,19 +124,3 @@ def fine_tune(
     numbers = {key: value for key, value in values.items() if isinstance(value, float)}
     print("  ".join(f"{key} {value:.4g}" for key, value in numbers.items()))
     return state
-
-
-def _larger(cameras):
-    return cameras.replace(
-        intrinsics=_FINER * cameras.intrinsics,
-        height=_FINER * cameras.height,
-        width=_FINER * cameras.width,
-    )
-
-
-def _coverage(labels):
-    """Mean weight of the labels."""
-    if isinstance(labels, Windows):
-        weight = labels.pyramid.values[..., 3]
-        return float(jnp.mean(weight, dtype=jnp.float32)) / 255
-    return float(jnp.mean(labels.weight))
