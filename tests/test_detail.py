@@ -124,7 +124,7 @@ def test_target_views_may_be_labeled_by_their_detail(rendered, found, monkeypatc
     assert error(labels.rgb) < 0.9 * error(np.stack(seen))
     monkeypatch.setattr(programs, "run", lambda *data, count: (data, {"skipped": 0}))
     kind, begun, photographs, learned, _ = fine_tune(
-        programs, start, views.cameras, most=2, kept=path
+        programs, start, views.cameras, most=1, kept=path
     )
     assert (kind, begun, photographs) == ("target_views", state, programs.scene.train)
     jax.tree.map(np.testing.assert_array_equal, learned, labels)

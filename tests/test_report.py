@@ -27,6 +27,7 @@ def results(psnr, *, weight=None, detail=None, **changes):
             for stage, value in psnr.items()
         },
         "gate": gate,
+        "config": {"targets": None},
         "detail": detail and {"stage": detail},
         "history": {"closeup": [{"label_coverage": 0.254}]},
         "finer_resolution": None,
@@ -81,6 +82,12 @@ def test_stages_without_labels_share_the_row_of_their_control():
     assert [row[0] for row in body] == ["baseline", "control, closeup", "test_time"]
     _, body = tables(results(psnr, weight=0.1))["Close-ups"]
     assert [row[0] for row in body] == list(psnr)
+    by_warps = results(psnr | {"test_time_control": 20.0}, weight=0.0)
+    _, body = tables(by_warps)["Close-ups"]
+    assert body[-1][0] == "test_time_control, test_time"
+    by_detail = by_warps | {"config": {"targets": {"label": "residual"}}}
+    _, body = tables(by_detail)["Close-ups"]
+    assert [row[0] for row in body[-2:]] == ["test_time", "test_time_control"]
 
 
 def test_tables_show_the_finer_size_and_perceptual_distances():

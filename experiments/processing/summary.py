@@ -107,7 +107,7 @@ def draw_from_above(model: pathlib.Path, images: pathlib.Path, path: pathlib.Pat
       SceneError: the model cannot be read.
       OSError: the picture cannot be written.
     """
-    _, frames, (points, rgb) = read_colmap(model, images)
+    _, frames, (points, rgb), _ = read_colmap(model, images)
     poses = np.stack([frame.camtoworld for frame in frames])
     plane = _horizontal(poses[:, :, :3])
     if len(points) > _MOST_POINTS:
