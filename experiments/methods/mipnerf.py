@@ -2,8 +2,8 @@
 
 import dataclasses
 
-from experiments.methods.method import LabelConfig, Method, Preset, WindowConfig
-from experiments.methods.volumes import QUICK_LABELS, AdamConfig, DepthConfig, adam, maker
+from experiments.methods.method import LabelConfig, Preset, WindowConfig
+from experiments.methods.volumes import QUICK_LABELS, AdamConfig, DepthConfig, volumetric
 from jaxcloseup.train import TrainConfig
 from jaxcloseup.volume.mipnerf import MipNerfConfig, mipnerf
 
@@ -49,10 +49,4 @@ QUICK = Preset(
     windows=WindowConfig(finest=8),
 )
 
-METHOD = Method(
-    presets={"quick": QUICK, "paper": PAPER},
-    make_field=maker(mipnerf),
-    make_optimizer=adam,
-    renders_pixels=True,
-    target_steps=lambda config, count: config.target_steps,
-)
+METHOD = volumetric(mipnerf, quick=QUICK, paper=PAPER)

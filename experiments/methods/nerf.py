@@ -5,7 +5,13 @@ import dataclasses
 import optax
 
 from experiments.methods.method import LabelConfig, Method, Preset, WindowConfig
-from experiments.methods.volumes import QUICK_LABELS, DepthConfig, depth_supervision, unit_cube
+from experiments.methods.volumes import (
+    QUICK_LABELS,
+    AdamConfig,
+    DepthConfig,
+    depth_supervision,
+    unit_cube,
+)
 from jaxcloseup.field import RadianceField
 from jaxcloseup.scene import Scene
 from jaxcloseup.train import TrainConfig
@@ -13,22 +19,16 @@ from jaxcloseup.volume.nerf import NerfConfig, nerf
 
 
 @dataclasses.dataclass(frozen=True)
-class NerfTrainingConfig(NerfConfig, DepthConfig):
+class NerfTrainingConfig(NerfConfig, DepthConfig, AdamConfig):
     """A NeRF and its training.
 
     Attributes:
-      initial_lr: Adam's learning rate at the first step.
-      lr_decay: factor on it over `lr_decay_steps`, along an exponential through all stages.
-      lr_decay_steps: see `lr_decay`.
       normalize: scale the scene to the unit cube around what the cameras look at.
-      target_steps: steps on all target views together.
     """
 
     initial_lr: float = 5e-4
-    lr_decay: float = 0.1
     lr_decay_steps: int = 250_000
     normalize: bool = False
-    target_steps: int = 200
 
 
 PAPER = Preset(

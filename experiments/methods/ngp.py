@@ -2,8 +2,8 @@
 
 import dataclasses
 
-from experiments.methods.method import LabelConfig, Method, Preset, WindowConfig
-from experiments.methods.volumes import QUICK_LABELS, AdamConfig, DepthConfig, adam, maker
+from experiments.methods.method import LabelConfig, Preset, WindowConfig
+from experiments.methods.volumes import QUICK_LABELS, AdamConfig, DepthConfig, volumetric
 from jaxcloseup.train import TrainConfig
 from jaxcloseup.volume.hash_grid import HashGridConfig
 from jaxcloseup.volume.ngp import NgpConfig, ngp
@@ -48,11 +48,4 @@ QUICK = Preset(
     windows=WindowConfig(),
 )
 
-
-METHOD = Method(
-    presets={"quick": QUICK, "paper": PAPER},
-    make_field=maker(ngp),
-    make_optimizer=adam,
-    renders_pixels=True,
-    target_steps=lambda config, count: config.target_steps,
-)
+METHOD = volumetric(ngp, quick=QUICK, paper=PAPER)

@@ -2,8 +2,8 @@
 
 import dataclasses
 
-from experiments.methods.method import LabelConfig, Method, Preset, WindowConfig
-from experiments.methods.volumes import QUICK_LABELS, AdamConfig, DepthConfig, adam, maker
+from experiments.methods.method import LabelConfig, Preset, WindowConfig
+from experiments.methods.volumes import QUICK_LABELS, AdamConfig, DepthConfig, volumetric
 from jaxcloseup.train import TrainConfig
 from jaxcloseup.volume.tensorf import TensorfConfig, tensorf
 
@@ -53,10 +53,4 @@ QUICK = Preset(
     windows=WindowConfig(),
 )
 
-METHOD = Method(
-    presets={"quick": QUICK, "paper": PAPER},
-    make_field=maker(tensorf),
-    make_optimizer=adam,
-    renders_pixels=True,
-    target_steps=lambda config, count: config.target_steps,
-)
+METHOD = volumetric(tensorf, quick=QUICK, paper=PAPER)

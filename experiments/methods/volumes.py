@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import optax
 
-from experiments.methods.method import LabelConfig
+from experiments.methods.method import LabelConfig, Method, Preset
 from experiments.methods.sightings import find_sightings
 from jaxcloseup.field import RadianceField
 from jaxcloseup.scene import Scene
@@ -82,6 +82,22 @@ def adam(config: AdamConfig, scene: Scene) -> optax.GradientTransformation:
     del scene
     rate = optax.exponential_decay(config.initial_lr, config.lr_decay_steps, config.lr_decay)
     return optax.adam(rate, b1=0.9, b2=0.99, eps=1e-15)
+
+
+def volumetric(field: Callable[..., RadianceField], **presets: Preset) -> Method:
+    """The method of a volumetric field in unit coordinates, trained by `adam`.
+
+    Args:
+      field: as in `maker`.
+      **presets: by name; the first one is the default.
+    """
+    return Method(
+        presets=presets,
+        make_field=maker(field),
+        make_optimizer=adam,
+        renders_pixels=True,
+        target_steps=lambda config, count: config.target_steps,
+    )
 
 
 # A short training leaves depth errors of several per cent, under which the paper's labels are worse

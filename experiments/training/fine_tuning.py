@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from experiments import progress
-from experiments.training.gate import gated, weigh
+from experiments.training.gate import gated, lets_in, weigh
 from experiments.training.loop import TrainingError
 from experiments.training.programs import Programs
 from experiments.training.setup import LabelStart, label_targets, rendered_depths
@@ -37,12 +37,6 @@ class TargetData(NamedTuple):
     labels: Views
     settings: PseudoSettings
     steps: int
-
-
-def may_label(programs: Programs, gate: Mapping[str, Any] | None) -> bool:
-    """Whether the gate, if there is one, lets labels of target views in."""
-    warped = programs.preset.target_labels.label == "warp"
-    return not warped or gate is None or gate["weight"] > 0
 
 
 def target_data(
@@ -100,7 +94,7 @@ def fine_tune(
       TrainingError: no step was finite.
     """
     gate, state = weigh(programs, start), start.state
-    if not may_label(programs, gate):
+    if not lets_in(programs.preset.target_labels, gate):
         print("nothing is fine-tuned")
         return state
     data = target_data(programs, start, cameras, gate, kept)

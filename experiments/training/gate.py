@@ -53,6 +53,11 @@ def weigh(programs: Programs, start: LabelStart) -> dict[str, Any] | None:
     return found
 
 
+def lets_in(labels: LabelConfig, gate: Mapping[str, Any] | None) -> bool:
+    """Whether labels have any weight: the gate, if there is one, may shut warped ones out."""
+    return labels.label != "warp" or gate is None or gate["weight"] > 0
+
+
 def gated(labels: LabelConfig, gate: Mapping[str, Any] | None) -> PseudoSettings:
     """The settings of labels; the gate scales the weight of warped ones."""
     settings = pseudo_settings(labels)

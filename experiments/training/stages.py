@@ -12,8 +12,8 @@ from experiments.evaluation.audit import audit_labels, left_out_curve
 from experiments.evaluation.renders import write_truth
 from experiments.evaluation.scores import NO_PERCEPTUAL, Perceptual
 from experiments.training.detail import detail_path, detailed, find_detail
-from experiments.training.fine_tuning import may_label, target_data
-from experiments.training.gate import gated, weigh
+from experiments.training.fine_tuning import target_data
+from experiments.training.gate import gated, lets_in, weigh
 from experiments.training.names import STAGES
 from experiments.training.programs import Programs
 from experiments.training.scoring import HeldOut, Scorer, hold_out
@@ -102,7 +102,7 @@ def run_stages(
         return stage, state
 
     # Without labels `closeup` is its control: the same steps on the same photographs.
-    use_labels = gate is None or preset.labels.label != "warp" or gate["weight"] > 0
+    use_labels = lets_in(preset.labels, gate)
     if "control" in to_run or ("closeup" in to_run and not use_labels):
         latest = continue_from(baseline, "control", "photographs")
     if "closeup" in to_run and use_labels:
@@ -150,7 +150,7 @@ def train_for_targets(
         scorer.score(name, state)
         return state
 
-    labeled = may_label(programs, gate)
+    labeled = lets_in(programs.preset.target_labels, gate)
     if controlled or not labeled:
         without = train(control, "photographs", data.settings.lr_scale)
     if labeled:
