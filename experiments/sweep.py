@@ -4,7 +4,8 @@
 
 Stage 1 is trained once for each seed and copied to every arm; arms of a seed draw the same random
 numbers, so that they differ by their settings alone. Interrupted, the same command with --resume
-goes on to the same tables.
+goes on to the same tables. With --methods every method is swept on every scene, each in a process
+of its own, and one table has them all.
 """
 
 from absl import flags
@@ -14,10 +15,12 @@ from experiments.training import define_flags
 from experiments.training.names import ARMS
 
 
+FLAGS = flags.FLAGS
 flags.adopt_module_key_flags(define_flags)  # these are in --help too
 for _name in ("output_dir", "lpips_weights", "compilation_cache"):
     flags.declare_key_flag(_name)
 flags.DEFINE_list("scenes", ["table"], "built-in scenes or folders")
+flags.DEFINE_list("methods", [], "sweep these methods, one after another; default: --method")
 flags.DEFINE_integer("seeds", 3, "random seeds 0, 1, ...", lower_bound=1)
 flags.DEFINE_list(
     "arms",
@@ -42,8 +45,8 @@ flags.DEFINE_integer("process_id", None, "which of them this is, from 0", lower_
 
 
 def main(_: list[str]) -> None:
-    """Run the sweep of the flags on every scene."""
-    job("sweep").main()
+    """Run the sweep of the flags on every scene, for every method."""
+    job("sweep_methods" if FLAGS.methods else "sweep").main()
 
 
 if __name__ == "__main__":

@@ -10,7 +10,13 @@ import pytest
 
 from experiments.evaluation.ladder import MAGNIFICATIONS, describe_ladder, ladder_targets
 from experiments.reporting.plots import Curve, gains_over, line_plot, zoom_curves
-from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_rays
+from jaxcloseup.geometry.cameras import (
+    pixel_grid,
+    pixels_to_points,
+    pixels_to_rays,
+    points_to_pixels,
+)
+from jaxcloseup.photographs import camera_at
 from jaxcloseup.scene import Surface
 from jaxcloseup.scenes import Scene
 
@@ -37,19 +43,33 @@ def ladder():
 
 def test_each_rung_is_magnification_times_nearer_to_one_point(ladder):
     scene, targets = ladder
-    assert list(targets) == [f"zoom_{m}" for m in MAGNIFICATIONS]
+    assert list(targets) == [f"zoom_{m:g}" for m in MAGNIFICATIONS]
     for i, name in enumerate(scene.names["test_far"]):
-        centers = np.stack([targets[f"zoom_{m}"][i].camera.position for m in MAGNIFICATIONS])
+        nearer = [m for m in MAGNIFICATIONS if m >= 1]
+        centers = np.stack([targets[f"zoom_{m:g}"][i].camera.position for m in nearer])
         assert targets["zoom_1"][i].name == name
         np.testing.assert_allclose(centers[0], scene.test_far.cameras.position[i], atol=1e-6)
         # All cameras stand on one line, which meets the plane at the anchor.
         anchor = centers[0] + (centers[1] - centers[0]) * 2
         np.testing.assert_allclose(anchor[2], 0, atol=1e-5)
-        for m, center in zip(MAGNIFICATIONS, centers, strict=True):
+        for m, center in zip(nearer, centers, strict=True):
             np.testing.assert_allclose(anchor - center, (anchor - centers[0]) / m, atol=1e-5)
             np.testing.assert_array_equal(
-                targets[f"zoom_{m}"][i].camera.rotation, scene.test_far.cameras.rotation[i]
+                targets[f"zoom_{m:g}"][i].camera.rotation, scene.test_far.cameras.rotation[i]
             )
+
+
+def test_the_rung_below_1_sees_twice_as_far_to_each_side(ladder):
+    scene, targets = ladder
+    for i, target in enumerate(targets["zoom_0.5"]):
+        view, camera = camera_at(scene.test_far.cameras, i), target.camera
+        np.testing.assert_array_equal(camera.camtoworld, view.camtoworld)
+        # A point that the view has at some offset from its center lies at half of it.
+        center = np.asarray(view.intrinsics[2:])
+        pixels = np.array([[3.0, 2.0], [20.0, 9.0]], np.float32)
+        points = pixels_to_points(view, pixels, np.float32([2.0, 3.0]))
+        seen, _ = points_to_pixels(camera, points)
+        np.testing.assert_allclose(np.asarray(seen) - center, (pixels - center) / 2, atol=1e-4)
 
 
 def test_targets_hold_the_exact_surface(ladder):
@@ -70,7 +90,7 @@ def test_a_capture_has_no_ladder(ladder):
 def test_curves_and_gains():
     def splits(*psnr):
         return {"test": {"psnr": 1.0}} | {
-            f"zoom_{m}": {"psnr": value} for m, value in zip((1, 4, 16), psnr, strict=True)
+            f"zoom_{m:g}": {"psnr": value} for m, value in zip((1, 4, 16), psnr, strict=True)
         }
 
     stages = {"control": splits(30.0, 25.0, None), "closeup": splits(29.5, 26.0, 20.0)}
@@ -81,7 +101,7 @@ def test_curves_and_gains():
     ]
     assert gains_over(curves, "control")[1] == Curve("closeup", [1, 4], [-0.5, 1.0])
     assert gains_over(curves[1:], "control") == []
-    assert describe_ladder(stages["control"]).endswith("4x nearer 25.00, 16x nearer -")
+    assert describe_ladder(stages["control"]).endswith("4x 25.00, 16x -")
 
 
 def test_a_plot_is_one_svg_element_with_its_labels():

@@ -2,6 +2,7 @@
 
 Each held-out ordinary view gives a camera for each rung. The camera moves 1, 2, 4, 8 and 16 times
 nearer to one point of the view without turning, so only the magnification changes along the ladder.
+The rung below 1 has half the view's focal length: moving back might lead out of the scene.
 """
 
 from collections.abc import Iterable, Mapping
@@ -18,7 +19,7 @@ from jaxcloseup.scenes import Scene
 from jaxcloseup.support import count_seen
 
 
-MAGNIFICATIONS = (1, 2, 4, 8, 16)
+MAGNIFICATIONS = (0.5, 1, 2, 4, 8, 16)
 PREFIX = "zoom_"
 MIN_PHOTOGRAPHS = 3  # photographs that must see the point of a ladder, if any point has so many
 
@@ -37,21 +38,21 @@ def ladder_targets(scene: Scene, exact_depths: jax.Array) -> dict[str, list[Targ
     if scene.surface is None or scene.test_far is None:
         return {}
     surface, count = scene.surface, jax.jit(count_seen)
-    ladder: dict[str, list[Target]] = {f"{PREFIX}{m}": [] for m in MAGNIFICATIONS}
+    ladder: dict[str, list[Target]] = {f"{PREFIX}{m:g}": [] for m in MAGNIFICATIONS}
     for i, name in enumerate(scene.names["test_far"]):
         far = camera_at(scene.test_far.cameras, i)
         pixels = pixel_grid(far.height, far.width)
-        anchor = None
+        depth = surface(far).depth
+        seen = count(far, pixels, depth, scene.train, exact_depths)
+        anchor = _anchor(jax.random.key(i), far, depth, seen)
         for m in MAGNIFICATIONS:
-            camera = far if anchor is None else _nearer(far, anchor, m)
+            camera = _nearer(far, anchor, m) if m > 1 else _wider(far, m)
             seen_surface = surface(camera)
             seen = count(camera, pixels, seen_surface.depth, scene.train, exact_depths)
-            if anchor is None:
-                anchor = _anchor(jax.random.key(i), camera, seen_surface.depth, seen)
             weight = jnp.ones(seen.shape, jnp.float32)
             rgb = seen_surface.rgb.astype(jnp.float32)
             target = Target(name, camera, rgb, weight, seen, seen_surface)
-            ladder[f"{PREFIX}{m}"].append(target)
+            ladder[f"{PREFIX}{m:g}"].append(target)
     return ladder
 
 
@@ -72,14 +73,19 @@ def _nearer(camera: Camera, anchor: jax.Array, magnification: float) -> Camera:
     return camera.replace(camtoworld=camera.camtoworld.at[:, 3].set(position))
 
 
+def _wider(camera: Camera, magnification: float) -> Camera:
+    focal = camera.intrinsics[:2] * magnification
+    return camera.replace(intrinsics=camera.intrinsics.at[:2].set(focal))
+
+
 def describe_ladder(splits: Mapping[str, Any]) -> str:
     """Return the PSNR at each magnification as one line."""
-    rungs = ((m, splits[f"{PREFIX}{m}"]["psnr"]) for m in rungs_of(splits))
-    return "PSNR (dB) " + ", ".join(
-        f"{m}x nearer {'-' if value is None else f'{value:.2f}'}" for m, value in rungs
+    rungs = ((m, splits[f"{PREFIX}{m:g}"]["psnr"]) for m in rungs_of(splits))
+    return "PSNR (dB) by magnification: " + ", ".join(
+        f"{m:g}x {'-' if value is None else f'{value:.2f}'}" for m, value in rungs
     )
 
 
-def rungs_of(splits: Iterable[str]) -> list[int]:
+def rungs_of(splits: Iterable[str]) -> list[float]:
     """Return the magnifications of the ladder's splits, in ascending order."""
-    return sorted(int(name.removeprefix(PREFIX)) for name in splits if name.startswith(PREFIX))
+    return sorted(float(name.removeprefix(PREFIX)) for name in splits if name.startswith(PREFIX))

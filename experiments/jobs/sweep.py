@@ -51,7 +51,12 @@ def _hosts() -> tuple[str, int, int] | None:
     return hosts
 
 
-def _check_flags(preset: Preset) -> None:
+def check_flags(preset: Preset) -> None:
+    """Check the scenes and arms that the flags name.
+
+    Raises:
+      ValueError: one sentence that names the flag.
+    """
     for flag in ("scenes", "arms"):
         values = getattr(FLAGS, flag)
         if not values or len(set(values)) < len(values):
@@ -91,7 +96,7 @@ def main() -> None:
         if FLAGS.tensorboard:
             check_tensorboard()
         preset = training_flags.preset_from_flags()
-        _check_flags(preset)
+        check_flags(preset)
         output_dir = pathlib.Path(FLAGS.output_dir or "")
         if first:
             output_dir = training_flags.choose_output_dir(

@@ -17,8 +17,8 @@ def zoom_plots(stages: Mapping[str, Any]) -> list[str]:
     axis = {"x": "magnification (times nearer)", "doubling": True}
     plots = [line_plot(curves, y="PSNR (dB)", title="PSNR", **axis)]
     text = (
-        "Cameras move up to 16 times nearer to points of the ordinary views. The first plot shows "
-        "the mean PSNR of each stage; higher is better."
+        "Cameras move up to 16 times nearer to points of the ordinary views; at 0.5 they have half "
+        "the focal length. The first plot shows the mean PSNR of each stage; higher is better."
     )
     gains = gains_over(curves, "control")
     if gains:

@@ -86,7 +86,7 @@ def zoom_curves(stages: Mapping[str, Mapping[str, Any]], metric: str = "psnr") -
     """
     curves = []
     for stage, splits in stages.items():
-        rungs = [(m, splits[f"{PREFIX}{m}"][metric]) for m in rungs_of(splits)]
+        rungs = [(m, splits[f"{PREFIX}{m:g}"][metric]) for m in rungs_of(splits)]
         known = [(m, value) for m, value in rungs if value is not None]
         if known:
             curves.append(Curve(stage, *map(list, zip(*known, strict=True))))

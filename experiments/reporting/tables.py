@@ -136,7 +136,7 @@ def gain_curves(scenes: Mapping[str, Mapping[str, Any]]) -> list[Curve]:
     for arm in _arms(scenes):
         found = {}
         for m in MAGNIFICATIONS:
-            gain = gain_over_control(scenes, arm, f"{PREFIX}{m}")
+            gain = gain_over_control(scenes, arm, f"{PREFIX}{m:g}")
             if gain is not None:
                 found[m] = gain
         if found:
@@ -197,8 +197,9 @@ def write_sweep(
     if curves:
         parts += [
             "<h2>Gain by magnification</h2><p>Cameras move up to 16 times nearer to points of the "
-            "ordinary views. The plot shows each arm's PSNR above <i>control</i>, with its 95 % "
-            "interval shaded: an arm helps where its curve is above 0.</p>",
+            "ordinary views; at 0.5 they have half the focal length. The plot shows each arm's "
+            "PSNR above <i>control</i>, with its 95 % interval shaded: an arm helps where its "
+            "curve is above 0.</p>",
             "<div class=plots>",
             line_plot(
                 curves,

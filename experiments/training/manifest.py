@@ -17,6 +17,12 @@ from jaxcloseup.files import read_object, write_json
 from jaxcloseup.scenes import Scene
 
 
+try:
+    import resource
+except ImportError:  # not a Unix: what a run uses is not measured
+    resource = None
+
+
 NAME = "manifest.json"
 _HASHED = (
     "rgb, weight, camtoworld and intrinsics of the training views, points and their rgb, near and "
@@ -27,7 +33,7 @@ _HASHED = (
 def write_manifest(
     folder: pathlib.Path, about: Mapping[str, Any], seconds: Mapping[str, Any] | None = None
 ) -> None:
-    """Write `manifest.json` atomically.
+    """Write `manifest.json` atomically; at the end, also the core-seconds and the peak of memory.
 
     A run that another commit continues prints a warning.
 
@@ -48,7 +54,9 @@ def write_manifest(
             stacklevel=2,
         )
     git = {"git_commit": commit, "git_changed": changed}
-    write_json(folder / NAME, {**about, **git, "finished": seconds is not None, "seconds": seconds})
+    used = {} if seconds is None else _resources_used()
+    ended = {"finished": seconds is not None, "seconds": seconds, **used}
+    write_json(folder / NAME, {**about, **git, **ended})
 
 
 def about_scene(scene: Scene, load_options: Mapping[str, Any]) -> dict[str, Any]:
@@ -114,6 +122,15 @@ def _hash(arrays):
         digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
         digest.update(array.data)
     return digest.hexdigest()
+
+
+def _resources_used():
+    """Core-seconds and the largest resident memory in bytes, of this process since it began."""
+    if resource is None:
+        return {}
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    unit = 1 if platform.system() == "Darwin" else 1024
+    return {"core_seconds": used.ru_utime + used.ru_stime, "peak_bytes": used.ru_maxrss * unit}
 
 
 def git_commit(folder: pathlib.Path) -> tuple[str | None, bool | None]:
