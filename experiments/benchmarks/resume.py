@@ -1,6 +1,7 @@
-"""A short run, killed at ten random moments and resumed each time, against an uninterrupted run.
+"""Five short runs, killed fifty times (-9) and resumed each time, against an uninterrupted run.
 
-All metrics and the history of every stage must be the same to the last bit.
+Kills come at random within the stages of a run, the first checkpoint, the gate, an evaluation and
+the report among them. All metrics and the history of every stage must be the same to the last bit.
 """
 
 import json
@@ -13,52 +14,75 @@ import tempfile
 import time
 
 
-KILLS = 10
-KILLS_PER_RUN = 2  # later kills would hit the restart, and no longer stage 1
+RUNS = 5
+KILLS_PER_RUN = 10
 COMMAND = (
-    "-m",
-    "experiments.run",
-    "--scene=table",
-    "--set=baseline_steps=700",  # relocation, harmonics and regularizers start earlier
-    "--set=closeup_steps=20",
-    "--save_every=50",
+    *("-m", "experiments.run", "--scene=table", "--save_every=20"),
+    *("--set=coarse.steps=150", "--set=baseline_steps=60", "--set=closeup_steps=20"),
+    *("--set=steps_per_target=1", "--set=fewest_target_steps=10"),
 )
+# What a run prints as it begins each part, in order. These four are in every run's kills.
+ALWAYS = ("first checkpoint", "comparing labels with left-out", "scoring control", "writing the")
+MOMENTS = (
+    *("loading table", ALWAYS[0], "coarse_baseline", "adding surfels", "] baseline", "rendering"),
+    *(ALWAYS[1], "] control", ALWAYS[2], "] closeup", "scoring closeup", "making the detail"),
+    *("scoring detail", "] test_time", "with the truth", "rendering a dolly", ALWAYS[3]),
+)
+LATEST = 3.0  # seconds between what is printed and the kill
 
 
 def run() -> None:
-    """Print the checkpoint kept at each kill, and check that all runs end the same."""
+    """Print what each kill interrupted, and check that all runs end the same."""
+    rng = random.Random(0)
     with tempfile.TemporaryDirectory() as folder:
         root = pathlib.Path(folder)
         start = time.perf_counter()
-        _start(root / "uninterrupted", resume=False).wait()
-        expected = _outcome(root / "uninterrupted")
-        whole = time.perf_counter() - start
-        print(f"uninterrupted: {whole:.0f} s")
-        rng, killed, attempt = random.Random(0), 0, 0
-        while killed < KILLS:
-            target, before = root / f"killed_{attempt}", killed
-            while not (target / "report.html").exists():
-                process = _start(target, resume=(target / "checkpoints").is_dir())
-                if killed < min(KILLS, before + KILLS_PER_RUN):
-                    time.sleep(rng.uniform(0.1, 0.6) * whole)
-                    if process.poll() is None:
-                        process.send_signal(signal.SIGKILL)
-                        killed += 1
-                        steps = sorted(target.glob("checkpoints/*/[0-9]*"))
-                        last = "/".join(steps[-1].parts[-2:]) if steps else "none"
-                        print(f"kill {killed}: the newest checkpoint is {last}", flush=True)
-                if process.wait() not in (0, -signal.SIGKILL):
-                    raise AssertionError((root / "log.txt").read_text()[-2000:])
-            attempt += 1
+        if _start(root / "uninterrupted", root / "log.txt").wait():
+            raise AssertionError((root / "log.txt").read_text()[-2000:])
+        print(f"uninterrupted: {time.perf_counter() - start:.0f} s", flush=True)
+        expected, kills = _outcome(root / "uninterrupted"), 0
+        for index in range(RUNS):
+            others = [moment for moment in MOMENTS if moment not in ALWAYS]
+            chosen = {*ALWAYS, *rng.sample(others, KILLS_PER_RUN - len(ALWAYS))}
+            target = root / f"killed_{index}"
+            for moment in sorted(chosen, key=MOMENTS.index):
+                kills += _kill(target, root / "log.txt", moment, rng.uniform(0, LATEST))
+                steps = sorted(target.glob("checkpoints/*/[0-9]*"))
+                newest = "/".join(steps[-1].parts[-2:]) if steps else "none"
+                print(f"kill {kills}, {moment}: the newest checkpoint is {newest}", flush=True)
+            if _start(target, root / "log.txt").wait():
+                raise AssertionError((root / "log.txt").read_text()[-2000:])
             if _outcome(target) != expected:
-                raise AssertionError("a run that was killed and resumed ended differently")
-        print(f"{killed} kills, {attempt} runs: the same metrics and history every time")
+                raise AssertionError(f"run {index} was killed and resumed, and ended differently")
+    print(f"{kills} kills, {RUNS} runs: the same metrics and history every time")
 
 
-def _start(folder, *, resume):
-    flags = [f"--output_dir={folder}", *(["--resume"] if resume else [])]
-    with (folder.parent / "log.txt").open("a") as log:
-        return subprocess.Popen([sys.executable, *COMMAND, *flags], stdout=log, stderr=log)
+def _kill(folder, log, moment, delay):
+    """Start or resume a run, and kill it `delay` seconds after a moment; False if it ended."""
+    process = _start(folder, log)
+    while process.poll() is None:
+        if moment == ALWAYS[0]:
+            reached = any(folder.glob("checkpoints/*/*"))
+        else:
+            reached = moment in log.read_text()
+        if reached:
+            time.sleep(delay / 10 if moment == ALWAYS[0] else delay)
+            break
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    if process.wait() not in (0, -signal.SIGKILL):
+        raise AssertionError(log.read_text()[-2000:])
+    return process.returncode != 0
+
+
+def _start(folder, log):
+    resume = ["--resume"] if (folder / "checkpoints").is_dir() else []
+    # One that was killed before its first checkpoint has left nothing to resume.
+    for one in () if resume or not folder.is_dir() else folder.iterdir():
+        one.unlink()
+    with log.open("w") as file:
+        command = [sys.executable, *COMMAND, f"--output_dir={folder}", *resume]
+        return subprocess.Popen(command, stdout=file, stderr=file)
 
 
 def _outcome(folder):

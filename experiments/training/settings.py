@@ -5,6 +5,7 @@ hold it (`field`, `train` or `labels`): `capacity`, `density.growth`, `rgb_toler
 """
 
 import dataclasses
+import difflib
 import math
 import sys
 import types
@@ -134,9 +135,12 @@ def with_settings(preset: Preset, given: Sequence[str], *, flag: str = "--set=")
         if not equals:
             raise ValueError(f"{flag}{text} must be name=value, as in label_loss_weight=0.1")
         if name not in known:
+            parts = [one for one in known if f".{name}." in f".{one}."]
+            near = parts or difflib.get_close_matches(name, known, n=3)
+            meant = f"perhaps {' or '.join(near)} is meant; " if near else ""
             raise ValueError(
-                f"{flag}{text}: method {preset.method} has no setting {name}: choose one of "
-                + ", ".join(sorted(known))
+                f"{flag}{text}: method {preset.method} has no setting {name}: {meant}--set=help "
+                "lists all"
             )
         if name in changed:
             raise ValueError(f"{flag}{text} sets {name} twice: leave one out")

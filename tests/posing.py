@@ -1,0 +1,99 @@
+"""Photographs with known poses to make poses of, and how far found poses are from these."""
+
+import json
+
+import jax
+import numpy as np
+import PIL.Image
+from absl import flags
+from absl.testing import flagsaver
+
+from experiments import process as program
+from jaxcloseup.photographs import camera_at
+from jaxcloseup.procedural import loading, modeling, planning
+from jaxcloseup.procedural.builtin import SCENES
+from jaxcloseup.scenes import load_scene
+
+
+WIDTH, HEIGHT, FRAMES, OTHERS = 480, 270, 20, 3
+FOCAL = planning.FOCAL * WIDTH / planning.WIDTH
+FOCAL_IN_EXIF = 31  # in mm of a frame 36 mm x 24 mm
+
+
+def photograph(name, poses):
+    """Photographs `[V, H, W, 3]` of a built-in scene in flat light, which need no baking."""
+    world = modeling.build_world(SCENES[name](), lambda *scene: np.ones((len(scene[3]), 4)))
+    cameras = loading._cameras(poses, WIDTH, HEIGHT)
+    with jax.numpy_dtype_promotion("standard"):
+        rgb = [
+            np.asarray(loading._render_rgb(world, camera_at(cameras, i), samples=2))
+            for i in range(len(poses))
+        ]
+    return np.rint(np.stack(rgb) * 255).astype(np.uint8)
+
+
+def walk_around(name, count):
+    """Poses `[V, 3, 4]` of a camera that moves around a built-in scene."""
+    rig, poses = SCENES[name]().rig, []
+    center, distance = np.array(rig.target), np.mean(rig.distance)
+    for turn in np.linspace(-1, 1, count):
+        azimuth, elevation = np.deg2rad([40 * turn, 25 + 10 * np.sin(4 * turn)])
+        away = [np.sin(azimuth) * np.cos(elevation), -np.cos(azimuth) * np.cos(elevation)]
+        position = center + distance * np.array([*away, np.sin(elevation)])
+        target = center + 0.05 * np.array([np.sin(5 * turn), 0, np.cos(7 * turn)])
+        poses.append(planning.pose_looking_at(position, target, (0, 0, 0.05 * np.sin(9 * turn))))
+    return np.stack(poses)
+
+
+def errors(found, true):
+    """Positions' errors over the extent, and rotations' errors in degrees, after a similarity.
+
+    The similarity's rotation fits the positions and the cameras' axes at once (Umeyama 1991), since
+    positions alone, of cameras that stand near a line, leave a turn about it open.
+
+    Args:
+      found: `[V, 3, 4]` poses.
+      true: `[V, 3, 4]` poses.
+    """
+    found, true = np.asarray(found, np.float64), np.asarray(true, np.float64)
+    a, b = (poses[:, :, 3] - poses[:, :, 3].mean(0) for poses in (found, true))
+    axes = np.einsum("vij,vkj->ik", true[:, :, :3], found[:, :, :3]) / len(true) / 3
+    u, _, v = np.linalg.svd(b.T @ a / np.linalg.norm(a) / np.linalg.norm(b) + axes)
+    rotation = u * np.array([1, 1, np.linalg.det(u @ v)]) @ v
+    turned = a @ rotation.T
+    scale = (turned * b).sum() / (turned**2).sum()
+    away = np.linalg.norm(scale * turned - b, axis=1)
+    relative = true[:, :, :3].swapaxes(1, 2) @ (rotation @ found[:, :, :3])
+    cosine = (np.trace(relative, axis1=1, axis2=2) - 1) / 2
+    extent = np.linalg.norm(np.ptp(true[:, :, 3], axis=0))
+    return away / extent, np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
+
+
+def run_process(**given):
+    if not flags.FLAGS.is_parsed():
+        flags.FLAGS(["process"])
+    with flagsaver.flagsaver(compilation_cache="", **given):
+        program.main(["process"])
+
+
+def poses_by_name(folder):
+    """Poses of a capture as `run` loads it, by name without ending."""
+    scene = load_scene(folder)
+    found = {}
+    for split, names in scene.names.items():
+        poses = np.asarray(getattr(scene, split).cameras.camtoworld)
+        found |= dict(zip(names, poses, strict=True))
+    return scene, found
+
+
+def summary_of(folder):
+    return json.loads((folder / "process.json").read_text())["summary"]
+
+
+def save(path, rgb, *, turned=False):
+    """Write a photograph with a focal length in EXIF; turned, it is stored sideways."""
+    image = PIL.Image.fromarray(np.rot90(rgb) if turned else rgb)  # counterclockwise
+    exif = image.getexif()
+    exif[0x0112] = 6 if turned else 1  # to be shown turned by 90 degrees clockwise
+    exif.get_ifd(0x8769)[0xA405] = FOCAL_IN_EXIF
+    image.save(path, quality=97, subsampling=0, exif=exif)
