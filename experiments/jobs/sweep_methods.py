@@ -8,9 +8,9 @@ import contextlib
 import os
 import pathlib
 import shutil
-import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from subprocess import call
 from typing import Any
 
 from absl import flags
@@ -86,7 +86,7 @@ def sweep_methods(
         for name, scene in scenes.items():
             own = folder / method / name
             print(f"{method} on {name}")
-            if not _prepare(own) and subprocess.run(_command(own, method, scene)).returncode:
+            if not _prepare(own) and call(_command(own, method, scene)):
                 failed.append(f"{method} on {name}")
                 continue
             found.setdefault(method, {})[name] = read_method(own)
