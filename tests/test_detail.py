@@ -14,9 +14,9 @@ from tiny_runs import KEPT
 
 from experiments.evaluation.scores import targets_by_split
 from experiments.training import detail as training_detail
-from experiments.training import gate
+from experiments.training import fine_tuning, gate
 from experiments.training.detail import detail_path, detailed, find_detail
-from experiments.training.fine_tuning import fine_tune
+from experiments.training.fine_tuning import fine_tune, tuned_detail
 from experiments.training.residuals import _enlarge
 from experiments.training.setup import label_closeups, label_targets, start_labels
 from experiments.training.stored_run import load_run_scene, read_run, restore
@@ -137,6 +137,40 @@ def test_target_views_may_be_labeled_by_their_detail(rendered, found, monkeypatc
     drawn = [np.asarray(views.cameras.position)[:, None] for views in (near, others)]
     assert all(np.linalg.norm(far - one, axis=-1).min() > 0 for one in drawn)
     assert not np.any(drawn[0] == drawn[1])
+
+
+def test_a_tuned_state_has_the_detail_of_photographs_that_see_the_view(rendered, found):
+    """Its own residuals, of these photographs alone; what others show changes nothing."""
+    programs, state, _ = rendered
+    detail, _ = found
+    start, view = start_labels(programs, state, seed=0), camera_at(programs.scene.test.cameras, 0)
+    cameras = jax.tree.map(lambda leaf: leaf[None], view)
+    seen = programs.render(state, view)
+    same = tuned_detail(programs, start, state, cameras, detail)
+    whole, part = (detailed(programs, one, view, seen) for one in (detail, same))
+    np.testing.assert_allclose(part.rgb, whole.rgb, atol=1e-6)
+
+    # One photograph turns away: it is of no use any more, and five are no multiple of two.
+    away = start.sources.depths.at[1].set(0)
+    blind = start._replace(sources=start.sources.replace(depths=away))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fine_tuning, "_TOGETHER", 2)
+        others = tuned_detail(programs, blind, state, cameras, detail)
+    count = len(programs.scene.train)
+    left = [i for i in range(count) if i != 1]
+    assert count == 5
+    np.testing.assert_array_equal(others.residuals.values, detail.residuals.values[np.array(left)])
+
+    # A state that blurs more has its own residuals: with those of the first it stays further away.
+    wide = state.params.replace(log_scales=state.params.log_scales + 0.4)
+    blurred = state.replace(params=wide)
+    tuned = tuned_detail(programs, start, blurred, cameras, detail)
+    truth, seen = to_float(programs.scene.test.rgb[0]), programs.render(blurred, view)
+    errors = [
+        np.abs(np.asarray(detailed(programs, one, view, seen).rgb) - np.asarray(truth)).mean()
+        for one in (tuned, detail)
+    ]
+    assert errors[0] < 0.98 * errors[1], errors
 
 
 def test_detail_is_kept_with_its_state_and_made_again_for_another(rendered, found, monkeypatch):

@@ -13,7 +13,7 @@ from absl import flags
 from experiments import progress
 from experiments.command_line import check_unused, prepare_to_stop, set_up
 from experiments.training.detail import detail_path, find_detail
-from experiments.training.fine_tuning import fine_tune
+from experiments.training.fine_tuning import fine_tune, tuned_detail
 from experiments.training.loop import TrainingError
 from experiments.training.setup import start_labels
 from experiments.training.stored_run import RunError, load_run_scene, restore
@@ -100,10 +100,13 @@ def _render() -> None:
         cameras, most = shots.cameras, FLAGS.target_steps
         state = fine_tune(programs, start, cameras, most=most, kept=kept)
     detail = None
-    if FLAGS.detail:
+    if FLAGS.detail and fine_tuned:
         # What was fine-tuned for these cameras is not kept, and its detail neither.
-        path = None if fine_tuned else detail_path(record.folder, stage)
-        detail, _ = find_detail(programs, state, path)
+        detail, _ = find_detail(programs, start.state, kept)
+        if state is not start.state:
+            detail = tuned_detail(programs, start, state, cameras, detail)
+    elif FLAGS.detail:
+        detail, _ = find_detail(programs, state, detail_path(record.folder, stage))
     folders = render_shots(output_dir, programs, state, shots, sources=sources, detail=detail)
     print(f"{len(shots.names)} frames: {', '.join(str(folder) for folder in folders)}")
     if chosen != "views" and len(shots.names) > 1:

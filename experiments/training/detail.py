@@ -110,13 +110,33 @@ def make_detail(programs: Programs, state: TrainState) -> tuple[Detail, dict[str
     count = len(scene.train)
     left_out = np.unique(np.linspace(0, count - 1, LEFT_OUT).round().astype(int)).tolist()
     residuals, windows, depths = render_residuals(programs, state, pyramid, left_out)
-    trust = scene.train.weight * reproduced(residuals)
-    sources = jax.jit(gather_sources)(scene.train.cameras, depths, trust)
     finer = jnp.float32(np.log2(pyramid.sizes[0][1] / scene.train.cameras.width))
-    detail = Detail(residuals, sources, None, finer)
+    detail = Detail(residuals, _sources(scene.train, residuals, depths), None, finer)
     weights, table = calibrate(detail, windows)
     about = {"divisor": divisor, "sizes": list(map(list, pyramid.sizes)), "reliability": table}
     return detail.replace(weights=weights), about
+
+
+def _sources(views, residuals, depths):
+    trust = views.weight * reproduced(residuals)
+    return jax.jit(gather_sources)(views.cameras, depths, trust)
+
+
+def refresh_detail(
+    programs: Programs, state: TrainState, detail: Detail, views: Sequence[int]
+) -> Detail:
+    """Detail of a state that went on from another one, of some photographs alone.
+
+    Args:
+      programs: the run's.
+      state: the state that is rendered.
+      detail: of the other state, whose weights stay.
+      views: the photographs.
+    """
+    pyramid, _ = programs.pyramid()
+    residuals, _, depths = render_residuals(programs, state, pyramid, views=views)
+    own = jax.tree.map(lambda leaf: leaf[np.asarray(views)], programs.scene.train)
+    return detail.replace(residuals=residuals, sources=_sources(own, residuals, depths))
 
 
 def calibrate(detail: Detail, windows: Sequence[Window]) -> tuple[Any, list[dict[str, float]]]:

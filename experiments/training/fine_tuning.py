@@ -7,13 +7,17 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from experiments import progress
+from experiments.training.detail import refresh_detail
 from experiments.training.gate import gated, lets_in, weigh
 from experiments.training.loop import TrainingError
 from experiments.training.programs import Programs
 from experiments.training.setup import LabelStart, label_targets, rendered_depths
-from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.detail import Detail
+from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points
+from jaxcloseup.geometry.visibility import sample_where_visible
 from jaxcloseup.photographs import Views
 from jaxcloseup.pseudo import PseudoSettings
 from jaxcloseup.train import TrainState
@@ -21,6 +25,9 @@ from jaxcloseup.windows import Windows, windows_that_see
 
 
 _REPORTS = 10
+_TOLERANCE = 0.05  # relative difference of depths up to which a photograph sees a surface
+_LEAST_SEEN = 0.02  # share of a view's pixels that a photograph must see to be of use for it
+_TOGETHER = 8  # numbers of photographs are multiples of this, so that little is compiled
 
 
 class TargetData(NamedTuple):
@@ -66,6 +73,44 @@ def target_data(
         key = jax.random.fold_in(start.state.key, start.state.step)
         photographs = jax.jit(windows_that_see)(key, photographs, *seen)
     return TargetData(photographs, labels, settings, steps)
+
+
+def tuned_detail(
+    programs: Programs, start: LabelStart, state: TrainState, cameras: Camera, detail: Detail
+) -> Detail:
+    """Detail of a state that was fine-tuned for target views, of the photographs that see these.
+
+    Args:
+      programs: the run's.
+      start: what fine-tuning began with.
+      state: what it ended with.
+      cameras: stacked `[Q]`, of the target views.
+      detail: of the state that fine-tuning began with.
+    """
+    depths = rendered_depths(functools.partial(programs.render, state), cameras, programs.scene)
+    sources = start.sources
+    seen = np.asarray(_share_seen(cameras, depths, sources.views, sources.depths))
+    count = max(int((seen >= _LEAST_SEEN).sum()), 1)
+    count = min(-(-count // _TOGETHER) * _TOGETHER, len(seen))
+    return refresh_detail(programs, state, detail, np.sort(np.argsort(-seen)[:count]).tolist())
+
+
+@jax.jit
+def _share_seen(cameras, depths, views, view_depths):
+    """The largest share of a target view's pixels that each photograph sees, `[V]`."""
+    pixels = pixel_grid(cameras.height, cameras.width)
+
+    def of_target(item):
+        camera, depth = item
+        points = pixels_to_points(camera, pixels, jnp.where(depth > 0, depth, 1))
+
+        def of_photograph(item):
+            seen = sample_where_visible(*item, points, _TOLERANCE)[2]
+            return jnp.mean((seen > 0) & (depth > 0))
+
+        return jax.lax.map(of_photograph, (views.cameras, view_depths, views.weight))
+
+    return jnp.max(jax.lax.map(of_target, (cameras, depths)), axis=0)
 
 
 def fine_tune(

@@ -52,9 +52,13 @@ class Window(NamedTuple):
 
 
 def render_residuals(
-    programs: Programs, state: TrainState, pyramid: Pyramid, left_out: Sequence[int]
+    programs: Programs,
+    state: TrainState,
+    pyramid: Pyramid,
+    left_out: Sequence[int] = (),
+    views: Sequence[int] | None = None,
 ) -> tuple[Pyramid, list[Window], jax.Array]:
-    """Render every photograph's own view, and subtract it from the photograph at every level.
+    """Render photographs' own views, and subtract them from the photographs at every level.
 
     The state is rendered at levels up to `FINER` (or `FINER_RAYS`) times the reduced photographs'
     size, and enlarged for finer ones. Exposure is not detail: an affine map first brings each
@@ -65,18 +69,20 @@ def render_residuals(
       state: the state to render.
       pyramid: photographs with their weights.
       left_out: views of which windows are kept.
+      views: the photographs; all by default.
 
     Returns:
-      The residuals, int8; windows of `left_out`; and the depths `[V, H, W]` of all photographs at
-      their training size.
+      The residuals of these V photographs, int8; windows of `left_out`; and the depths `[V, H, W]`
+      at their training size.
     """
     scene = programs.scene
     cameras, last = scene.train.cameras, len(pyramid.sizes) - 1
     most = FINER_RAYS if programs.method.renders_pixels else FINER
     rendered = pyramid.level_near(most * cameras.width)
-    values = np.empty((*pyramid.values.shape[:2], 3), np.int8)
+    views = range(len(scene.train)) if views is None else views
+    values = np.empty((len(views), pyramid.values.shape[1], 3), np.int8)
     windows, depths, rng = [], [], np.random.default_rng(0)
-    for view in progress.track(range(len(scene.train)), "residuals of photographs"):
+    for view, own in zip(progress.track(views, "residuals of photographs"), values, strict=True):
         for level in range(last, -1, -1):
             camera = pyramid.camera(camera_at(cameras, view), view, level)
             photograph = pyramid.image(view, level)
@@ -91,11 +97,12 @@ def render_residuals(
                 # The size that the model learned from shows the exposure.
                 colors = _match(photograph, *shown[:2])
             residual, weight = map(np.asarray, _subtract(photograph, shown[0], colors))
-            values[view, pyramid.pixels_of(level)] = residual.reshape(-1, 3)
+            own[pyramid.pixels_of(level)] = residual.reshape(-1, 3)
             if view in left_out:
                 images = residual / np.float32(127), weight, shown[2], shown[1]
                 windows += _cut(rng, view, level, pyramid.sizes, list(map(np.asarray, images)))
-    return pyramid.replace(values=jnp.asarray(values)), windows, jnp.stack(depths)
+    found = Pyramid(jnp.asarray(values), pyramid.intrinsics[np.asarray(views)], pyramid.sizes)
+    return found, windows, jnp.stack(depths)
 
 
 def _enlarge(shown, camera, finer):

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.training.detail import find_detail
-from experiments.training.fine_tuning import fine_tune
+from experiments.training.fine_tuning import fine_tune, tuned_detail
 from experiments.training.loop import TrainingError
 from experiments.training.programs import Programs
 from experiments.training.setup import LabelStart, start_labels
@@ -183,14 +183,15 @@ class Viewer:
         `say_steps` is told how many steps of fine-tuning are done, and how many there are.
         """
         start, state = self.labels, self.state
+        cameras = jax.tree.map(lambda leaf: leaf[None], camera)
         if tuned:
-            cameras = jax.tree.map(lambda leaf: leaf[None], camera)
             kept = self._kept if start.state is self.state else None
             state = fine_tune(
                 *(self.programs, start, cameras), most=None, kept=kept, tell=say_steps
             )
-        # A state tuned for one camera differs from the one whose detail is known.
-        added = self.detail if detail and state is self.state else None
+        added = self.detail if detail else None
+        if detail and tuned and state is not start.state:
+            added = tuned_detail(self.programs, start, state, cameras, added)
         images = render_pictures(self.programs, state, camera, sources=start.sources, detail=added)
         if tuned and state is start.state:
             return images, (
