@@ -13,6 +13,7 @@ import pytest
 from tiny_runs import KEPT
 
 from experiments.evaluation.scores import targets_by_split
+from experiments.methods import TargetConfig
 from experiments.training import detail as training_detail
 from experiments.training import fine_tuning, gate
 from experiments.training.detail import detail_path, detailed, find_detail
@@ -108,7 +109,8 @@ def test_target_views_may_be_labeled_by_their_detail(rendered, found, monkeypatc
     programs, state, path = rendered
     by_detail = dataclasses.replace(KEPT.labels, label="residual")
     # Its weights replace the gate of warps.
-    gated = dataclasses.replace(programs.preset, gated=True, labels=by_detail)
+    targets = TargetConfig("residual", KEPT.labels.label_loss_weight, KEPT.labels.lr_scale)
+    gated = dataclasses.replace(programs.preset, gated=True, targets=targets)
     monkeypatch.setattr(programs, "preset", gated)
     monkeypatch.setattr(gate, "weigh_labels", lambda *_: pytest.fail("asked the gate"))
     monkeypatch.setattr(training_detail, "make_detail", lambda *_: pytest.fail("made again"))
@@ -143,28 +145,27 @@ def test_a_tuned_state_has_the_detail_of_photographs_that_see_the_view(rendered,
     """Its own residuals, of these photographs alone; what others show changes nothing."""
     programs, state, _ = rendered
     detail, _ = found
-    start, view = start_labels(programs, state, seed=0), camera_at(programs.scene.test.cameras, 0)
+    view = camera_at(programs.scene.test.cameras, 0)
     cameras = jax.tree.map(lambda leaf: leaf[None], view)
     seen = programs.render(state, view)
-    same = tuned_detail(programs, start, state, cameras, detail)
+    same = tuned_detail(programs, state, cameras, detail)
     whole, part = (detailed(programs, one, view, seen) for one in (detail, same))
     np.testing.assert_allclose(part.rgb, whole.rgb, atol=1e-6)
 
-    # One photograph turns away: it is of no use any more, and five are no multiple of two.
-    away = start.sources.depths.at[1].set(0)
-    blind = start._replace(sources=start.sources.replace(depths=away))
+    # One photograph shows nothing any more, and the other four are a multiple of two.
+    trust = detail.sources.trust.at[1].set(0)
+    blind = detail.replace(sources=detail.sources.replace(trust=trust))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fine_tuning, "_TOGETHER", 2)
-        others = tuned_detail(programs, blind, state, cameras, detail)
-    count = len(programs.scene.train)
-    left = [i for i in range(count) if i != 1]
-    assert count == 5
-    np.testing.assert_array_equal(others.residuals.values, detail.residuals.values[np.array(left)])
+        others = tuned_detail(programs, state, cameras, blind)
+    left = np.array([i for i in range(len(programs.scene.train)) if i != 1])
+    assert len(left) == 4
+    np.testing.assert_array_equal(others.residuals.values, detail.residuals.values[left])
 
     # A state that blurs more has its own residuals: with those of the first it stays further away.
     wide = state.params.replace(log_scales=state.params.log_scales + 0.4)
     blurred = state.replace(params=wide)
-    tuned = tuned_detail(programs, start, blurred, cameras, detail)
+    tuned = tuned_detail(programs, blurred, cameras, detail)
     truth, seen = to_float(programs.scene.test.rgb[0]), programs.render(blurred, view)
     errors = [
         np.abs(np.asarray(detailed(programs, one, view, seen).rgb) - np.asarray(truth)).mean()

@@ -104,7 +104,7 @@ def _render() -> None:
         # What was fine-tuned for these cameras is not kept, and its detail neither.
         detail, _ = find_detail(programs, start.state, kept)
         if state is not start.state:
-            detail = tuned_detail(programs, start, state, cameras, detail)
+            detail = tuned_detail(programs, state, cameras, detail)
     elif FLAGS.detail:
         detail, _ = find_detail(programs, state, detail_path(record.folder, stage))
     folders = render_shots(output_dir, programs, state, shots, sources=sources, detail=detail)

@@ -16,17 +16,19 @@ from experiments.training.loop import TrainingError
 from experiments.training.programs import Programs
 from experiments.training.setup import LabelStart, label_targets, rendered_depths
 from jaxcloseup.detail import Detail
-from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points
-from jaxcloseup.geometry.visibility import sample_where_visible
-from jaxcloseup.photographs import Views
+from jaxcloseup.gather import gather
+from jaxcloseup.geometry.cameras import Camera, pixel_grid
+from jaxcloseup.label_rules import label_depth
+from jaxcloseup.photographs import Views, camera_at
 from jaxcloseup.pseudo import PseudoSettings
+from jaxcloseup.pyramids import Pyramid
 from jaxcloseup.train import TrainState
 from jaxcloseup.windows import Windows, windows_that_see
 
 
 _REPORTS = 10
-_TOLERANCE = 0.05  # relative difference of depths up to which a photograph sees a surface
-_LEAST_SEEN = 0.02  # share of a view's pixels that a photograph must see to be of use for it
+_ENOUGH = 0.95  # share of a view's detail that the photographs must carry that are rendered for it
+_PIXELS = 4096  # of a view, that tell these shares
 _TOGETHER = 8  # numbers of photographs are multiples of this, so that little is compiled
 
 
@@ -75,42 +77,40 @@ def target_data(
     return TargetData(photographs, labels, settings, steps)
 
 
-def tuned_detail(
-    programs: Programs, start: LabelStart, state: TrainState, cameras: Camera, detail: Detail
-) -> Detail:
-    """Detail of a state that was fine-tuned for target views, of the photographs that see these.
+def tuned_detail(programs: Programs, state: TrainState, cameras: Camera, detail: Detail) -> Detail:
+    """Detail of a state that was fine-tuned for target views, of the photographs that it needs.
 
     Args:
       programs: the run's.
-      start: what fine-tuning began with.
-      state: what it ended with.
+      state: what fine-tuning ended with.
       cameras: stacked `[Q]`, of the target views.
       detail: of the state that fine-tuning began with.
     """
-    depths = rendered_depths(functools.partial(programs.render, state), cameras, programs.scene)
-    sources = start.sources
-    seen = np.asarray(_share_seen(cameras, depths, sources.views, sources.depths))
-    count = max(int((seen >= _LEAST_SEEN).sum()), 1)
-    count = min(-(-count // _TOGETHER) * _TOGETHER, len(seen))
-    return refresh_detail(programs, state, detail, np.sort(np.argsort(-seen)[:count]).tolist())
+    shares = []
+    for index in range(cameras.intrinsics.shape[0]):
+        camera = camera_at(cameras, index)
+        depth = label_depth(programs.render(state, camera), near=0, far=programs.scene.far)
+        shares.append(np.asarray(_shares(detail, camera, depth)))
+    shares = np.stack(shares)
+    order = np.argsort(-shares, axis=1)
+    reached = np.cumsum(np.take_along_axis(shares, order, axis=1), axis=1)
+    needed = [own[: np.sum(sums < _ENOUGH) + 1] for own, sums in zip(order, reached, strict=True)]
+    count = len(np.unique(np.concatenate(needed)))
+    count = min(-(-count // _TOGETHER) * _TOGETHER, len(detail.sources.trust))
+    views = np.argsort(-shares.max(axis=0), kind="stable")[:count]
+    return refresh_detail(programs, state, detail, np.sort(views).tolist())
 
 
 @jax.jit
-def _share_seen(cameras, depths, views, view_depths):
-    """The largest share of a target view's pixels that each photograph sees, `[V]`."""
-    pixels = pixel_grid(cameras.height, cameras.width)
-
-    def of_target(item):
-        camera, depth = item
-        points = pixels_to_points(camera, pixels, jnp.where(depth > 0, depth, 1))
-
-        def of_photograph(item):
-            seen = sample_where_visible(*item, points, _TOLERANCE)[2]
-            return jnp.mean((seen > 0) & (depth > 0))
-
-        return jax.lax.map(of_photograph, (views.cameras, view_depths, views.weight))
-
-    return jnp.max(jax.lax.map(of_target, (cameras, depths)), axis=0)
+def _shares(detail, camera, depth):
+    """The share of each photograph in what is gathered into a view, `[V]`; its sum is at most 1."""
+    count = detail.sources.trust.shape[0]
+    # Each photograph shows nothing but its own number, in as fine pixels as it has.
+    numbers = Pyramid(jnp.eye(count)[:, None], detail.residuals.intrinsics[:, :1], ((1, 1),))
+    every = max(1, round((depth.size / _PIXELS) ** 0.5))
+    pixels = pixel_grid(camera.height, camera.width)[::every, ::every]
+    found = gather(camera, pixels, depth[::every, ::every], detail.sources, numbers)
+    return jnp.mean(found.mean, axis=(0, 1))
 
 
 def fine_tune(
@@ -138,8 +138,9 @@ def fine_tune(
     Raises:
       TrainingError: no step was finite.
     """
-    gate, state = weigh(programs, start), start.state
-    if not lets_in(programs.preset.target_labels, gate):
+    labels, state = programs.preset.target_labels, start.state
+    gate = weigh(programs, start) if labels.label == "warp" else None
+    if not lets_in(labels, gate):
         print("nothing is fine-tuned")
         return state
     data = target_data(programs, start, cameras, gate, kept)

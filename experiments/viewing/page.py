@@ -191,7 +191,7 @@ class Viewer:
             )
         added = self.detail if detail else None
         if detail and tuned and state is not start.state:
-            added = tuned_detail(self.programs, start, state, cameras, added)
+            added = tuned_detail(self.programs, state, cameras, added)
         images = render_pictures(self.programs, state, camera, sources=start.sources, detail=added)
         if tuned and state is start.state:
             return images, (
