@@ -42,12 +42,12 @@ def ladder_targets(scene: Scene, exact_depths: jax.Array) -> dict[str, list[Targ
     for i, name in enumerate(scene.names["test_far"]):
         far = camera_at(scene.test_far.cameras, i)
         pixels = pixel_grid(far.height, far.width)
-        depth = surface(far).depth
-        seen = count(far, pixels, depth, scene.train, exact_depths)
-        anchor = _anchor(jax.random.key(i), far, depth, seen)
+        own = surface(far)
+        seen = count(far, pixels, own.depth, scene.train, exact_depths)
+        anchor = _anchor(jax.random.key(i), far, own.depth, seen)
         for m in MAGNIFICATIONS:
             camera = _nearer(far, anchor, m) if m > 1 else _wider(far, m)
-            seen_surface = surface(camera)
+            seen_surface = own if m == 1 else surface(camera)
             seen = count(camera, pixels, seen_surface.depth, scene.train, exact_depths)
             weight = jnp.ones(seen.shape, jnp.float32)
             rgb = seen_surface.rgb.astype(jnp.float32)
