@@ -11,8 +11,8 @@ from tiny_runs import keep_run, write_plane
 
 
 # Arms of sweeps are spread over all devices. Tests compile more than they compute, so LLVM takes
-# no passes that optimize. Read when the first array is made.
-QUICKLY = "--xla_backend_optimization_level=0"
+# its quicker passes. Read when the first array is made.
+QUICKLY = "--xla_backend_optimization_level=1"
 DEVICES = "--xla_force_host_platform_device_count=8"
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICKLY} {DEVICES}".strip()
 jax.config.update("jax_numpy_rank_promotion", "raise")
