@@ -1,5 +1,6 @@
 """Strict numerics for every test, and where the shared reference data lies, if it is here."""
 
+import gc
 import os
 import pathlib
 import shutil
@@ -43,6 +44,19 @@ def pytest_unconfigure(config):
     """Remove them."""
     if not hasattr(config, "workerinput"):
         shutil.rmtree(os.environ.pop(_CACHE))
+
+
+MOST_MAPS = 30_000  # of the 65,530 that Linux lets a process have; every program takes several
+MAPS = pathlib.Path("/proc/self/maps")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_programs():
+    """Forget what is compiled before memory maps run out: XLA would wait for one forever."""
+    yield
+    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > MOST_MAPS:
+        jax.clear_caches()
+        gc.collect()
 
 
 SHARED = pathlib.Path(__file__).parents[2] / "shared"

@@ -184,16 +184,6 @@ def test_a_rendering_matches_the_oracle(name):
             np.testing.assert_allclose(seen.aux.penalty[i], penalty, rtol=1e-4)
 
 
-@pytest.fixture(autouse=True)
-def uncached():
-    """XLA at times fails to write these programs into the cache of compiled ones, or never ends."""
-    name = "jax_persistent_cache_min_compile_time_secs"
-    before = getattr(jax.config, name)
-    jax.config.update(name, 1e9)
-    yield
-    jax.config.update(name, before)
-
-
 @pytest.mark.parametrize("name", FIELDS)
 def test_gradients_are_finite_differences(name, monkeypatch):
     """With intervals that stay, because no gradient flows through where rays are cut."""
