@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments.evaluation.scores import Target
+from experiments.reporting.pictures import comparisons
 from experiments.reporting.report import print_results
 from experiments.reporting.showcase import best_middle_worst, cut_out, find_place
 from experiments.reporting.summary import conclusion, tables
@@ -151,3 +153,14 @@ def test_a_photograph_is_cut_out_where_it_shows_a_close_up():
         error = np.abs(found / 255 - wall(view, 36, 48))[inside]
         assert inside.mean() > 0.5 and np.median(error) < 0.01
     assert find_place(near, jnp.zeros((36, 48)), photograph) is None
+
+
+def test_the_page_shows_the_error_of_the_last_picture_that_it_shows(tmp_path):
+    """The file has all stages, the last of them wrong everywhere; the page has the right one."""
+    view = Target("view", None, jnp.zeros((8, 240, 3)), None, None)
+    images = {(stage, "test"): {"view": view.rgb + error} for stage, error in [("a", 0), ("b", 1)]}
+    (shown,) = comparisons(tmp_path, {"test": [view]}, images, in_report=["a"])
+    assert shown.image.shape[1] == 3 * 240 + 2 * 8
+    assert shown.image[-8:, -240:].max() < 10
+    written = cv2.imread(str(tmp_path / "view.png"))
+    assert written.shape[1] == 4 * 240 + 3 * 8 and written[-1, -1].max() > 200

@@ -52,22 +52,22 @@ def comparisons(
     for split, views in shown.items():
         stages = [stage for stage, rendered in images if rendered == split]
         for target in views if stages else ():
-            seen = [images[stage, split][target.name] for stage in stages]
-            truth = np.asarray(target.rgb)
-            error = colorize_error(np.abs(seen[-1] - truth).mean(axis=-1))
-            panels = dict(zip(["truth", *stages], [truth, *seen], strict=True))
-            panels[f"error of {stages[-1]}"] = error
+            seen = {stage: images[stage, split][target.name] for stage in stages}
             name = f"{split}_{target.name}" if target.name in written else target.name
             written.add(name)
-            write_png(folder / f"{name}.png", _row(panels))
-            left_out = set(stages) - set(in_report or stages)
-            brief = {title: panel for title, panel in panels.items() if title not in left_out}
+            truth = np.asarray(target.rgb)
+            write_png(folder / f"{name}.png", _row(truth, seen))
+            brief = {stage: seen[stage] for stage in stages if stage in (in_report or stages)}
             section = SPLIT_TITLES[split.removesuffix(FINER)]
-            pictures.append(Picture(section, target.name, _row(brief)))
+            pictures.append(Picture(section, target.name, _row(truth, brief)))
     return pictures
 
 
-def _row(panels):
+def _row(truth, seen):
+    """The true image, `seen` stage by stage, and the error of the last one."""
+    last = list(seen)[-1]
+    error = colorize_error(np.abs(seen[last] - truth).mean(axis=-1))
+    panels = {"truth": truth, **seen, f"error of {last}": error}
     return side_by_side(map(enlarge, panels.values()), labels=list(panels))
 
 
