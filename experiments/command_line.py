@@ -53,7 +53,7 @@ flags.DEFINE_string(
 _TOPICS = {
     "What is trained": "scene scenes method methods preset set stages arms seed seeds downscale "
     "windows",
-    "The capture": "format split zoom half_pixel invert_masks alpha_mode",
+    "The capture": "format split zoom photographs half_pixel invert_masks alpha_mode",
     "The run": "run stage data",
     "Cameras": "views camera_path camera_transform target orbit from pixel magnification up frames "
     "width height",

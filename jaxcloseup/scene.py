@@ -1,13 +1,13 @@
 """`Scene`, the record that every loader returns, with its errors and warnings."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.geometry.cameras import Camera, points_to_pixels
 from jaxcloseup.messages import printable
 from jaxcloseup.photographs import Views, camera_at
 
@@ -109,3 +109,39 @@ class Scene:
         """The camera of one photograph, without the padding at its right and its bottom."""
         width, height = self.sizes(split)[index]
         return camera_at(getattr(self, split).cameras, index).replace(width=width, height=height)
+
+
+def keep_photographs(scene: Scene, chosen: Sequence[int]) -> Scene:
+    """The scene with some of its training photographs, and the points in two of their pictures.
+
+    Args:
+      scene: a scene whose metadata say nothing of single training photographs.
+      chosen: indices of the training photographs that stay.
+    """
+    if len(chosen) == len(scene.train):
+        return scene
+    rows = np.array(chosen)
+
+    def take(views: Views) -> Views:
+        return jax.tree.map(lambda leaf: leaf[rows], views)
+
+    def photographs_at(factor: int, split: str = "train") -> tuple[Views, list[tuple[int, int]]]:
+        views, sizes = scene.photographs_at(factor, split)
+        return (take(views), [sizes[i] for i in chosen]) if split == "train" else (views, sizes)
+
+    train = take(scene.train)
+    size = np.array([train.cameras.width, train.cameras.height], np.float32)
+    times_seen = np.zeros(len(scene.points), int)
+    for view in range(len(rows)):
+        pixels, depth = map(
+            np.asarray, points_to_pixels(camera_at(train.cameras, view), scene.points)
+        )
+        times_seen += np.all((pixels >= 0) & (pixels < size), axis=-1) & (depth > 0)
+    return dataclasses.replace(
+        scene,
+        train=train,
+        points=scene.points[times_seen > 1],
+        rgb=scene.rgb[times_seen > 1],
+        names=scene.names | {"train": [scene.names["train"][i] for i in chosen]},
+        photographs_at=scene.photographs_at and photographs_at,
+    )

@@ -3,8 +3,9 @@
 import pathlib
 
 from jaxcloseup.captures import ALPHA_MODES, FORMATS, SPLITS, Reading, load_capture
+from jaxcloseup.captures.splits import spread
 from jaxcloseup.procedural import PROCEDURAL_SCENES, procedural_scene
-from jaxcloseup.scene import Scene, SceneError, SceneWarning, Surface
+from jaxcloseup.scene import Scene, SceneError, SceneWarning, Surface, keep_photographs
 
 
 __all__ = ["PROCEDURAL_SCENES", "Scene", "SceneError", "SceneWarning", "Surface", "load_scene"]
@@ -23,6 +24,7 @@ def load_scene(
     zoom: int | None = None,
     invert_masks: bool = False,
     alpha_mode: str = "blend",
+    photographs: int | None = None,
 ) -> Scene:
     """Load a built-in scene by its name, or a capture from its folder.
 
@@ -75,6 +77,9 @@ def load_scene(
       invert_masks: whether masks mark ignored pixels in white instead of black.
       alpha_mode: `blend` shows the background through transparent pixels; `mask` keeps the file's
         colors and uses alpha as the weight.
+      photographs: learn from so many of the training photographs, evenly spread over their order;
+        None means all. Points that fewer than two of them see are dropped, where a COLMAP model
+        says so; of a built-in scene those that lie in the pictures of fewer than two.
 
     Returns:
       The scene. For a folder, `metadata` holds
@@ -91,7 +96,7 @@ def load_scene(
     Raises:
       SceneError: one sentence that names the file and the field and says what to do.
     """
-    _check_options(downscale, background, format, split, zoom, alpha_mode)
+    _check_options(downscale, background, format, split, zoom, alpha_mode, photographs)
     zoom = (zoom or _DEFAULT_ZOOM) if split == "zoom" else 1
     reading = Reading(downscale, zoom, background, half_pixel, alpha_mode, invert_masks)
     path = pathlib.Path(name_or_path)
@@ -108,13 +113,14 @@ def load_scene(
                     f"{path} is a built-in scene with its own split and no masks: leave out "
                     f"{given[0]}."
                 )
-            return procedural_scene(path.name, downscale=downscale)
+            scene = procedural_scene(path.name, downscale=downscale)
+            return keep_photographs(scene, spread(scene.name, len(scene.train), photographs))
         if not path.exists():
             raise SceneError(
                 f"{path} is neither a folder nor a built-in scene: choose one of "
                 f"{', '.join(PROCEDURAL_SCENES)}, or give the path of a capture."
             )
-    return load_capture(path, reading, format=format, split=split)
+    return load_capture(path, reading, format=format, split=split, photographs=photographs)
 
 
 def _check_options(
@@ -124,6 +130,7 @@ def _check_options(
     split: str,
     zoom: int | None,
     alpha_mode: str,
+    photographs: int | None,
 ) -> None:
     if isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1:
         raise SceneError(f"downscale must be a whole number of at least 1, got {downscale!r}.")
@@ -141,3 +148,7 @@ def _check_options(
         raise SceneError(
             f"alpha_mode {alpha_mode!r} is unknown: choose one of {', '.join(ALPHA_MODES)}."
         )
+    if photographs is not None and (
+        isinstance(photographs, bool) or not isinstance(photographs, int) or photographs < 2
+    ):
+        raise SceneError(f"photographs must be a whole number of at least 2, got {photographs!r}.")

@@ -14,6 +14,7 @@ from jaxcloseup.photographs import camera_at
 from jaxcloseup.procedural import loading, modeling, planning
 from jaxcloseup.procedural.builtin import SCENES
 from jaxcloseup.procedural.raycast import cast_rays
+from jaxcloseup.scenes import load_scene
 
 
 DOWNSCALE = 20  # 48 x 27
@@ -203,6 +204,30 @@ def test_realism_affects_only_training_photographs(scene):
     )
     turned = np.trace(rotation @ np.asarray(before.rotation).swapaxes(1, 2), axis1=1, axis2=2)
     assert 0.01 < np.arccos(np.clip((turned - 1) / 2, -1, 1)).mean() < 0.025
+
+
+def test_fewer_photographs_are_the_same_ones(scene):
+    """The finer ones are of the same views, and the points lie in two of their pictures."""
+    fewer = load_scene("counter", downscale=DOWNSCALE, photographs=2)
+    views = [15, 45]
+    assert fewer.names["train"] == [f"train_{i:03d}" for i in views]
+    np.testing.assert_array_equal(fewer.train.rgb, np.asarray(scene.train.rgb)[views])
+    np.testing.assert_array_equal(fewer.test.rgb, scene.test.rgb)
+    finer, sizes = fewer.photographs_at(DOWNSCALE)
+    np.testing.assert_array_equal(finer.rgb, fewer.train.rgb)
+    assert len(sizes) == 2 and len(fewer.photographs_at(DOWNSCALE, "test")[1]) == len(scene.test)
+    inside = np.ones(len(scene.points), bool)
+    for pose, lens in zip(
+        np.asarray(scene.train.cameras.camtoworld)[views],
+        np.asarray(scene.train.cameras.intrinsics)[views],
+        strict=True,
+    ):
+        x, y, z = ((scene.points - pose[:, 3]) @ pose[:, :3]).T
+        column, row = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
+        inside &= (z > 0) & (column >= 0) & (column < 48) & (row >= 0) & (row < 27)
+    assert 100 < inside.sum() < len(inside)
+    np.testing.assert_array_equal(fewer.points, scene.points[inside])
+    np.testing.assert_array_equal(fewer.rgb, scene.rgb[inside])
 
 
 def test_the_cache_is_used_and_survives_damage(scene, cache, monkeypatch):

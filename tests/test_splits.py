@@ -5,7 +5,14 @@ import time
 import numpy as np
 import pytest
 from tiny_capture import HEIGHT, WIDTH, vertices, write_image, write_json, write_ply
-from tiny_models import colmap_capture, llff_capture, llff_rows
+from tiny_models import (
+    POINTS,
+    colmap_capture,
+    image_line,
+    llff_capture,
+    llff_rows,
+    write_model,
+)
 
 from jaxcloseup.captures.splits import unique_names
 from jaxcloseup.scene import UnknownKeyWarning
@@ -112,3 +119,37 @@ def test_many_photographs_of_one_name_are_named_soon():
     assert time.process_time() - start < 10
     assert names[:4] == ["images_a", "images_a_2", "images_a_3", "images_a_2_2"]
     assert len(set(names)) == len(files)
+
+
+def test_fewer_photographs_are_spread_evenly(tmp_path):
+    """Points that fewer than two of them see are dropped; held-out views stay."""
+    for i in range(9):
+        write_image(tmp_path / f"images/{i:03d}.png")
+    # 1 to 7 are for training; the second point is seen by two of 1, 3, 5 and 7 too, the first not.
+    seen = {2: "4 3 1", 3: "4 3 1 4 3 2", 4: "4 3 1", 7: "4 3 2"}
+    names = [f"{i:03d}.png" for i in range(9)]
+    lines = [
+        part for i, name in enumerate(names) for part in (image_line(i + 1, name), seen.get(i, ""))
+    ]
+    points = [f"{POINTS[0]} 3 0 4 0 5 0", f"{POINTS[1]} 4 1 8 0"]
+    write_model(tmp_path / "sparse", lines, points=points)
+    everything, fewer = load_scene(tmp_path), load_scene(tmp_path, photographs=4)
+    assert fewer.names == {"train": ["001", "003", "005", "007"], "test_far": ["000", "008"]}
+    np.testing.assert_array_equal(everything.points[1:], fewer.points)
+    assert any("learns from 4 of 7 training" in note for note in fewer.metadata["notes"])
+    assert load_scene(tmp_path, photographs=7).names == everything.names
+
+
+@pytest.mark.parametrize(
+    ("count", "message"),
+    [
+        (1, "photographs must be a whole number of at least 2, got 1"),
+        (2.0, "photographs must be a whole number"),
+        (4, "capture has 3 training photographs: ask for fewer than 4"),
+    ],
+)
+def test_a_wrong_number_of_photographs(tmp_path, count, message):
+    capture = llff_capture(tmp_path / "capture")
+    (capture / "split.json").write_text(json.dumps({"train": ["0.png", "1.png", "2.png"]}))
+    with pytest.raises(SceneError, match=message):
+        load_scene(capture, photographs=count)

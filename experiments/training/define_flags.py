@@ -66,6 +66,12 @@ flags.DEFINE_integer(
     "with --split=zoom: how many times finer test is than the training photographs; default: 4",
     lower_bound=2,
 )
+flags.DEFINE_integer(
+    "photographs",
+    None,
+    "learn from so many of the training photographs, evenly spread over their order; default: all",
+    lower_bound=2,
+)
 flags.DEFINE_bool("invert_masks", False, "masks are white where photographs do not count")
 flags.DEFINE_enum(
     "alpha_mode",

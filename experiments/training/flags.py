@@ -18,7 +18,7 @@ from jaxcloseup.scenes import load_scene
 
 
 FLAGS = flags.FLAGS
-_OF_CAPTURE = ("format", "split", "zoom", "invert_masks", "alpha_mode")
+_OF_CAPTURE = ("format", "split", "zoom", "photographs", "invert_masks", "alpha_mode")
 
 
 def preset_from_flags() -> Preset:

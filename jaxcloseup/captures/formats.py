@@ -2,6 +2,7 @@
 
 import pathlib
 import shlex
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +15,13 @@ from jaxcloseup.captures.masks import attach_masks
 from jaxcloseup.captures.points import read_ply_points
 from jaxcloseup.captures.reduced_photos import attach_reduced
 from jaxcloseup.captures.scale import check_positions, plausible
-from jaxcloseup.captures.splits import divide, splits_from_fields, splits_from_file, warn_duplicates
+from jaxcloseup.captures.splits import (
+    divide,
+    splits_from_fields,
+    splits_from_file,
+    spread,
+    warn_duplicates,
+)
 from jaxcloseup.captures.transforms import read_transforms
 from jaxcloseup.messages import printable
 from jaxcloseup.scene import SceneError
@@ -70,7 +77,13 @@ class _Content(NamedTuple):
 
 
 def read_listing(
-    path: pathlib.Path, *, format: str | None = None, split: str, zoom: int = 1, downscale: int = 1
+    path: pathlib.Path,
+    *,
+    format: str | None = None,
+    split: str,
+    zoom: int = 1,
+    downscale: int = 1,
+    photographs: int | None = None,
 ) -> Listing:
     """List a folder's photographs by split; `load_scene` documents the arguments.
 
@@ -110,10 +123,18 @@ def read_listing(
     division = divide(scene, content.frames, given, split, points, zoom)
     if split != "zoom":  # crops share files with training photographs but show finer detail
         warn_duplicates(folder, division.frames)
-    frames, masked = attach_masks(folder, division.frames)
+    train = division.frames["train"]
+    chosen = spread(scene, len(train), photographs)
+    fewer = len(chosen) < len(train)
+    frames = division.frames | {"train": [train[i] for i in chosen]}
+    frames, masked = attach_masks(folder, frames)
     frames, reduced = attach_reduced(scene, frames, downscale)
-    keep = _seen_in_training(frames, len(points))
+    keep = np.ones(len(points), bool)
+    if fewer or len(frames) > 1:
+        keep = _seen_in_training(frames["train"], len(points))
     notes = [note, *division.notes, *masked, *reduced]
+    if fewer:
+        notes.append(f"{scene}: learns from {len(chosen)} of {len(train)} training photographs")
     if not keep.all():
         notes.append(
             f"{scene}: dropped {np.sum(~keep)} of {len(keep)} points, which fewer than two "
@@ -213,12 +234,12 @@ def _renumbered(frames: list[Frame], keep: np.ndarray) -> list[Frame]:
     ]
 
 
-def _seen_in_training(splits: dict[str, list[Frame]], count: int) -> np.ndarray:
+def _seen_in_training(train: Sequence[Frame], count: int) -> np.ndarray:
     """Whether two training photographs see each point, `[P]` bool; all True if files do not say.
 
-    A point that only held-out photographs see would leak their content into training.
+    A point that only other photographs see would leak their content into training.
     """
-    seen = [frame.seen for frame in splits["train"]]
-    if len(splits) == 1 or any(rows is None for rows in seen):
+    seen = [frame.seen for frame in train]
+    if any(rows is None for rows in seen):
         return np.ones(count, bool)
     return np.bincount(np.concatenate(seen), minlength=count) >= 2

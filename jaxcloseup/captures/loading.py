@@ -31,7 +31,12 @@ _log = logging.getLogger(__name__)
 
 
 def load_capture(
-    path: pathlib.Path, reading: Reading, *, format: str | None = None, split: str = "given"
+    path: pathlib.Path,
+    reading: Reading,
+    *,
+    format: str | None = None,
+    split: str = "given",
+    photographs: int | None = None,
 ) -> Scene:
     """Load the capture in a folder, as `jaxcloseup.scenes.load_scene` describes.
 
@@ -42,7 +47,12 @@ def load_capture(
         if not path.is_dir():
             raise SceneError(f"{path} is not a folder: give the folder that holds the capture.")
         listing = read_listing(
-            path, format=format, split=split, zoom=reading.zoom, downscale=reading.downscale
+            path,
+            format=format,
+            split=split,
+            zoom=reading.zoom,
+            downscale=reading.downscale,
+            photographs=photographs,
         )
     except OSError as error:  # from listing folders; reading a file raises SceneError
         raise SceneError(

@@ -128,6 +128,24 @@ def divide(
     )
 
 
+def spread(name: str, total: int, count: int | None) -> list[int]:
+    """Which of `total` training photographs to keep: `count`, evenly spread over their order.
+
+    Args:
+      name: name of the capture, for the error.
+      total: how many there are.
+      count: how many to keep; None keeps all.
+
+    Raises:
+      SceneError: there are fewer.
+    """
+    if count is None:
+        return list(range(total))
+    if count > total:
+        raise SceneError(f"{name} has {total} training photographs: ask for fewer than {count}.")
+    return [(2 * i + 1) * total // (2 * count) for i in range(count)]
+
+
 def unique_names(files: Sequence[pathlib.Path]) -> list[str]:
     """Name each file by its stem; prefix the folder's name, then number, where names clash.
 
