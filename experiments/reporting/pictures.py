@@ -56,18 +56,21 @@ def comparisons(
             name = f"{split}_{target.name}" if target.name in written else target.name
             written.add(name)
             truth = np.asarray(target.rgb)
-            write_png(folder / f"{name}.png", _row(truth, seen))
+            write_png(folder / f"{name}.png", _comparison(truth, seen))
             brief = {stage: seen[stage] for stage in stages if stage in (in_report or stages)}
             section = SPLIT_TITLES[split.removesuffix(FINER)]
-            pictures.append(Picture(section, target.name, _row(truth, brief)))
+            pictures.append(Picture(section, target.name, _comparison(truth, brief)))
     return pictures
 
 
-def _row(truth, seen):
+def _comparison(truth, seen):
     """The true image, `seen` stage by stage, and the error of the last one."""
     last = list(seen)[-1]
     error = colorize_error(np.abs(seen[last] - truth).mean(axis=-1))
-    panels = {"truth": truth, **seen, f"error of {last}": error}
+    return _row({"truth": truth, **seen, f"error of {last}": error})
+
+
+def _row(panels):
     return side_by_side(map(enlarge, panels.values()), labels=list(panels))
 
 
