@@ -237,18 +237,23 @@ def mipnerf(config, params, center, scale, pixel, network):
     return [(config.num_coarse, render), (config.num_fine, render)]
 
 
-def zip_samples(origin, direction, begin, end, radius):
-    """Six points and deviations in a frustum (Zip-NeRF, eq. 1 to 3), for some axes across."""
+def zip_samples(origin, direction, begin, end, radius, count):
+    """Points and deviations in a frustum (Zip-NeRF, eq. 1 to 3), for some axes across.
+
+    Others than the paper's six are evenly spread, with the same variance along the ray.
+    """
     m, h = (begin + end) / 2, (end - begin) / 2
     unit = direction / np.linalg.norm(direction)
     across = np.cross(unit, np.eye(3)[np.argmin(np.abs(unit))])
     across /= np.linalg.norm(across)
     other = np.cross(unit, across)
-    for j, turn in enumerate((0, 2, 4, 3, 5, 1)):
+    spread = np.linspace(-1, 1, count) if count > 1 else np.zeros(1)
+    spread *= math.sqrt(0.6 / max(np.var(spread), 1e-9))
+    for j, turn in enumerate((0, 2, 4, 3, 5, 1) if count == 6 else range(count)):
         root = math.sqrt((h**2 - m**2) ** 2 + 4 * m**4)
-        t = end**2 + 2 * m**2 + 3 / math.sqrt(7) * (2 * j / 5 - 1) * root
+        t = end**2 + 2 * m**2 + spread[j] * root
         t = begin + h * t / (h**2 + 3 * m**2)
-        angle, away = turn * math.pi / 3, radius * t / math.sqrt(2)
+        angle, away = turn * 2 * math.pi / count, radius * t / math.sqrt(2)
         turned = math.cos(angle) * across + math.sin(angle) * other
         yield origin + t * direction + away * turned, 0.5 * away
 
@@ -256,13 +261,13 @@ def zip_samples(origin, direction, begin, end, radius):
 def zipnerf(config, params, center, scale, pixel):
     """`rounds` for `march`, of Zip-NeRF."""
 
-    def features(grid, table, origin, direction, depth):
+    def features(grid, points, table, origin, direction, depth):
         origin, direction = (origin - center) * scale, direction * scale
         result = []
         for begin, end in itertools.pairwise(depth):
             total = 0
             radius = 2 / math.sqrt(12) * pixel * scale
-            for x, deviation in zip_samples(origin, direction, begin, end, radius):
+            for x, deviation in zip_samples(origin, direction, begin, end, radius, points):
                 half = 1
                 if config.contracted:
                     step, half = 1e-5, 2
@@ -275,19 +280,19 @@ def zipnerf(config, params, center, scale, pixel):
                     cells = resolution(level, grid.levels, grid.coarsest, grid.finest)
                     spread = 0.5 * deviation / half * cells
                     found[level] *= math.erf(1 / math.sqrt(8 * spread**2))
-                total = total + found / 6
+                total = total + found / points
             result.append(total.ravel())
         return np.array(result)
 
     def propose(part, origin, direction, depth):
-        raw = mlp(
-            part["density"], features(config.proposal, part["grid"], origin, direction, depth)
-        )
+        kind = config.proposal, config.proposal_points
+        raw = mlp(part["density"], features(*kind, part["grid"], origin, direction, depth))
         return scale * np.exp(raw[:, 0]), None
 
     def render(origin, direction, depth):
         part = params["fine"]
-        raw = mlp(part["density"], features(config.grid, part["grid"], origin, direction, depth))
+        kind = config.grid, config.points
+        raw = mlp(part["density"], features(*kind, part["grid"], origin, direction, depth))
         seen = looking(direction, len(raw), config.direction_octaves)
         return scale * np.exp(raw[:, 0]), sigmoid(mlp(part["color"], raw, seen))
 

@@ -68,12 +68,14 @@ def test_the_integrated_encoding_is_the_mean_of_encodings():
         np.testing.assert_allclose(ours[:, i], reference.positional(x, 4)[:, 3:].mean(0), atol=5e-3)
 
 
+@pytest.mark.parametrize("count", [6, 3])
 @pytest.mark.parametrize("turned", [False, True])
-def test_six_points_have_their_frustums_moments(turned):
+def test_points_have_their_frustums_moments(turned, count):
     """Along the ray and, in the mean of both coordinates, across."""
     key = jax.random.key(0) if turned else None
     straight = rays((0.0, 0.0, 1.0))
-    points, deviation = jax.jit(frustum_samples)(key, straight, np.float32(EDGES))
+    sample = jax.jit(frustum_samples, static_argnums=3)
+    points, deviation = sample(key, straight, np.float32(EDGES), count)
     points = np.asarray(points) - np.array([0.1, 0.2, 0.3])[:, None, None, None]
     for i in range(3):
         mean, along, across = reference.frustum(*EDGES[0, i : i + 2], RADIUS * PIXEL)
@@ -82,6 +84,20 @@ def test_six_points_have_their_frustums_moments(turned):
         np.testing.assert_allclose(z.var(), along, rtol=1e-4)
         np.testing.assert_allclose((np.mean(x**2) + np.mean(y**2)) / 2, across, rtol=1e-4)
         np.testing.assert_allclose(deviation[0, i], 0.5 * np.hypot(x, y), rtol=1e-4)
+
+
+def test_a_single_point_has_its_frustums_mean_depth():
+    """Its place about the ray is random, and not biased."""
+    many = jax.tree.map(lambda leaf: np.repeat(leaf, 4000, axis=0), rays((0.0, 0.0, 1.0)))
+    edges = np.tile(np.float32(EDGES[:1]), (4000, 1))
+    points, _ = jax.jit(frustum_samples, static_argnums=3)(jax.random.key(1), many, edges, 1)
+    points = np.asarray(points)[..., 0] - np.array([0.1, 0.2, 0.3])[:, None, None]
+    for i in range(3):
+        mean, _, across = reference.frustum(*EDGES[0, i : i + 2], RADIUS * PIXEL)
+        np.testing.assert_allclose(points[2, :, i], mean, rtol=1e-5)
+        for axis in points[:2, :, i]:
+            np.testing.assert_allclose(np.mean(axis**2), across, rtol=0.1)
+            assert abs(axis.mean()) < 0.1 * across**0.5
 
 
 def test_weights_widen_as_the_oracle_says():

@@ -63,6 +63,7 @@ ZIP = ZipNerfConfig(
     num_coarse=6,
     num_middle=0,
     num_fine=4,
+    proposal_points=3,
 )
 TENSORF = TensorfConfig(
     coarsest=3,
@@ -102,7 +103,7 @@ def ngp_penalty(config, params, histograms):
 def zip_penalty(config, params, histograms):
     *proposals, last = histograms
     total = config.distortion_weight * reference.distortion(*last)
-    for proposed, pulse in zip(proposals, (0.03,), strict=True):
+    for proposed, pulse in zip(proposals, (0.003,), strict=True):
         total += config.proposal_weight * reference.blurred_penalty(*last, *proposed, pulse)
     decay = 0
     for part, grid in (

@@ -41,7 +41,7 @@ class DepthConfig:
     """
 
     depth_weight: float = 0.0
-    depth_share: float = 0.5
+    depth_share: float = 0.25
 
 
 def depth_supervision(config: DepthConfig, scene: Scene) -> DepthSupervision | None:

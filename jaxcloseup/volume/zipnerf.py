@@ -1,7 +1,7 @@
 """Zip-NeRF: hash features of cones, over mip-NeRF 360's rounds of proposals (Barron et al., 2023).
 
-A frustum's features are the mean over six Gaussians in it, and a level whose cells are small
-against a Gaussian counts less. The paper also hands the networks how much each level counted,
+A frustum's features are the mean over Gaussians in it, and a level whose cells are small against a
+Gaussian counts less. The paper also hands the networks how much each level counted,
 which is not done here; densities are exponential as in Instant-NGP, which learns faster at first.
 """
 
@@ -22,7 +22,6 @@ from jaxcloseup.volume.encodings import positional_encoding
 from jaxcloseup.volume.hash_grid import HashGridConfig, hash_features, init_hash_grid
 from jaxcloseup.volume.intervals import IntervalConfig, Round, interval_field
 from jaxcloseup.volume.networks import apply_mlp, exponential_density, init_mlp
-from jaxcloseup.volume.rays import Rays
 from jaxcloseup.volume.regularizers import antialiased_proposal_penalty, distortion
 from jaxcloseup.volume.renderer import Samples
 
@@ -46,6 +45,8 @@ class ZipNerfConfig:
       num_coarse: intervals per ray of the first proposal.
       num_middle: intervals per ray of the second proposal; 0: there is none.
       num_fine: intervals per ray that are rendered.
+      proposal_points: Gaussians of each interval of a proposal; the paper has 6.
+      points: Gaussians of each interval that is rendered; the paper has 6.
       spacing: exponent of the first round's spacing, see `spaced`.
       contracted: draw what lies outside the unit ball into a ball of radius 2; else positions
         outside the unit cube are those of its surface.
@@ -64,6 +65,8 @@ class ZipNerfConfig:
     num_coarse: int = 64
     num_middle: int = 64
     num_fine: int = 32
+    proposal_points: int = 6
+    points: int = 6
     spacing: float = -1.5
     contracted: bool = True
     proposal_weight: float = 0.01
@@ -107,8 +110,8 @@ def zipnerf(
         fine["color"] = init_mlp(key_color, widths, ray_features=3 + 6 * config.direction_octaves)
         return {"fine": fine, "proposal": [part(k, config.proposal, 1) for k in keys[1:]]}, ()
 
-    def geometry(part: Any, grid: HashGridConfig, key: Any, rays: Rays, edges: jax.Array):
-        positions, deviation = frustum_samples(key, rays, edges)
+    def geometry(part, grid, points, key, rays, edges) -> jax.Array:
+        positions, deviation = frustum_samples(key, rays, edges, points)
         shape, half = deviation.shape, 1.0  # half of the side of the cube that grids fill
         if config.contracted:
             deviation = deviation * contraction_scale(positions)
@@ -125,12 +128,13 @@ def zipnerf(
 
     def propose(index, params, buffers, key, rays, edges) -> Samples:
         del buffers
-        raw = geometry(params["proposal"][index], config.proposal, key, rays, edges)
+        part, points = params["proposal"][index], config.proposal_points
+        raw = geometry(part, config.proposal, points, key, rays, edges)
         return Samples(density(raw, edges), None)
 
     def render(params, buffers, key, rays, edges) -> Samples:
         del buffers
-        raw = geometry(params["fine"], config.grid, key, rays, edges)
+        raw = geometry(params["fine"], config.grid, config.points, key, rays, edges)
         looking = positional_encoding(rays.unit, config.direction_octaves)
         rgb = jax.nn.sigmoid(apply_mlp(params["fine"]["color"], raw, looking))
         shape = edges.shape[0], edges.shape[1] - 1
@@ -140,7 +144,7 @@ def zipnerf(
         del buffers
         *proposals, last = histograms
         total = config.distortion_weight * distortion(*last)
-        for proposed, pulse in zip(proposals, _PULSES, strict=False):
+        for proposed, pulse in zip(proposals, _PULSES[-len(proposals) :], strict=True):
             total += config.proposal_weight * antialiased_proposal_penalty(*last, *proposed, pulse)
         decay = mean_squares(params["fine"]["grid"], config.grid)
         decay += sum(mean_squares(part["grid"], config.proposal) for part in params["proposal"])
