@@ -88,8 +88,8 @@ def settings_of(preset: Preset, method: Method | None = None) -> dict[str, Setti
     method = METHODS[preset.method] if method is None else method
     found = {}
     for path, kind, value in _leaves(preset):
-        in_train = path[0] == "train"
-        if path == ("method",) or (in_train and not method.renders_pixels):
+        of_pixels = path[0] == "train" and path[1] != "num_windows"
+        if path == ("method",) or (of_pixels and not method.renders_pixels):
             continue
         if path == ("labels", "expected_depth") and method.with_expected_depth is None:
             continue
