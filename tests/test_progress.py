@@ -8,7 +8,7 @@ import time
 import pytest
 
 from experiments import progress
-from experiments.progress import display
+from experiments.progress import display, threads
 from experiments.progress.estimate import Estimate
 from experiments.training import plan
 
@@ -142,3 +142,46 @@ def test_parts_have_words():
     assert plan.in_words("control_evaluation") == "scoring control"
     assert plan.in_words("refine_baseline").startswith("adding surfels")
     assert plan.in_words("coarse_baseline") == "coarse_baseline"
+
+
+@pytest.mark.parametrize("cores", [1, 2, 64])
+def test_each_keeps_the_order(monkeypatch, cores):
+    """Later values may be done first; the first is done before another one begins."""
+    monkeypatch.setattr(threads.os, "cpu_count", lambda: cores)
+    begun, ended, before_second = [], [], []
+
+    def give(value):
+        begun.append(value)
+        if value == 1:
+            before_second.extend(ended)
+        time.sleep(0.02 if value % 2 else 0)
+        ended.append(value)
+        return -value
+
+    found = progress.each(give, range(9), "values")
+    assert next(found) == 0
+    assert len(begun) <= 1 + min(cores, 4) + 1  # no more is held than threads work on
+    assert list(found) == [-value for value in range(1, 9)]
+    assert before_second == [0]
+    assert sorted(ended) == list(range(9))
+    assert list(progress.each(give, [], "values")) == []
+
+
+@pytest.mark.parametrize("cores", [1, 2])
+@pytest.mark.parametrize("bad", [0, 3])
+def test_each_passes_an_error_on(monkeypatch, cores, bad):
+    monkeypatch.setattr(threads.os, "cpu_count", lambda: cores)
+    begun = []
+
+    def give(value):
+        begun.append(value)
+        if value == bad:
+            raise ValueError("no such value")
+        return value
+
+    found = []
+    with pytest.raises(ValueError, match="no such value"):
+        for value in progress.each(give, range(100), "values"):
+            found.append(value)
+    assert found == list(range(bad))
+    assert len(begun) < 20

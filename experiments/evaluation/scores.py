@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments import progress
 from experiments.evaluation.metrics_text import FINER
 from experiments.evaluation.surface_error import (
     Landmarks,
@@ -263,10 +264,12 @@ def evaluate(
 
     Renderings have their photograph's own size, and no `aux`.
     """
-    renderings = {
-        target.name: without_padding(jax.device_get(render(target.camera)), *target.weight.shape)
-        for target in targets
-    }
+
+    def seen(target):
+        return without_padding(jax.device_get(render(target.camera)), *target.weight.shape)
+
+    names = [target.name for target in targets]
+    renderings = dict(zip(names, progress.each(seen, targets, "rendering views"), strict=True))
     scores = {t.name: score(renderings[t.name], t, perceptual) for t in targets}
     return summarize(scores), renderings
 

@@ -6,6 +6,7 @@ Without `showing`, as in tests of single functions, nothing is said.
 """
 
 from experiments.progress.display import count, part, saying, showing, skip, track
+from experiments.progress.threads import each, workers
 
 
-__all__ = ["count", "part", "saying", "showing", "skip", "track"]
+__all__ = ["count", "each", "part", "saying", "showing", "skip", "track", "workers"]

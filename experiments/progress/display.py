@@ -24,7 +24,7 @@ class _Display:
     def __init__(self, estimate: Estimate, words: Callable[[str], str]) -> None:
         self.estimate, self._words = estimate, words
         self.lock = threading.RLock()  # of the estimate
-        self.doing: list[str] = []  # the innermost last
+        self.doing: list[list[str]] = []  # a text each, the innermost last
         self.said = time.monotonic()
         self._began = self.said  # what is being done
 
@@ -38,7 +38,7 @@ class _Display:
                     parts.append(f"{self.estimate.done} of {self.estimate.total} steps")
             remaining = _left(self.estimate)
             counting = self.estimate.done is not None
-        parts += self.doing[-1:] or ([] if parts else ["getting ready"])
+        parts += (self.doing or [[] if parts else ["getting ready"]])[-1]
         seconds = time.monotonic() - self._began
         if seconds >= 1 and (self.doing or not counting):
             parts.append(f"{seconds:.0f} s")
@@ -145,16 +145,18 @@ def saying(what: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _doing(what, *, aloud):
+    text = [what]
     if _display is None:
-        yield
+        yield text
         return
     doing = _display.doing
-    doing.append(what)
+    doing.append(text)
     _display.changed(aloud=aloud)
     try:
-        yield
+        yield text
     finally:
-        doing.pop()
+        # Another thread may have begun something since then.
+        doing[:] = [one for one in doing if one is not text]
 
 
 def track(values: Iterable[Any], what: str, total: int | None = None) -> Iterator[Any]:
@@ -169,9 +171,10 @@ def track(values: Iterable[Any], what: str, total: int | None = None) -> Iterato
         yield from values
         return
     display, total = _display, total or len(values)
-    with _doing(what, aloud=display.estimate.name is None):  # parts say that they begin
+    aloud = display.estimate.name is None  # parts say that they begin
+    with _doing(what, aloud=aloud) as text:
         for done, value in enumerate(values):
-            display.doing[-1] = f"{what}: {done} of {total}"
+            text[0] = f"{what}: {done} of {total}"
             yield value
 
 

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxcloseup
+from experiments import progress
 from experiments.training.manifest import hash_data
 from experiments.training.programs import Programs, describe_photographs
 from experiments.training.residuals import Window, render_residuals, reproduced
@@ -62,10 +63,12 @@ def detailed(programs: Programs, detail: Detail, camera: Camera, rendering: Rend
 
 def detailed_views(programs: Programs, state: TrainState, detail: Detail, cameras: Camera) -> Views:
     """Renders of stacked cameras `[Q]` with detail; pixels weigh as much as it is trusted."""
-    found = []
-    for index in range(cameras.intrinsics.shape[0]):
+
+    def label(index):
         camera = camera_at(cameras, index)
-        found.append(detailed(programs, detail, camera, programs.render(state, camera)))
+        return detailed(programs, detail, camera, programs.render(state, camera))
+
+    found = list(progress.each(label, range(cameras.intrinsics.shape[0]), "views with detail"))
     rgb, weight = (jnp.stack([getattr(one, name) for one in found]) for name in ("rgb", "weight"))
     return Views(cameras, rgb, weight)
 

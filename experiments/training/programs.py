@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import functools
 import math
-import os
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -44,6 +44,7 @@ class Programs:
         self.preset, self.scene, self.method = preset, scene, METHODS[preset.method]
         self.optimizer = self.method.make_optimizer(preset.field, scene)
         self.growth = 1
+        self._growing = threading.Lock()
         self._meetings = 0
         self._width = width or scene.train.cameras.width
         self._larger: dict[int, Programs] = {}
@@ -162,8 +163,12 @@ class Programs:
             self._larger[doublings] = large
         return self._larger[doublings]
 
-    def _grow(self) -> None:
-        self.make_room(2 * self.growth)
+    def _grow(self, too_small: int) -> None:
+        """Double the room, unless another thread found it too small too and already did."""
+        with self._growing:
+            if self.growth > too_small:
+                return
+            self.make_room(2 * self.growth)
         print(
             f"an image needs more room than there is: growing to {self.growth} times the preset's"
         )
@@ -189,6 +194,7 @@ class Programs:
         """
         arrays = self._share_out(kind, (state, *data))
         while True:
+            growth = self.growth
             with self._compiling(kind, "compiling the steps"):
                 after, metrics = self._collect(kind, self._runners[kind](*arrays, count=count))
                 metrics = jax.device_get(metrics)
@@ -196,7 +202,7 @@ class Programs:
             overflow = [metrics.pop(key, np.zeros(())) for key in ("overflow", "label_overflow")]
             if not any(np.any(values) for values in overflow):
                 return after, _checked(metrics, kind, count)
-            self._grow()
+            self._grow(growth)
 
     def _compiling(self, kind: str, what: str) -> contextlib.AbstractContextManager[None]:
         """Says that a kind of step, or rendering, is compiled, when it is called first."""
@@ -236,11 +242,12 @@ class Programs:
         """Render a whole image; without a key, deterministically."""
         programs = self._for_width(camera.width)
         while True:
+            growth = programs.growth
             with programs._compiling("render", "compiling the renderer"):
                 rendering = programs._render(state, camera, key)
             if rendering.overflow is None or not int(rendering.overflow):
                 return rendering
-            programs._grow()
+            programs._grow(growth)
 
 
 def _mesh_of_windows(windows: int) -> Mesh | None:
@@ -269,11 +276,10 @@ def _take_steps(
 
     To compile the rendering of an image, with its derivative, takes as long as hundreds of steps.
     """
-    cores = (os.cpu_count() or 1) if jax.default_backend() == "cpu" else 1
     total = None
     for i in range(count):
         # Two threads would compile the same parts, so the first step takes one.
-        state, metrics = step(state, *data, spread=in_threads(cores if i else 1))
+        state, metrics = step(state, *data, spread=in_threads(progress.workers() if i else 1))
         # No step begins before the last one ends: what waits would hold memory.
         total = metrics if total is None else jax.tree.map(jnp.add, total, metrics)
         jax.block_until_ready(total)

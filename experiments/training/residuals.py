@@ -81,8 +81,10 @@ def render_residuals(
     rendered = pyramid.level_near(most * cameras.width)
     views = range(len(scene.train)) if views is None else views
     values = np.empty((len(views), pyramid.values.shape[1], 3), np.int8)
-    windows, depths, rng = [], [], np.random.default_rng(0)
-    for view, own in zip(progress.track(views, "residuals of photographs"), values, strict=True):
+
+    def compare(view):
+        """Level, residual, weight, opacity and depth, the coarsest first."""
+        found = []
         for level in range(last, -1, -1):
             camera = pyramid.camera(camera_at(cameras, view), view, level)
             photograph = pyramid.image(view, level)
@@ -93,14 +95,20 @@ def render_residuals(
             else:
                 shown, shown_by = _enlarge(shown, shown_by, camera), camera
             if level == last:
-                depths.append(depth)
                 # The size that the model learned from shows the exposure.
                 colors = _match(photograph, *shown[:2])
-            residual, weight = map(np.asarray, _subtract(photograph, shown[0], colors))
+            found.append((level, *_subtract(photograph, shown[0], colors), *shown[1:]))
+        return [(level, *map(np.asarray, images)) for level, *images in found]
+
+    windows, depths, rng = [], [], np.random.default_rng(0)
+    compared = progress.each(compare, views, "residuals of photographs")
+    for view, own, found in zip(views, values, compared, strict=True):
+        depths.append(found[0][-1])
+        for level, residual, weight, alpha, depth in found:
             own[pyramid.pixels_of(level)] = residual.reshape(-1, 3)
             if view in left_out:
-                images = residual / np.float32(127), weight, shown[2], shown[1]
-                windows += _cut(rng, view, level, pyramid.sizes, list(map(np.asarray, images)))
+                images = [residual / np.float32(127), weight, depth, alpha]
+                windows += _cut(rng, view, level, pyramid.sizes, images)
     found = Pyramid(jnp.asarray(values), pyramid.intrinsics[np.asarray(views)], pyramid.sizes)
     return found, windows, jnp.stack(depths)
 

@@ -246,9 +246,11 @@ def rendered_depths(
     """
     count = cameras.intrinsics.shape[0]
     keys = [None] * count if key is None else jax.random.split(key, count)
-    views = progress.track(range(count), "rendering depths")
-    seen = (render(camera_at(cameras, i), keys[i]) for i in views)
-    return jnp.stack([depth(rendering, near=near, far=scene.far) for rendering in seen])
+
+    def depth_of(view):
+        return depth(render(camera_at(cameras, view), keys[view]), near=near, far=scene.far)
+
+    return jnp.stack(list(progress.each(depth_of, range(count), "rendering depths")))
 
 
 def label_targets(
