@@ -252,6 +252,7 @@ def test_a_preset_of_the_other_method_is_one_sentence(parsed_flags, tmp_path):
         ("nerf", "capacity=500", "method nerf has no setting capacity: --set=help lists all"),
         ("surfels", "compute_dtype=bfloat16", "method surfels has no setting compute_dtype"),
         ("surfels", "num_rays=4", "method surfels has no setting num_rays"),
+        ("surfels", "num_windows=0", "num_windows must be between 1 and 2147483647"),
         ("surfels", "capacity", "must be name=value"),
         ("surfels", "capacity=many", "capacity must be a whole number between 1 and 100000000"),
         ("surfels", "capacity=0", "capacity must be between 1 and 100000000"),
@@ -286,6 +287,12 @@ def test_settings_of_nested_records_have_their_path(parsed_flags):
         field = training_flags.preset_from_flags().field
     assert (field.density.growth, field.raster.tile, field.capacity) == (1.2, 16, 300)
     assert field.means_lr == (0.1, 0.01)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_any_method_takes_several_windows_a_step(parsed_flags, method):
+    with flagsaver.flagsaver(method=method, windows=3):
+        assert training_flags.preset_from_flags().train.num_windows == 3
 
 
 def test_every_setting_is_listed_with_values_that_it_may_have(parsed_flags, capsys):
