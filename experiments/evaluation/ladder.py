@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from experiments import progress
 from experiments.evaluation.scores import Target
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points
 from jaxcloseup.geometry.poses import closeup_position, sample_anchor
@@ -38,22 +39,26 @@ def ladder_targets(scene: Scene, exact_depths: jax.Array) -> dict[str, list[Targ
     if scene.surface is None or scene.test_far is None:
         return {}
     surface, count = scene.surface, jax.jit(count_seen)
-    ladder: dict[str, list[Target]] = {f"{PREFIX}{m:g}": [] for m in MAGNIFICATIONS}
-    for i, name in enumerate(scene.names["test_far"]):
-        far = camera_at(scene.test_far.cameras, i)
+
+    def rungs(i):
+        name, far = scene.names["test_far"][i], camera_at(scene.test_far.cameras, i)
         pixels = pixel_grid(far.height, far.width)
         own = surface(far)
         seen = count(far, pixels, own.depth, scene.train, exact_depths)
         anchor = _anchor(jax.random.key(i), far, own.depth, seen)
+        targets = []
         for m in MAGNIFICATIONS:
             camera = _nearer(far, anchor, m) if m > 1 else _wider(far, m)
             seen_surface = own if m == 1 else surface(camera)
             seen = count(camera, pixels, seen_surface.depth, scene.train, exact_depths)
             weight = jnp.ones(seen.shape, jnp.float32)
             rgb = seen_surface.rgb.astype(jnp.float32)
-            target = Target(name, camera, rgb, weight, seen, seen_surface)
-            ladder[f"{PREFIX}{m:g}"].append(target)
-    return ladder
+            targets.append(Target(name, camera, rgb, weight, seen, seen_surface))
+        return targets
+
+    views = progress.each(rungs, range(len(scene.names["test_far"])), "truth of the zoom ladder")
+    rows = zip(MAGNIFICATIONS, zip(*views, strict=True), strict=True)
+    return {f"{PREFIX}{m:g}": list(targets) for m, targets in rows}
 
 
 def _anchor(key: jax.Array, camera: Camera, depth: jax.Array, seen: jax.Array) -> jax.Array:

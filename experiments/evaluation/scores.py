@@ -84,7 +84,8 @@ def exact_depths(scene: Scene, cameras: Camera) -> jax.Array:
     """Return the exact z-depths `[V, H, W]` of stacked cameras on a procedural scene."""
     depth = jax.jit(lambda camera: scene.surface(camera).depth)  # jit skips the unused colors
     count = cameras.intrinsics.shape[0]
-    return jnp.stack([depth(camera_at(cameras, i)) for i in range(count)])
+    found = progress.each(lambda i: depth(camera_at(cameras, i)), range(count), "exact depths")
+    return jnp.stack(list(found))
 
 
 def make_targets(
@@ -110,9 +111,9 @@ def make_targets(
     views, sizes = finer or (getattr(scene, split), scene.sizes(split))
     surface = scene.surface  # is compiled; within jit, its textures would be constants
     count = jax.jit(count_seen)
-    targets = []
-    for i, (name, (width, height)) in enumerate(zip(scene.names[split], sizes, strict=True)):
-        camera = camera_at(views.cameras, i)
+
+    def make(i):
+        camera, (width, height) = camera_at(views.cameras, i), sizes[i]
         own = camera.replace(width=width, height=height)
         exact = surface(camera) if surface else None
         landmarks = None if exact else find_landmarks(own, scene.points)
@@ -121,8 +122,9 @@ def make_targets(
         seen = count(camera, pixels, depth, scene.train, train_depths)[:height, :width]
         rgb = to_float(jnp.asarray(views.rgb[i, :height, :width]))
         weight = jnp.asarray(views.weight[i, :height, :width])
-        targets.append(Target(name, camera, rgb, weight, seen, exact, landmarks))
-    return targets
+        return Target(scene.names[split][i], camera, rgb, weight, seen, exact, landmarks)
+
+    return list(progress.each(make, range(len(sizes)), f"truth of {split}"))
 
 
 def targets_by_split(
