@@ -238,12 +238,14 @@ def refine(
     each = min(max(0, free) // views, math.prod(pyramid.sizes[level]))
     kind = {"sh_degree": config.sh_degree, "num_scales": config.num_scales}
     sample = jax.jit(functools.partial(surfels_where_wrong, count=each, **kind))
-    new = []
-    for view in progress.track(range(views), "photographs searched"):
+
+    def search(view):
         camera = pyramid.camera(camera_at(cameras, view), view, level)
         photograph, seen = to_float(pyramid.image(view, level)), render(camera)
         data = photograph[..., :3], photograph[..., 3], seen.rgb, label_depth(seen)
-        new.append(sample(jax.random.fold_in(key, view), camera, *data))
+        return sample(jax.random.fold_in(key, view), camera, *data)
+
+    new = progress.each(search, range(views), "photographs searched")
     new = jax.tree.map(lambda *rows: jnp.concatenate(rows), *new)
     # The filter of finer photographs is smaller, so what the coarse one made stays as it is.
     old = smoothed(surfels, buffers.interval), buffers.alive

@@ -6,8 +6,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import jax
-
 from experiments.progress.display import track
 
 
@@ -16,6 +14,8 @@ _MOST = 4  # threads, each of which holds an image and what it is made from
 
 def workers() -> int:
     """How many threads have something to do for XLA: one for each core, one alone for a GPU."""
+    import jax  # not before the flags are read
+
     return (os.cpu_count() or 1) if jax.default_backend() == "cpu" else 1
 
 

@@ -61,5 +61,8 @@ def approach(
         magnification=float(np.clip(nearer, *MAGNIFICATION)),
         frames=FRAMES,
     )
-    cameras = progress.track(named_cameras(shots), "frames")
-    return [to_uint8(np.asarray(render(one).rgb)[:height, :width]) for _, one in cameras]
+
+    def frame(one):
+        return to_uint8(np.asarray(render(one).rgb)[:height, :width])
+
+    return list(progress.each(frame, [one for _, one in named_cameras(shots)], "frames"))

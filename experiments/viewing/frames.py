@@ -59,13 +59,15 @@ def render_shots(
     sizes = shots.sizes or [(shots.cameras.width, shots.cameras.height)] * len(cameras)
     images: dict[str, Image] = {}
     empty = 0
-    shown = progress.track(zip(cameras, sizes, strict=True), "rendering frames", len(cameras))
-    for (name, camera), (width, height) in shown:
-        seen = programs.render(state, camera)
-        images = draw_pictures(
-            programs, seen, camera, sources=sources, detail=detail, limits=limits
-        )
-        empty += not bool(np.any(np.asarray(seen.alpha)[:height, :width] >= SOLID))
+
+    def draw(named):
+        seen = programs.render(state, named[1])
+        given = {"sources": sources, "detail": detail, "limits": limits}
+        return draw_pictures(programs, seen, named[1], **given), np.asarray(seen.alpha)
+
+    drawn = progress.each(draw, cameras, "rendering frames")
+    for (name, _), (width, height), (images, alpha) in zip(cameras, sizes, drawn, strict=True):
+        empty += not bool(np.any(alpha[:height, :width] >= SOLID))
         for kind, image in images.items():
             write_png(output_dir / kind / f"{name}.png", image[:height, :width])
     if empty:
