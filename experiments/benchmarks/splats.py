@@ -179,7 +179,6 @@ def _lists(footprints, camera, config, *, exact=True):
         height=camera.height,
         width=camera.width,
         tile=config.tile,
-        block=1,
         capacity=config.capacity,
         reaches=functools.partial(reaches, table, tile=config.tile, near=config.near)
         if exact
@@ -203,7 +202,7 @@ def _render_by_scan(surfels, camera, config, longest):
     splats = _footprints(surfels, camera, config)
     lists = _lists(lax.stop_gradient(splats), camera, config)
     splats = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), splats)
-    starts, counts, origins = (a[:, 0] for a in (lists.starts, lists.counts, lists.origins))
+    starts, counts, origins = lists.starts, lists.counts, lists.origins
     inner = jnp.arange(config.tile) + 0.5
     inner = jnp.stack(jnp.meshgrid(inner, inner), axis=-1).reshape(-1, 2)
     pixels = origins[:, None] + inner[None]  # [T, P, 2]
@@ -234,7 +233,7 @@ def _render_by_scan(surfels, camera, config, longest):
     start = jnp.ones(pixels.shape[:2]), jnp.zeros((*pixels.shape[:2], 10))
     (_, sums), _ = lax.scan(step, start, jnp.arange(longest, dtype=jnp.int32))
     down, across = -(-camera.height // config.tile), -(-camera.width // config.tile)
-    image = sums[lists.slot].reshape(down, across, config.tile, config.tile, 10).swapaxes(1, 2)
+    image = sums.reshape(down, across, config.tile, config.tile, 10).swapaxes(1, 2)
     image = image.reshape(down * config.tile, across * config.tile, 10)
     image = image[: camera.height, : camera.width]
     depth, alpha, first, second = (image[..., i] for i in range(6, 10))

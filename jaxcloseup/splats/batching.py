@@ -28,8 +28,7 @@ def broadcast_batch(
 
 def merge_images(table: jax.Array, lists: TileLists) -> tuple[jax.Array, TileLists]:
     """Merge tables `[M, N, C]` and tile lists of M images into those of one image."""
-    count, capacity, tiles = table.shape[1], lists.splats.shape[1], lists.slot.shape[1]
-    slots = lists.tile[0].size
+    count, capacity = table.shape[1], lists.splats.shape[1]
 
     def flat(leaf, shift=0):
         image = jnp.arange(leaf.shape[0], dtype=leaf.dtype)
@@ -41,8 +40,6 @@ def merge_images(table: jax.Array, lists: TileLists) -> tuple[jax.Array, TileLis
         starts=flat(lists.starts, capacity),
         counts=flat(lists.counts),
         origins=flat(lists.origins),
-        tile=flat(lists.tile, tiles),
-        slot=flat(lists.slot, slots),
         overflow=lists.overflow.sum(),
     )
 

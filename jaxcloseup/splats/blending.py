@@ -21,7 +21,7 @@ def blend_tiles(config, table: jax.Array, lists: TileLists) -> tuple[jax.Array, 
     Args:
       config: a `RasterizeConfig`; static.
       table: `[N, C]` from `pack`.
-      lists: result of `tile_lists` with the config's tile and block.
+      lists: result of `tile_lists` with the config's tile.
 
     Returns:
       Sums `[T, F + 4, P]` over splats of weight times payload, z, 1, and the first and second power
@@ -57,8 +57,8 @@ def _compositor(config, name: str) -> Callable[..., Any]:
 def _kernels_compile(tile: int) -> bool:
     """Whether this GPU runs the kernels; says why not, once."""
     config, array = _Tiles(tile, near=1.0), jax.ShapeDtypeStruct
-    one, grid = array((1,), jnp.int32), array((1, 1), jnp.int32)
-    lists = TileLists(one, grid, grid, array((1, 1, 2), jnp.int32), grid, one, one)
+    one = array((1,), jnp.int32)
+    lists = TileLists(one, one, one, array((1, 2), jnp.int32), one)
     table = array((1, PAYLOAD + 1), jnp.float32)
 
     def both(table, lists):

@@ -28,7 +28,7 @@ from jaxcloseup.splats.kernel import (
     shade,
     worth,
 )
-from jaxcloseup.splats.tiling import TileLists
+from jaxcloseup.splats.tiling import TileLists, longest_first
 
 
 _TILE = plgpu.CompilerParams(num_warps=2)
@@ -39,8 +39,8 @@ def forward(
 ) -> tuple[jax.Array, jax.Array, Trace]:
     """`loops.forward`; with `interpret`, on any platform, slowly."""
     features, pixels = table.shape[1] - PAYLOAD, config.tile**2
-    blocks, dtype = lists.starts.shape, table.dtype
-    tiles = blocks[0] * blocks[1]
+    tiles, dtype = lists.starts.shape[0], table.dtype
+    order = longest_first(lists.counts)
     each = pl.BlockSpec((1, pixels), lambda i: (i, 0))
     values = jax.ShapeDtypeStruct((tiles, pixels), dtype)
     sums, median, *trace = pl.pallas_call(
@@ -56,9 +56,10 @@ def forward(
         ],
         interpret=interpret,
         compiler_params=_TILE,
-    )(table, *_flat(lists))
-    trace = Trace(*(leaf.reshape(*blocks, pixels) for leaf in trace))
-    return sums[lists.slot], median[lists.slot], trace
+    )(table, *_in_turn(lists, order))
+    place = jnp.argsort(order)
+    sums, median, *trace = (leaf[place] for leaf in (sums, median, *trace))
+    return sums, median, Trace(*trace)
 
 
 def backward(
@@ -72,11 +73,12 @@ def backward(
 ) -> jax.Array:
     """`loops.backward`; with `interpret`, on any platform, slowly."""
     features, pixels = table.shape[1] - PAYLOAD, config.tile**2
-    tiles, capacity = lists.starts.size, lists.splats.shape[0]
-    sums_bar, median_bar = (bar[lists.tile.reshape(-1)] for bar in cotangents)
-    trace = jax.tree.map(lambda leaf: leaf.reshape(tiles, pixels), trace)
+    tiles, capacity = lists.starts.shape[0], lists.splats.shape[0]
+    order = longest_first(lists.counts)
+    (sums_bar, median_bar), trace = jax.tree.map(lambda leaf: leaf[order], (cotangents, trace))
+    in_turn = _in_turn(lists, order)
     each = pl.BlockSpec((1, pixels), lambda i: (i, 0))
-    whole = [pl.BlockSpec(a.shape, lambda i, n=a.ndim: (0,) * n) for a in (table, *_flat(lists))]
+    whole = [pl.BlockSpec(a.shape, lambda i, n=a.ndim: (0,) * n) for a in (table, *in_turn)]
     pairs_bar = pl.pallas_call(
         functools.partial(_backward_tile, config, features),
         grid=tiles,
@@ -89,18 +91,13 @@ def backward(
         out_shape=jax.ShapeDtypeStruct((capacity, table.shape[1]), table.dtype),
         interpret=interpret,
         compiler_params=_TILE,
-    )(table, *_flat(lists), *trace, sums_bar, median_bar)
+    )(table, *in_turn, *trace, sums_bar, median_bar)
     return _add_pairs(pairs_bar, lists, table.shape[0], interpret)
 
 
-def _flat(lists):
-    """Lists by place, longest first, so that long lists begin first."""
-    return (
-        lists.splats,
-        lists.starts.reshape(-1),
-        lists.counts.reshape(-1),
-        lists.origins.reshape(-1, 2),
-    )
+def _in_turn(lists, order):
+    """Lists in an order of tiles, longest first, so that long lists begin first."""
+    return lists.splats, lists.starts[order], lists.counts[order], lists.origins[order]
 
 
 def _pixels(tile: int, dtype: Any) -> tuple[jax.Array, jax.Array]:
@@ -199,7 +196,7 @@ def _backward_tile(config, features, *refs):
 def _add_pairs(pairs_bar, lists, count, interpret):
     """Sums `[N, C]` of the pairs' cotangents, splat by splat."""
     capacity = lists.splats.shape[0]
-    begins, ends = (at.reshape(-1) for at in (lists.starts, lists.starts + lists.counts))
+    begins, ends = lists.starts, lists.starts + lists.counts
     changes = jnp.zeros(capacity + 1, jnp.int32).at[begins].add(1).at[ends].add(-1)
     listed = jnp.cumsum(changes[:-1]) > 0
     place = jnp.arange(capacity, dtype=jnp.int32)

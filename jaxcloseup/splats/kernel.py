@@ -38,7 +38,7 @@ def pack(footprints) -> jax.Array:
 
 
 class Trace(NamedTuple):
-    """What the forward pass keeps for the derivative, per pixel of all blocks `[blocks, B, P]`."""
+    """What the forward pass keeps for the derivative, per pixel of all tiles `[T, P]`."""
 
     transmittance: jax.Array  # behind the last drawn splat
     stop: jax.Array  # position in the list at which the pixel was finished

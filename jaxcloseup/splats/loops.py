@@ -1,54 +1,116 @@
 """The compositor in `jax.lax`, for every platform.
 
-Tiles are sorted by the length of their lists and processed in blocks of `B`. A block processes its
-lists in chunks of `K` splats and evaluates a chunk at all `P` pixels of its tiles at once, in
-arrays `[K, B, P]`; only the products along a list are sequential. The derivative walks the same
-chunks back to front, so memory is linear in pixels and pairs, and all sums have one fixed order.
+A step evaluates a chunk of `K` splats of each of `B` tiles at all `P` pixels of these tiles, in
+arrays `[K, B, P]`; only the products along a list are sequential. A tile whose list has ended makes
+way for the next one, longest lists first, so that nothing waits. The derivative walks the lists
+back to front, so memory is linear in pixels and pairs, and all sums have one fixed order.
 """
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
 from jaxcloseup.splats.kernel import (
-    HOMOGRAPHY,
+    ANCHOR,
     OPACITY,
     PAYLOAD,
     TRANSMITTANCE_MIN,
     Trace,
     Walk,
     channels,
-    pass_splat,
     pull_back,
     row_bar,
     shade,
     worth,
 )
-from jaxcloseup.splats.tiling import TileLists
+from jaxcloseup.splats.tiling import TileLists, longest_first
 
 
 _EXACT = lax.Precision.HIGHEST
+_GPU_LANES = 4096  # tiles that a GPU's many cores evaluate at once; not measured
 
 
-def _column(rows):
-    """Columns `[K, B, 1]` of gathered table rows `[K, B, C]`."""
-    return lambda i: rows[:, :, i, None]
+class _Queue(NamedTuple):
+    """Which tiles are at work, and which come next.
+
+    Attributes:
+      waiting: `[T + B]` tiles in the order in which they begin; `T` ends them.
+      next: `[]` place of the next one.
+      tile: `[B]` tiles at work, `T` where there is none.
+      step: `[B]` chunks that they have behind them.
+    """
+
+    waiting: jax.Array
+    next: jax.Array
+    tile: jax.Array
+    step: jax.Array
 
 
-def _gather(table, lists: TileLists, tiles, position, chunk):
-    """Table rows `[K, B, C]` of each tile's chunk, with local anchors, and splats `[K, B]`."""
-    starts, counts, origins = tiles
-    place = position + jnp.arange(chunk, dtype=jnp.int32)[:, None]
-    inside = place < counts[None]
-    # Past a list's end, take the splat at its start and give it opacity 0.
-    index = lists.splats[starts[None] + jnp.where(inside, place, 0)]
-    rows = table[index]
-    anchor = rows[..., :HOMOGRAPHY] - origins[None].astype(table.dtype)
-    opacity = jnp.where(inside, rows[..., OPACITY], 0)[..., None]
-    rows = jnp.concatenate(
-        [anchor, rows[..., HOMOGRAPHY:OPACITY], opacity, rows[..., OPACITY + 1 :]], axis=-1
+def _lanes(config, tiles):
+    """How many tiles are at work at once."""
+    on_cpu = jax.default_backend() == "cpu"
+    return min(config.block if on_cpu else max(config.block, _GPU_LANES), tiles)
+
+
+def _begin(counts, lanes):
+    """The queue of all tiles `[T]` whose lists have entries."""
+    tiles = counts.shape[0]
+    order = longest_first(counts)
+    order = jnp.where(counts[order] > 0, order, tiles)
+    waiting = jnp.pad(order, (0, lanes), constant_values=tiles)
+    return _Queue(waiting, jnp.int32(lanes), waiting[:lanes], jnp.zeros(lanes, jnp.int32))
+
+
+def _advance(queue, done):
+    """The queue after a step, in which the tiles `done[B]` ended."""
+    lanes = jnp.arange(done.shape[0])
+    earlier = done[None] & (lanes[None] < lanes[:, None])
+    place = queue.next + jnp.sum(earlier, axis=1, dtype=jnp.int32)
+    place = jnp.minimum(place, queue.waiting.shape[0] - 1)
+    return queue._replace(
+        next=queue.next + jnp.sum(done, dtype=jnp.int32),
+        tile=jnp.where(done, queue.waiting[place], queue.tile),
+        step=jnp.where(done, 0, queue.step + 1),
     )
-    return rows, index
+
+
+class _Chunk(NamedTuple):
+    """Splats `[K, B]` at the places of a chunk in their tiles' lists.
+
+    Attributes:
+      rows: `[K, B, C]` of the table.
+      index: which splats they are.
+      place: in the lists.
+      inside: bool; False past a list's end.
+      origins: `[B, 2]` first pixels of the tiles.
+    """
+
+    rows: jax.Array
+    index: jax.Array
+    place: jax.Array
+    inside: jax.Array
+    origins: jax.Array
+
+    def column(self, i: int) -> jax.Array:
+        """A column `[K, B, 1]`; anchors are local to the tiles, and opacity ends with the lists."""
+        value = self.rows[:, :, i]
+        if i in (ANCHOR, ANCHOR + 1):
+            value = value - self.origins[None, :, i - ANCHOR].astype(value.dtype)
+        elif i == OPACITY:
+            value = jnp.where(self.inside, value, 0)
+        return value[..., None]
+
+
+def _chunk(table, splats, tiles, position, size):
+    """The chunk of `size` splats at `position[B]` of each tile's list."""
+    starts, counts, origins = tiles
+    place = position[None] + jnp.arange(size, dtype=jnp.int32)[:, None]
+    inside = place < counts[None]
+    # Past a list's end, take the splat at its start.
+    index = splats[starts[None] + jnp.where(inside, place, 0)]
+    return _Chunk(table[index], index, place, inside, origins)
 
 
 def _pixels(tile: int, dtype) -> tuple[jax.Array, jax.Array]:
@@ -57,55 +119,87 @@ def _pixels(tile: int, dtype) -> tuple[jax.Array, jax.Array]:
     return jnp.tile(centers, tile), jnp.repeat(centers, tile)
 
 
-def forward(config, table: jax.Array, lists: TileLists) -> tuple[jax.Array, jax.Array, Trace]:
-    """Sums and median of `blend_tiles`, and what `backward` needs besides."""
-    features = table.shape[1] - PAYLOAD
-    x, y = (at[None, None] for at in _pixels(config.tile, table.dtype))
+def _running_products(before, alpha):
+    """Transmittances `[K, B, P]` behind each splat, from those in front of the chunk.
 
-    def attenuate(product, alpha):
-        # The product keeps falling once a pixel is finished, so the pixel stays finished.
-        product = product - alpha * product
+    They keep falling once a pixel is finished, so the pixel stays finished.
+    """
+
+    def attenuate(product, splat):
+        product = product - splat * product
         return product, product
 
-    def block(tiles):
-        counts = tiles[1]
-        longest = counts.max()
+    return lax.scan(attenuate, before, alpha)[1]
 
-        def unfinished(state):
-            position, product = state[:2]
-            listed = (position < counts)[:, None]
-            return (position < longest) & jnp.any((product >= TRANSMITTANCE_MIN) & listed)
 
-        def step(state):
-            position, product, walk, sums = state
-            rows, _ = _gather(table, lists, tiles, position, config.chunk)
-            seen = shade(_column(rows), x, y, config.near)
-            before = product
-            product, afters = lax.scan(attenuate, product, seen.alpha)
-            weights = []
-            for k in range(config.chunk):
-                splat = seen.alpha[k], seen.inverse_depth[k], seen.z[k]
-                weight, walk = pass_splat(walk, *splat, before, afters[k], position + k)
-                weights.append(weight)
-                before = afters[k]
-            sums = tuple(
-                total + sum(weights[k] * channel[k] for k in range(config.chunk))
-                for total, channel in zip(
-                    sums, channels(_column(rows), features, seen, walk.reference[None]), strict=True
-                )
-            )
-            return position + config.chunk, product, walk, sums
+def _pass_chunk(walk, seen, before, afters, place):
+    """Weights `[B, P]` of each of a chunk's splats, and the walk behind them."""
+    weights = []
+    remaining, stop, reference, median = walk
+    for k, after in enumerate(afters):
+        open_, drawn = after >= TRANSMITTANCE_MIN, seen.alpha[k] > 0
+        weights.append(jnp.where(open_, seen.alpha[k] * before, 0))
+        remaining = jnp.where(open_, after, remaining)
+        stop = jnp.where(open_, place[k] + 1, stop)
+        reference = reference + jnp.where(drawn & (before == 1), seen.inverse_depth[k], 0)
+        median = jnp.where(drawn & (before > 0.5), seen.z[k], median)
+        before = after
+    return weights, Walk(remaining, stop, reference, median)
 
-        shape = (len(counts), config.tile**2)
-        ones, zeros = jnp.ones(shape, table.dtype), jnp.zeros(shape, table.dtype)
-        walk = Walk(ones, jnp.zeros(shape, jnp.int32), zeros, zeros)
-        state = (jnp.int32(0), ones, walk, (zeros,) * (features + 4))
-        _, _, walk, sums = lax.while_loop(unfinished, step, state)
-        return jnp.stack(sums, axis=1), walk.median, Trace(*walk[:3])
 
-    sums, median, trace = lax.map(block, (lists.starts, lists.counts, lists.origins))
-    in_order = lambda tiles: tiles.reshape((-1, *tiles.shape[2:]))[lists.slot]  # noqa: E731
-    return in_order(sums), in_order(median), trace
+def _with_none(lists: TileLists):
+    """Starts, counts and origins of all tiles, and of none: an empty list."""
+    return tuple(
+        jnp.pad(leaf, ((0, 1),) + ((0, 0),) * (leaf.ndim - 1))
+        for leaf in (lists.starts, lists.counts, lists.origins)
+    )
+
+
+def forward(config, table: jax.Array, lists: TileLists) -> tuple[jax.Array, jax.Array, Trace]:
+    """Sums and median of `blend_tiles`, and what `backward` needs besides."""
+    features, tiles = table.shape[1] - PAYLOAD, lists.counts.shape[0]
+    lanes = _lanes(config, tiles)
+    x, y = (at[None, None] for at in _pixels(config.tile, table.dtype))
+    of_tile = _with_none(lists)
+    ones = jnp.ones((lanes, config.tile**2), table.dtype)
+    zeros = jnp.zeros_like(ones)
+    fresh = Walk(ones, jnp.zeros(ones.shape, jnp.int32), zeros, zeros)
+
+    def step(state):
+        queue, product, walk, sums, ended = state
+        here = tuple(leaf[queue.tile] for leaf in of_tile)
+        position = queue.step * config.chunk
+        splats = _chunk(table, lists.splats, here, position, config.chunk)
+        seen = shade(splats.column, x, y, config.near)
+        begins = (queue.step == 0)[:, None]
+        before = jnp.where(begins, 1, product)
+        walk = jax.tree.map(lambda new, old: jnp.where(begins, new, old), fresh, walk)
+        sums = tuple(jnp.where(begins, 0, total) for total in sums)
+        afters = _running_products(before, seen.alpha)
+        product = afters[-1]
+        weights, walk = _pass_chunk(walk, seen, before, afters, splats.place[..., None])
+        weights = lax.optimization_barrier(weights)
+        found = channels(splats.column, features, seen, walk.reference[None])
+        sums = tuple(
+            total + sum(weights[k] * channel[k] for k in range(config.chunk))
+            for total, channel in zip(sums, found, strict=True)
+        )
+        finished = jnp.max(product, axis=-1) < TRANSMITTANCE_MIN
+        done = finished | (position + config.chunk >= here[1])
+        stop = walk.stop.astype(table.dtype)
+        rest = jnp.stack([walk.median, walk.remaining, stop, walk.reference], axis=1)
+        found = jnp.concatenate([jnp.stack(sums, axis=1), rest], axis=1)
+        ended = ended.at[jnp.where(done, queue.tile, tiles)].set(found)
+        return _advance(queue, done), product, walk, sums, ended
+
+    # What a tile without splats shows.
+    ended = jnp.zeros((tiles + 1, features + 8, config.tile**2), table.dtype)
+    ended = ended.at[:, features + 5].set(1)
+    sums = (zeros,) * (features + 4)
+    state = (_begin(lists.counts, lanes), ones, fresh, sums, ended)
+    ended = lax.while_loop(lambda state: jnp.any(state[0].tile < tiles), step, state)[-1][:-1]
+    median, remaining, stop, reference = (ended[:, features + 4 + i] for i in range(4))
+    return ended[:, : features + 4], median, Trace(remaining, stop.astype(jnp.int32), reference)
 
 
 def backward(
@@ -116,6 +210,8 @@ def backward(
     cotangents: tuple[jax.Array, jax.Array],
 ) -> jax.Array:
     """The table's cotangent `[N, C]` from those of the sums and the median."""
+    tiles = lists.counts.shape[0]
+    lanes = _lanes(config, tiles)
     pixels = _pixels(config.tile, table.dtype)
     x, y = (at[None, None] for at in pixels)
     # Moments about the middle of a tile lose the fewest digits.
@@ -126,8 +222,6 @@ def backward(
         sums = jnp.einsum("kbp,pm->kbm", values, basis, precision=_EXACT)
         return jnp.moveaxis(sums, -1, 0)
 
-    cotangents = tuple(bar[lists.tile] for bar in cotangents)
-
     def recede(carry, splat):
         behind, after = carry
         alpha, passing, value = splat
@@ -135,42 +229,54 @@ def backward(
         behind = behind + alpha * before * value
         return (behind, before), (behind, before)
 
-    def block(table_bar, tiles):
-        *tiles, (sums_bar, median_bar), trace = tiles
-        each_bar = [sums_bar[None, :, i] for i in range(sums_bar.shape[1])]
-        bars = (each_bar[-4], each_bar[-2], each_bar[-1], median_bar[None])
-        here = jax.tree.map(lambda leaf: leaf[None], trace)
+    of_tile = _with_none(lists)
+    sums_bar, median_bar = cotangents
+    of_pixel = jnp.concatenate(
+        [sums_bar, median_bar[:, None], *(leaf[:, None].astype(table.dtype) for leaf in trace)],
+        axis=1,
+    )
+    of_pixel = jnp.pad(of_pixel, ((0, 1), (0, 0), (0, 0)))
+    # Splats behind the one that finished the last pixel count for nothing.
+    counted = jnp.minimum(trace.stop.max(axis=-1), lists.counts)
+    chunks = jnp.pad(-(-counted // config.chunk), (0, 1))
 
-        def step(state):
-            position, behind, after, table_bar = state
-            rows, index = _gather(table, lists, tiles, position, config.chunk)
-            seen = shade(_column(rows), x, y, config.near)
-            place = position + jnp.arange(config.chunk, dtype=jnp.int32)[:, None, None]
-            alpha = jnp.where(place < here.stop, seen.alpha, 0)
-            value = worth(_column(rows), seen, here.reference, each_bar)
-            ends = (behind, after)
-            (behind, after), (behinds, before) = lax.scan(
-                recede, ends, (alpha, 1 / (1 - alpha), value), reverse=True
-            )
-            # Shift by one: the state behind a splat is the state in front of the next one.
-            behinds = jnp.concatenate([behinds[1:], ends[0][None]])
-            afters = jnp.concatenate([before[1:], ends[1][None]])
-            weight, pulled = pull_back(seen, alpha, before, afters, behinds, value, here, bars)
-            payload = jnp.einsum("kbp,bfp->kbf", weight, sums_bar[:, :-4], precision=_EXACT)
-            sums = pulled._replace(
-                **{name: moments(getattr(pulled, name)) for name in ("u", "v", "w", "low_pass")},
-                clip=pulled.clip.sum(-1),
-                scaled=pulled.scaled.sum(-1),
-            )
-            columns = row_bar(lambda i: rows[..., i], middle, sums, [])
-            update = jnp.concatenate([jnp.stack(columns, axis=-1), payload], axis=-1)
-            table_bar = table_bar.at[index.reshape(-1)].add(update.reshape(-1, table.shape[1]))
-            return position - config.chunk, behind, after, table_bar
+    def step(state):
+        queue, behind, after, table_bar = state
+        left = chunks[queue.tile] - 1 - queue.step
+        here = tuple(leaf[queue.tile] for leaf in of_tile)
+        position = jnp.maximum(left, 0) * config.chunk
+        splats = _chunk(table, lists.splats, here, position, config.chunk)
+        found = of_pixel[queue.tile]
+        *each_bar, median_bar, remaining, stop, reference = (
+            found[None, :, i] for i in range(found.shape[1])
+        )
+        trace = Trace(remaining, stop.astype(jnp.int32), reference)
+        bars = (each_bar[-4], each_bar[-2], each_bar[-1], median_bar)
+        seen = shade(splats.column, x, y, config.near)
+        alpha = jnp.where(splats.place[..., None] < trace.stop, seen.alpha, 0)
+        value = worth(splats.column, seen, reference, each_bar)
+        begins = (queue.step == 0)[:, None]
+        ends = (jnp.where(begins, 0, behind), jnp.where(begins, remaining[0], after))
+        (behind, after), (behinds, before) = lax.scan(
+            recede, ends, (alpha, 1 / (1 - alpha), value), reverse=True
+        )
+        # Shift by one: the state behind a splat is the state in front of the next one.
+        behinds = jnp.concatenate([behinds[1:], ends[0][None]])
+        afters = jnp.concatenate([before[1:], ends[1][None]])
+        weight, pulled = pull_back(seen, alpha, before, afters, behinds, value, trace, bars)
+        payload = jnp.einsum(
+            "kbp,bfp->kbf", weight, found[:, : len(each_bar) - 4], precision=_EXACT
+        )
+        sums = pulled._replace(
+            **{name: moments(getattr(pulled, name)) for name in ("u", "v", "w", "low_pass")},
+            clip=pulled.clip.sum(-1),
+            scaled=pulled.scaled.sum(-1),
+        )
+        columns = row_bar(lambda i: splats.column(i)[..., 0], middle, sums, [])
+        update = jnp.concatenate([jnp.stack(columns, axis=-1), payload], axis=-1)
+        table_bar = table_bar.at[splats.index.reshape(-1)].add(update.reshape(-1, table.shape[1]))
+        return _advance(queue, left <= 0), behind, after, table_bar
 
-        longest = jnp.minimum(trace.stop.max(), tiles[1].max())
-        position = (longest - 1) // config.chunk * config.chunk
-        state = (position, jnp.zeros_like(median_bar), trace.transmittance, table_bar)
-        return lax.while_loop(lambda state: state[0] >= 0, step, state)[-1], None
-
-    tiles = (lists.starts, lists.counts, lists.origins, cotangents, trace)
-    return lax.scan(block, jnp.zeros_like(table), tiles)[0]
+    zeros = jnp.zeros((lanes, config.tile**2), table.dtype)
+    state = (_begin(chunks[:-1], lanes), zeros, zeros, jnp.zeros_like(table))
+    return lax.while_loop(lambda state: jnp.any(state[0].tile < tiles), step, state)[-1]

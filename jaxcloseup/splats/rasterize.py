@@ -22,7 +22,6 @@ from jaxcloseup.splats.tiling import tile_lists
 
 
 COMPOSITORS = ("auto", "loops", "kernel")
-_GPU_BLOCK = 4096  # tiles that a GPU's many cores evaluate at once; not measured
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,14 +146,12 @@ def blend(
 ) -> SplatImage:
     """`rasterize` of splats whose footprints are a table `[N, C]` from `pack`, boxes and order."""
     kept = lax.stop_gradient(table)
-    block = config.block if jax.default_backend() == "cpu" else max(config.block, _GPU_BLOCK)
     lists = tile_lists(
         lax.stop_gradient(box),
         lax.stop_gradient(order),
         height=height,
         width=width,
         tile=config.tile,
-        block=block,
         capacity=config.capacity,
         reaches=functools.partial(reaches, kept, tile=config.tile, near=config.near),
     )

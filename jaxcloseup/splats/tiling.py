@@ -20,15 +20,13 @@ _LARGE = 2**16  # room that is worth shortcuts
 
 @struct.dataclass
 class TileLists:
-    """The lists of all `T` tiles, in blocks of `B` tiles whose lists have similar lengths.
+    """The lists of all `T` tiles, in row-major order.
 
     Attributes:
       splats: `[capacity]` indices of splats, tile after tile, each tile's nearest first.
-      starts: `[blocks, B]` index into `splats` at which a tile's list starts.
-      counts: `[blocks, B]` length of a tile's list; 0 for tiles that only fill the last block.
-      origins: `[blocks, B, 2]` x and y of a tile's first pixel.
-      tile: `[blocks, B]` row-major index of the tile in the image.
-      slot: `[T]` place of each tile in the flattened blocks.
+      starts: `[T]` index into `splats` at which a tile's list starts.
+      counts: `[T]` length of a tile's list.
+      origins: `[T, 2]` x and y of a tile's first pixel.
       overflow: `[]` int32 number of pairs that did not fit, which are those of the farthest splats;
         `LARGEST` where the number of pairs may exceed int32.
     """
@@ -37,8 +35,6 @@ class TileLists:
     starts: jax.Array
     counts: jax.Array
     origins: jax.Array
-    tile: jax.Array
-    slot: jax.Array
     overflow: jax.Array
 
 
@@ -49,7 +45,6 @@ def tile_lists(
     height: int,
     width: int,
     tile: int,
-    block: int,
     capacity: int,
     reaches: Callable[[jax.Array, jax.Array], jax.Array] | None = None,
 ) -> TileLists:
@@ -62,7 +57,6 @@ def tile_lists(
       height: image height in pixels; static.
       width: image width in pixels; static.
       tile: side of a tile in pixels; static.
-      block: largest number `B` of tiles in a block; static.
       capacity: largest number of pairs of splats and tiles that their boxes touch; static.
       reaches: says of `[P]` indices of splats and `[P, 2]` corners x, y of tiles, in pixels, which
         of these pairs are worth listing, `[P]` bool; None lists all.
@@ -95,26 +89,21 @@ def tile_lists(
     branches = [functools.partial(sort, *room) for room in rooms]
     first_fit = jnp.argmax(jnp.stack([*fits, jnp.array(True)]))
     tile_of, splats = lax.switch(first_fit, branches)
-    starts = jnp.searchsorted(tile_of, jnp.arange(across * down + 1, dtype=jnp.int32))
-    starts = starts.astype(jnp.int32)
-    counts = starts[1:] - starts[:-1]
-    # A block runs as long as its longest list, so lists of similar length share a block, and blocks
-    # share the tiles evenly.
-    block = -(-across * down // -(-across * down // block))
-    padding = -(across * down) % block
-    longest_first = jnp.argsort(-counts, stable=True).astype(jnp.int32)
-    slot = jnp.argsort(longest_first).astype(jnp.int32)
-    longest_first = jnp.pad(longest_first, (0, padding)).reshape(-1, block)
-    real = jnp.pad(jnp.ones(across * down, bool), (0, padding)).reshape(-1, block)
+    tiles = jnp.arange(across * down + 1, dtype=jnp.int32)
+    starts = jnp.searchsorted(tile_of, tiles).astype(jnp.int32)
+    tiles = tiles[:-1]
     return TileLists(
         splats=splats,
-        starts=starts[longest_first],
-        counts=jnp.where(real, counts[longest_first], 0),
-        origins=tile * jnp.stack([longest_first % across, longest_first // across], axis=-1),
-        tile=longest_first,
-        slot=slot,
+        starts=starts[:-1],
+        counts=starts[1:] - starts[:-1],
+        origins=tile * jnp.stack([tiles % across, tiles // across], axis=-1),
         overflow=jnp.where(too_many, LARGEST, jnp.maximum(total - capacity, 0)),
     )
+
+
+def longest_first(counts: jax.Array) -> jax.Array:
+    """Indices `[T]` of tiles by the length of their lists, of equal ones by index."""
+    return jnp.argsort(-counts, stable=True).astype(jnp.int32)
 
 
 def _sort(first, extent, order, reaches, rows, capacity, *, tile, across, down):
