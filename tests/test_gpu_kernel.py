@@ -82,9 +82,7 @@ def test_kernels_become_programs_of_a_gpu():
     # Triton's part of the compiler needs no GPU; what follows it does.
     count, height, width = COUNT, 16, 16
     box = jnp.tile(jnp.array([[0.0, 0.0, width, height]]), (count, 1))
-    lists = tile_lists(
-        box, jnp.ones(count), height=height, width=width, tile=8, block=4, capacity=256
-    )
+    lists = tile_lists(box, jnp.ones(count), height=height, width=width, tile=8, capacity=256)
     table = jnp.zeros((count, PAYLOAD + 6))
 
     def both(table, lists):

@@ -28,7 +28,7 @@ from splat_scenes import (
 )
 
 from jaxcloseup.geometry.rotations import euler_to_matrix
-from jaxcloseup.splats.rasterize import RasterizeConfig
+from jaxcloseup.splats.rasterize import RasterizeConfig, for_image
 
 
 VECTORS = ("rgb", "normal")
@@ -170,7 +170,7 @@ def test_tile_sizes_do_not_change_the_image(precision):
                     capacity=1024, near=NEAR, tile=tile, chunk=chunk, block=block
                 ),
             )
-            for tile, chunk, block in ((8, 4, 4), (16, 3, 1), (32, 8, 2))
+            for tile, chunk, block in ((8, 4, 4), (16, 3, 1), (32, 8, 2), (None, None, None))
         ]
     for other in images[1:]:
         for name in OUTPUTS:
@@ -180,6 +180,15 @@ def test_tile_sizes_do_not_change_the_image(precision):
             else:
                 atol, rtol = 1e-6, 0 if name in ("alpha", *VECTORS) else 5e-5
             np.testing.assert_allclose(other[name], images[0][name], atol=atol, rtol=rtol)
+
+
+def test_sizes_left_open_suit_the_image():
+    small = for_image(RasterizeConfig(capacity=1000), height=68, width=120)
+    large = for_image(RasterizeConfig(capacity=1000), height=270, width=480)
+    assert (small.tile, small.capacity) == (4, 2000) and (large.tile, large.capacity) == (8, 1000)
+    assert small.chunk > large.chunk > 0 and small.block == large.block > 0
+    given = RasterizeConfig(capacity=1000, tile=16, chunk=3, block=5)
+    assert for_image(given, height=68, width=120) == given
 
 
 @pytest.mark.parametrize("name", ["in front", "far and small"])

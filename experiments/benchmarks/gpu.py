@@ -142,9 +142,7 @@ def ceilings(size: Size) -> dict[str, float]:
 
 def _config(surfels_, camera) -> tuple[RasterizeConfig, int]:
     """Room for all pairs, and their number."""
-    guess = RasterizeConfig(capacity=2**16)
-    boxes, _ = splats.count_pairs(surfels_, camera, guess, exact=False)
-    config = RasterizeConfig(capacity=-(-boxes // 2**14) * 2**14)
+    config = splats.config_for(surfels_, camera)
     return config, splats.count_pairs(surfels_, camera, config)[0]
 
 

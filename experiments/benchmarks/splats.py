@@ -7,6 +7,7 @@ and `jax.grad` differentiates the scan. The bound is the time for the arithmetic
 """
 
 import contextlib
+import dataclasses
 import functools
 import math
 import os
@@ -25,13 +26,19 @@ from jaxcloseup.scenes import load_scene
 from jaxcloseup.splats import RasterizeConfig, render_surfels, surfels_from_points
 from jaxcloseup.splats.kernel import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, pack
 from jaxcloseup.splats.projection import project_discs, surfel_columns, to_camera
+from jaxcloseup.splats.rasterize import for_image
 from jaxcloseup.splats.reach import reaches
 from jaxcloseup.splats.spherical_harmonics import sh_to_rgb
 from jaxcloseup.splats.tiling import tile_lists
 
 
-COUNTS = (5_000, 20_000, 100_000)
-SIZES = ((135, 240), (270, 480), (540, 960))
+CASES = (  # discs, and the image's size
+    (10_000, (68, 120)),
+    (30_000, (135, 240)),
+    (20_000, (270, 480)),
+    (100_000, (270, 480)),
+    (100_000, (540, 960)),
+)
 # Additions, products, comparisons and selections of one evaluation; exp and 1/x count as one.
 FORWARD_OPERATIONS, BACKWARD_OPERATIONS = 76, 136
 SCAN_BYTES = 6e9  # the scan is skipped if its stored steps need more memory
@@ -49,18 +56,15 @@ def run() -> None:
         "  bound  MiB  (scan)  compile s"
     )
     scene = load_scene("table", downscale=4)
-    for count in COUNTS:
-        for size in SIZES:
-            _report(*_discs_on_table(scene, count, size), rate)
+    for count, size in CASES:
+        _report(*_discs_on_table(scene, count, size), rate)
     print("a wavy wall, which gives all tiles lists of nearly the same length:")
     _report(*discs_on_a_wall(20_000, (270, 480)), rate)
 
 
 def _report(surfels, camera, rate):
     count, size = surfels.means.shape[0], (camera.height, camera.width)
-    # The overflow of a first guess shows how much capacity is needed.
-    touched, _ = count_pairs(surfels, camera, RasterizeConfig(capacity=2**16), exact=False)
-    config = RasterizeConfig(capacity=-(-touched // 2**14) * 2**14)
+    config = config_for(surfels, camera)
     pairs, longest = count_pairs(surfels, camera, config)
 
     loss = functools.partial(loss_of_all, functools.partial(render_all, config=config))
@@ -109,6 +113,13 @@ def _report(surfels, camera, rate):
         f"  {memory / 2**20:>3.0f}  {scan_mib:>6}  {compile_seconds:>9.1f}",
         flush=True,
     )
+
+
+def config_for(surfels, camera):
+    """The configuration for an image, with as much room as it needs."""
+    guess = for_image(RasterizeConfig(), height=camera.height, width=camera.width)
+    touched, _ = count_pairs(surfels, camera, guess, exact=False)
+    return dataclasses.replace(guess, capacity=-(-touched // 2**14) * 2**14)
 
 
 def _discs_on_table(scene, count, size):

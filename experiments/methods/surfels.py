@@ -91,7 +91,7 @@ REDUCED = Preset(
         rotation_lr=5e-3,
         distortion_weight=0.1,
         density=McmcConfig(start=200, stop=1600, growth=1.1, noise=5e4),
-        raster=RasterizeConfig(capacity=2**15, block=32),
+        raster=RasterizeConfig(capacity=2**15),
     ),
     train=WHOLE_IMAGES,
     labels=LabelConfig(
@@ -121,7 +121,7 @@ QUICK = dataclasses.replace(
         steps_per_target=20,
         fewest_target_steps=60,
         density=McmcConfig(start=0, stop=700, growth=1.0, noise=0.0),
-        raster=RasterizeConfig(capacity=2**17, block=48, chunk=16, antialias=True),
+        raster=RasterizeConfig(capacity=2**17, antialias=True),
     ),
     coarse=CoarseConfig(
         field=dataclasses.replace(

@@ -29,7 +29,7 @@ from jaxcloseup.splats.tiling import TileLists, longest_first
 
 
 _EXACT = lax.Precision.HIGHEST
-_GPU_LANES = 4096  # tiles that a GPU's many cores evaluate at once; not measured
+_FEWEST = 16  # splats of a chunk of the derivative, which reads more for each chunk
 
 
 class _Queue(NamedTuple):
@@ -49,9 +49,8 @@ class _Queue(NamedTuple):
 
 
 def _lanes(config, tiles):
-    """How many tiles are at work at once."""
-    on_cpu = jax.default_backend() == "cpu"
-    return min(config.block if on_cpu else max(config.block, _GPU_LANES), tiles)
+    """How many tiles are at work at once: few enough that short lists fill up behind long ones."""
+    return min(config.block, -(-tiles // 4))
 
 
 def _begin(counts, lanes):
@@ -211,7 +210,7 @@ def backward(
 ) -> jax.Array:
     """The table's cotangent `[N, C]` from those of the sums and the median."""
     tiles = lists.counts.shape[0]
-    lanes = _lanes(config, tiles)
+    lanes, chunk = _lanes(config, tiles), max(config.chunk, _FEWEST)
     pixels = _pixels(config.tile, table.dtype)
     x, y = (at[None, None] for at in pixels)
     # Moments about the middle of a tile lose the fewest digits.
@@ -238,14 +237,14 @@ def backward(
     of_pixel = jnp.pad(of_pixel, ((0, 1), (0, 0), (0, 0)))
     # Splats behind the one that finished the last pixel count for nothing.
     counted = jnp.minimum(trace.stop.max(axis=-1), lists.counts)
-    chunks = jnp.pad(-(-counted // config.chunk), (0, 1))
+    chunks = jnp.pad(-(-counted // chunk), (0, 1))
 
     def step(state):
         queue, behind, after, table_bar = state
         left = chunks[queue.tile] - 1 - queue.step
         here = tuple(leaf[queue.tile] for leaf in of_tile)
-        position = jnp.maximum(left, 0) * config.chunk
-        splats = _chunk(table, lists.splats, here, position, config.chunk)
+        position = jnp.maximum(left, 0) * chunk
+        splats = _chunk(table, lists.splats, here, position, chunk)
         found = of_pixel[queue.tile]
         *each_bar, median_bar, remaining, stop, reference = (
             found[None, :, i] for i in range(found.shape[1])

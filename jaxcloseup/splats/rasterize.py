@@ -22,6 +22,7 @@ from jaxcloseup.splats.tiling import tile_lists
 
 
 COMPOSITORS = ("auto", "loops", "kernel")
+_SMALL = 2**16  # pixels of an image that is best cut into small tiles
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,9 +35,9 @@ class RasterizeConfig:
         larger capacity.
       near: positive z-depth in world units; nothing nearer is drawn.
       antialias: convolve surfels with the pixel, see `project_discs`.
-      tile: side of a tile in pixels.
-      chunk: number of a tile's splats that loops evaluate at once.
-      block: largest number of tiles that loops evaluate at once on a CPU; a GPU takes thousands.
+      tile: side of a tile in pixels; None: by the image's size, see `for_image`.
+      chunk: number of a tile's splats that loops evaluate at once; None: by the tile's size.
+      block: largest number of tiles that loops evaluate at once; None: by the platform.
       compositor: "loops" blends by `jax.lax`, with chunks and blocks; "kernel" by Pallas kernels,
         which other platforms than GPUs interpret, slowly; "auto" by kernels on a GPU that runs
         them, else by loops.
@@ -48,9 +49,9 @@ class RasterizeConfig:
     capacity: int = 2**18
     near: float = 0.01
     antialias: bool = False
-    tile: int = 8
-    chunk: int = 8
-    block: int = 128
+    tile: int | None = None
+    chunk: int | None = None
+    block: int | None = None
     compositor: str = "auto"
 
     def __post_init__(self) -> None:
@@ -59,6 +60,27 @@ class RasterizeConfig:
             raise ValueError(
                 f'RasterizeConfig.compositor must be one of {COMPOSITORS}, not "{self.compositor}"'
             )
+
+
+def for_image(config: RasterizeConfig, *, height: int, width: int) -> RasterizeConfig:
+    """The settings with the sizes that are fastest for an image, where they leave them open.
+
+    Small tiles evaluate fewer splats in vain, but more pairs have to be sorted; docs/results.md
+    has the times on a CPU. Small tiles that are chosen here get twice the `capacity`, since splats
+    touch about twice as many. A GPU evaluates thousands of tiles at once: its sizes are a guess.
+    """
+    on_cpu = jax.default_backend() == "cpu"
+    tile, capacity = config.tile, config.capacity
+    if tile is None:
+        small = on_cpu and height * width <= _SMALL
+        tile, capacity = (4, 2 * capacity) if small else (8, capacity)
+    return dataclasses.replace(
+        config,
+        capacity=capacity,
+        tile=tile,
+        chunk=config.chunk or (32 if tile <= 4 else 8),
+        block=config.block or (256 if on_cpu else 4096),
+    )
 
 
 @struct.dataclass
@@ -145,6 +167,7 @@ def blend(
     width: int,
 ) -> SplatImage:
     """`rasterize` of splats whose footprints are a table `[N, C]` from `pack`, boxes and order."""
+    config = for_image(config, height=height, width=width)
     kept = lax.stop_gradient(table)
     lists = tile_lists(
         lax.stop_gradient(box),
