@@ -108,13 +108,11 @@ def write_report(
         f"{sizes}, on 8-bit images.</p>",
         *_exhibition(shown, best_stage(results["stages"])),
         *_moving(dolly),
-        "<h2>Scores</h2>",
-        *score_tables(tables(results)),
-        _STAGES,
     ]
     views = [picture for picture in pictures if picture.section in SPLIT_TITLES.values()]
     labels = [picture for picture in pictures if picture not in views]
     parts += figures(views)
+    parts += ["<h2>Scores</h2>", *score_tables(tables(results)), _STAGES]
     parts += folded("PSNR by magnification", zoom_plots(results["stages"]))
     header, *body = rows(results)
     parts += folded("All scores", [table(header, body, names=2)])
