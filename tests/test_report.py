@@ -116,7 +116,12 @@ def test_a_phone_shows_a_page_without_scrolling_it_sideways(tmp_path):
     """Wide tables, rows of panels and the configuration scroll in themselves."""
     found = results({"baseline": 19.0, "test_time_control": 20.0}, scene="a", method="m")
     found |= {"preset": "quick", "seed": 0, "resolution": [24, 18], "versions": {}}
-    found |= {"labels": {}, "left_out": None, "config": {"targets": {"name": "long " * 50}}}
+    audit = {"error": 0.01, "kept": 0.5, "leaked": 0.1, "curve": None}
+    tried = {"rgb_tolerance": 0.02, "depth_tolerance": 0.005, "coverage": 0.1}
+    tried |= {"label_psnr": 30.0, "model_psnr": 31.0}
+    found["gate"] = {"weight": 0.0, "agreement": 0.08, "left_out": [tried]}
+    found |= {"labels": {"exact depth": audit}, "left_out": None}
+    found |= {"config": {"targets": None, "name": "long " * 50}}
     for split in found["stages"]["baseline"].values():
         split |= {"seen_psnr": 1.0, "seen_share": 0.5, "lpips_vgg": 0.3}
     noise = np.random.default_rng(0).integers(0, 255, (18, 24, 3), np.uint8)
