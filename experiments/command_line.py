@@ -46,8 +46,9 @@ flags.DEFINE_string(
 flags.DEFINE_string(
     "output_dir",
     None,
-    "folder for results; default: outputs/<scene>/<method>/<date_time>, and for "
-    "experiments.render <run>/videos/<date_time>",
+    "folder for results, new or empty; default: outputs/<scene>/<method>/<date_time> of a run, "
+    "<run>/videos/<date_time> of render, <run>/meshes/<date_time> of mesh, and "
+    "outputs/compare/<date_time> of compare; process needs one",
 )
 
 _TOPICS = {

@@ -1,4 +1,5 @@
 import json
+import re
 import shutil
 import sys
 
@@ -241,7 +242,7 @@ def test_wrong_binary_models(tmp_path):
 
 def test_plush_loads_three_ways(shared, monkeypatch):
     none = np.zeros((0, 3), np.float32)
-    monkeypatch.setattr(loading, "triangulate", lambda *_: (none, none))  # would take seconds
+    monkeypatch.setattr(loading, "triangulate", lambda *_: (none, none, none))  # would take seconds
     folder = shared / "data" / "plush_raw"
     binary = load_scene(folder, format="colmap")
     text = load_scene(folder / "sparse_text")
@@ -287,15 +288,22 @@ def test_points_of_plush_project_to_where_they_were_measured(shared):
     assert medians[0] < 0.8 * min(medians[1:]), medians
 
 
-def test_closest_of_plush_are_nearer(shared, tmp_path):
+def test_closest_of_plush_are_nearer(shared, tmp_path, monkeypatch):
     folder = shared / "data" / "plush_raw"
     scene = load_scene(folder, format="colmap", split="closest")
     assert (len(scene.train), len(scene.test), len(scene.test_far)) == (76, 10, 11)
     ratios = scene.metadata["times_nearer"]
     assert len(ratios) == 10 and min(ratios) > 1.5
     assert "test is the 10 nearest of 97 photographs, 1.9" in scene.metadata["notes"][1]
-    with pytest.raises(SceneError, match=r"closest needs points.*COLMAP model \(--format=colmap\)"):
-        load_scene(folder, split="closest")
+    # transforms.json lists no points, but the photographs' features give some.
+    monkeypatch.setattr(loading, "_MEASURED_SIDE", 320)
+    with pytest.warns(UserWarning, match="from the points"):
+        by_features = load_scene(folder, split="closest", downscale=4)
+    assert re.search(r"97 photographs by \d+ points triangulated", by_features.metadata["notes"][1])
+    assert len(set(by_features.names["test"]) & set(scene.names["test"])) >= 8
+    np.testing.assert_allclose(
+        np.median(by_features.metadata["times_nearer"]), np.median(ratios), rtol=0.1
+    )
     # A truncated file of the real model.
     shutil.copytree(folder / "sparse", tmp_path / "sparse", copy_function=shutil.copyfile)
     data = (folder / "sparse/0/images.bin").read_bytes()

@@ -10,6 +10,8 @@ import time
 
 import pytest
 
+from experiments.__main__ import PROGRAMS
+
 
 ROOT = pathlib.Path(__file__).parents[1]
 SECONDS = 10  # much less than a compilation or a chunk of steps, on a busy computer
@@ -58,9 +60,6 @@ def wait_for(lines, ending):
             return
         assert len(seen) < 10_000, seen[-10:]
     raise AssertionError("".join(seen))
-
-
-PROGRAMS = ("run", "sweep", "render", "view", "evaluate", "process", "bench")
 
 
 @pytest.mark.parametrize(

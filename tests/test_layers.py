@@ -65,7 +65,7 @@ ROOMS = {
     "reporting": {"methods", "evaluation", "training"},
     "viewing": {"methods", "evaluation", "progress", "training"},
     "benchmarks": {"methods", "evaluation", "training", "reporting", "viewing"},
-    "processing": set(),
+    "processing": {"progress"},
     "jobs": {
         *("methods", "evaluation", "progress", "training", "reporting", "viewing", "processing"),
         "command_line",

@@ -8,6 +8,7 @@ import time
 import pytest
 
 from experiments import progress
+from experiments.processing.progress import progress as stage_progress
 from experiments.progress import display, threads
 from experiments.progress.estimate import Estimate
 from experiments.training import plan
@@ -120,6 +121,21 @@ def test_silence_is_broken(monkeypatch, capsys):
             counted = progress.count("c", 0, 20)
             assert re.fullmatch(r"\[3/4\] c  0/20  \d+:\d\d left", counted)
     assert progress.count("c", 5, 10) == "c  5/10"
+
+
+def test_a_stage_that_counts_breaks_the_silence_too(monkeypatch, capsys):
+    monkeypatch.setattr(display, "QUIET", 0.3)
+    with progress.showing(), stage_progress("matching", "pairs") as report:
+        assert capsys.readouterr().out == "matching\n"
+        report(10, 1000)
+        time.sleep(0.5)
+        report(30, 1000)
+        time.sleep(0.7)
+    first, *_, shown, last = capsys.readouterr().out.splitlines()
+    assert first.startswith("matching: 10 of 1000, 0.0 pairs/s")
+    # 20 pairs, because 10 were there before.
+    assert re.fullmatch(r"matching: 30 of 1000, [234]\d\.\d pairs/s, 0:[234]\d left(, 1 s)?", shown)
+    assert re.fullmatch(r"matching: 30 of 1000, [234]\d\.\d pairs/s", last)
 
 
 def test_a_terminal_shows_one_line_below_what_is_printed(monkeypatch):

@@ -6,12 +6,15 @@ import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from browser import open_browser
 
 from experiments.evaluation.scores import Target
-from experiments.reporting.pictures import comparisons
-from experiments.reporting.report import print_results
-from experiments.reporting.showcase import best_middle_worst, cut_out, find_place
+from experiments.reporting.page import Picture
+from experiments.reporting.pictures import comparisons, enlarge
+from experiments.reporting.report import print_results, write_report
+from experiments.reporting.showcase import Exhibit, best_middle_worst, cut_out, find_place
 from experiments.reporting.summary import conclusion, tables
+from jaxcloseup.artifacts.images import side_by_side
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.pyramids import Pyramid
 
@@ -107,6 +110,40 @@ def test_stages_are_never_cut_in_a_narrow_terminal(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "50")
     print_results(results({"test_time_control": 20.0}))
     assert "test_time_control" in capsys.readouterr().out
+
+
+def test_a_phone_shows_a_page_without_scrolling_it_sideways(tmp_path):
+    """Wide tables, rows of panels and the configuration scroll in themselves."""
+    found = results({"baseline": 19.0, "test_time_control": 20.0}, scene="a", method="m")
+    found |= {"preset": "quick", "seed": 0, "resolution": [24, 18], "versions": {}}
+    audit = {"error": 0.01, "kept": 0.5, "leaked": 0.1, "curve": None}
+    tried = {"rgb_tolerance": 0.02, "depth_tolerance": 0.005, "coverage": 0.1}
+    tried |= {"label_psnr": 30.0, "model_psnr": 31.0}
+    found["gate"] = {"weight": 0.0, "agreement": 0.08, "left_out": [tried]}
+    found |= {"labels": {"exact depth": audit}, "left_out": None}
+    found |= {"config": {"targets": None, "name": "long " * 50}}
+    for split in found["stages"]["baseline"].values():
+        split |= {"seen_psnr": 1.0, "seen_share": 0.5, "lpips_vgg": 0.3}
+    noise = np.random.default_rng(0).integers(0, 255, (18, 24, 3), np.uint8)
+    shown = [Exhibit("a" * 40, 20.0, noise, noise, "b" * 40, noise, pixel) for pixel in (0.2, 1.3)]
+    row = side_by_side([enlarge(noise)] * 5, labels=["a title"] * 5)
+    pictures = [Picture(section, "a", row) for section in ("Close-ups", "Pseudo-labels")]
+    write_report(tmp_path / "report.html", found, shown, pictures)
+    page = (tmp_path / "report.html").read_text()
+    assert "whose pixels are 5.0 times finer" in page and "are 1.3 times as large" in page
+    assert page.index("<h2>Close-ups") < page.index("times finer") < page.index("<h2>Scores")
+    assert page.rindex("<h2>Close-ups") < page.index("<h2>Scores") < page.index("<h2>Pseudo-labels")
+    with open_browser() as browser:
+        size = {"width": 390, "height": 800, "deviceScaleFactor": 1, "mobile": True}
+        given = {"cmd": "Emulation.setDeviceMetricsOverride", "params": size}
+        browser.call("POST", "/goog/cdp/execute", given)
+        browser.open(f"file://{tmp_path}/report.html")
+        widths = browser.run(
+            "for (const one of document.querySelectorAll('details')) one.open = true;"
+            "const width = one => document.querySelector(one).getBoundingClientRect().width;"
+            "return [document.documentElement.scrollWidth, width('.wide img'), width('.pair')]"
+        )
+    assert widths[0] == 390 and widths[1] > 800 and widths[2] < 390
 
 
 def test_the_best_the_middle_and_the_worst_view_are_shown():

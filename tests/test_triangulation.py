@@ -38,11 +38,16 @@ def views():
 def test_points_lie_on_a_plane(views):
     images, poses = views
     masks = [np.full((HEIGHT, WIDTH), 255, np.uint8)] * 4
-    points, rgb = triangulate(images, masks, poses, np.array([LENS] * 4))
+    points, rgb, seen_by = triangulate(images, masks, poses, np.array([LENS] * 4))
     assert len(points) > 300 and points.dtype == rgb.dtype == np.float32
     error = np.abs(points[:, 2] / DEPTH - 1)
     assert np.mean(error < 0.01) > 0.98 and np.median(error) < 0.002
     assert rgb.min() >= 0 and rgb.max() <= 1
+    assert seen_by.shape == (len(points), 2) and set(np.unique(seen_by)) == {0, 1, 2, 3}
+    for i, pose in enumerate(poses):
+        seen = (points[(seen_by == i).any(axis=1)] - pose[:, 3]) @ pose[:, :3]
+        pixels = FOCAL * seen[:, :2] / seen[:, 2:] + LENS[2:]
+        assert ((pixels > 0) & (pixels < [WIDTH, HEIGHT])).all()
 
 
 def test_masked_features_are_ignored(views):
@@ -51,7 +56,7 @@ def test_masked_features_are_ignored(views):
     lenses = np.array([LENS] * 4)
     assert triangulate(images, masks, poses, lenses)[0].shape == (0, 3)
     masks[0][:, :120] = masks[1][:, :120] = 255
-    points, _ = triangulate(images, masks, poses, lenses)
+    points = triangulate(images, masks, poses, lenses).points
     column = ((points - poses[0, :, 3]) @ poses[0, :, :3])[:, :2].T[0]
     assert len(points) and (column < 0.1).all()
 
@@ -59,7 +64,7 @@ def test_masked_features_are_ignored(views):
 def test_one_position_gives_no_points(views):
     images, poses = views
     masks = [np.full((HEIGHT, WIDTH), 255, np.uint8)] * 2
-    points, _ = triangulate(images[:2], masks, poses[[0, 0]], np.array([LENS] * 2))
+    points, *_ = triangulate(images[:2], masks, poses[[0, 0]], np.array([LENS] * 2))
     assert points.shape == (0, 3)
 
 
@@ -79,13 +84,16 @@ def test_a_capture_without_points_gets_triangulated_ones(tmp_path, views):
     assert 2 < scene.near < 4.5 and 5 < scene.far < 10
     assert "were triangulated from features of its 3 training" in scene.metadata["notes"][-1]
     write_json(tmp_path / "transforms.json", frames, **lens)
+    closest = load_scene(tmp_path, split="closest")
+    assert closest.names == {"train": ["1", "2"], "test": ["3"], "test_far": ["0"]}
+    assert closest.metadata["times_nearer"] == pytest.approx([4.7 / 4.4], rel=0.03)
     again = load_scene(tmp_path, downscale=2)
     assert np.median(np.abs(again.points[:, 2] - DEPTH)) < 0.05
 
 
 def test_too_few_points_are_dropped(tmp_path, views, monkeypatch):
     few = np.ones((99, 3), np.float32)
-    monkeypatch.setattr(loading, "triangulate", lambda *_: (few, few))
+    monkeypatch.setattr(loading, "triangulate", lambda *_: (few, few, few))
     write_image(tmp_path / "a.png", views[0][0])
     pose = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist(), "fl_x": FOCAL}
     with pytest.warns(DuplicateFileWarning):

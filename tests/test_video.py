@@ -42,9 +42,11 @@ def check(path, ending, images):
 
 
 @pytest.mark.parametrize("size", [(64, 96), (63, 97)])
-def test_webm_by_opencv_keeps_every_frame(tmp_path, opencv_only, size):
+def test_webm_by_opencv_keeps_every_frame(tmp_path, opencv_only, size, capfd):
     images = frames(*size)
-    check(write_video(tmp_path / "new" / "a", images, fps=12), ".webm", images)
+    path = write_video(tmp_path / "new" / "a", images, fps=12)
+    assert capfd.readouterr() == ("", "")
+    check(path, ".webm", images)
 
 
 def test_avi_without_webm(tmp_path, opencv_only, monkeypatch):

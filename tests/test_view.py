@@ -123,7 +123,7 @@ def visit(page):
     return Visitor(page, client), client
 
 
-def test_each_visitor_has_a_camera_a_picture_and_colors_of_their_own(serve, kept):
+def test_each_visitor_has_a_camera_a_picture_and_colors_of_their_own(serve, kept, monkeypatch):
     record = read_run(kept)
     programs, state = restore(record, load_run_scene(record), "closeup")
     sh = state.params.sh.at[:, 1:].set(jax.random.normal(jax.random.key(0), (3,)))
@@ -173,6 +173,21 @@ def test_each_visitor_has_a_camera_a_picture_and_colors_of_their_own(serve, kept
     one._supported.value = False
     one._on_support()
     np.testing.assert_array_equal(one._drawn.rgbs, drawn[0])
+    # A render that is asked for while a click's camera is sought shows that camera.
+    find, ray = page.find_surface, programs.scene.camera("train", 0)
+
+    def press_meanwhile(*at):
+        one._on_render(None, tuned=False)
+        return find(*at)
+
+    monkeypatch.setattr(page, "find_surface", press_meanwhile)
+    one._nearer.value, one._visited = 2.0, -np.inf
+    at = {"ray_origin": ray.position, "ray_direction": ray.rotation[:, 2]}
+    one._on_click(types.SimpleNamespace(**at))
+    for _ in range(2):
+        page.work(timeout=1)
+    expected = programs.render(state, one._camera).rgb
+    np.testing.assert_array_equal(one._picture, to_uint8(expected))
     one.leave()
     one._drawn.rgbs = None
     one._draw()

@@ -9,6 +9,7 @@ from absl import flags
 from rich.console import Console
 from rich.table import Table
 
+from experiments import progress
 from experiments.command_line import set_up
 from experiments.evaluation.metrics_text import COLUMNS, format_metric
 from experiments.evaluation.scores import Perceptual, find_perceptual, score_image, summarize
@@ -74,7 +75,7 @@ def evaluate_folders(
     if masks is not None:
         _check_names(f"--masks={masks}", weights, f"--renders={renders}", pairs)
     views = {}
-    for name, path in pairs.items():
+    for name, path in progress.track(list(pairs.items()), "scoring images"):
         image, target = read_image(path), read_image(true[name])
         weight = np.ones(image.shape[:2], np.uint8) * 255
         if masks is not None:
@@ -113,7 +114,8 @@ def main() -> None:
         if output.exists():
             raise ValueError(f"--output={output} already exists: name a new file, or remove it")
         perceptual = find_perceptual(FLAGS.lpips_weights)
-        results = evaluate_folders(FLAGS.renders, FLAGS.truth, FLAGS.masks, perceptual)
+        with progress.showing():
+            results = evaluate_folders(FLAGS.renders, FLAGS.truth, FLAGS.masks, perceptual)
         write_json(output, results)
     except (SceneError, OSError, ValueError) as error:
         sys.exit(f"experiments.evaluate: {error}")

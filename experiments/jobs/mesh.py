@@ -9,6 +9,7 @@ import time
 import numpy as np
 from absl import flags
 
+from experiments import progress
 from experiments.command_line import check_unused, prepare_to_stop, set_up
 from experiments.evaluation.mesh_error import CLOSE, mesh_error
 from experiments.training.loop import TrainingError
@@ -37,7 +38,8 @@ def main() -> None:
             'experiments.mesh: scikit-image is missing: install jaxcloseup with the extra "mesh"'
         )
     try:
-        _mesh()
+        with progress.showing():
+            _mesh()
     except (
         *(MeshError, RunError, SceneError),
         *(CheckpointError, TrainingError, OSError),
@@ -76,12 +78,11 @@ def _mesh() -> None:
     grid = surface.make_grid(region, FLAGS.voxel or np.ptp(region, axis=0).max() / FLAGS.resolution)
     _check_memory(grid)
     counts = " x ".join(map(str, grid.shape))
-    print(
-        f"fusing {len(maps.depths)} depth maps into {counts} voxels of {grid.voxel:.3g}", flush=True
-    )
+    what = f"{len(maps.depths)} depth maps into {counts} voxels of {grid.voxel:.3g}"
     began = time.perf_counter()
-    mesh = surface.fuse_mesh(maps, grid)
-    print(f"fused in {time.perf_counter() - began:.0f} s")
+    with progress.saying(f"fusing {what}"):
+        mesh = surface.fuse_mesh(maps, grid)
+    print(f"fused {what} in {time.perf_counter() - began:.0f} s")
     if not len(mesh.faces):
         raise MeshError(
             "no surface lies in the region: choose another --region, smaller voxels or a smaller "
@@ -105,8 +106,8 @@ def _measure(scene: Scene, mesh: surface.Mesh, finer: int) -> dict[str, float] |
     """How far the mesh is from the exact surface, where that is known; printed too."""
     if scene.surface is None:
         return None
-    print("comparing with the exact surface that the training views see", flush=True)
-    error = mesh_error(mesh, surface.exact_points(scene, finer))
+    with progress.saying("comparing with the exact surface that the training views see"):
+        error = mesh_error(mesh, surface.exact_points(scene, finer))
     print(
         f"Chamfer distance {error['chamfer']:.4f} (mesh to surface {error['mesh_to_surface']:.4f}, "
         f"surface to mesh {error['surface_to_mesh']:.4f}) at an extent of {error['extent']:.2f}; "

@@ -15,6 +15,7 @@ from experiments.processing.names import COUNT
 from experiments.processing.pipeline import PICTURE, Request, make_capture
 from experiments.processing.stages import NAME, Stages
 from experiments.processing.summary import summary_lines
+from experiments.progress import showing
 from jaxcloseup.files import check_file
 from jaxcloseup.scene import SceneError
 
@@ -65,7 +66,7 @@ def main() -> None:
             check_unused(folder)
         stages = Stages(folder, identity)
         _prepare_to_stop(folder)
-        with lock_output_dir(folder):
+        with lock_output_dir(folder), showing():
             summary = make_capture(request, folder, stages)
     except (ProcessingError, SceneError, OSError) as error:
         sys.exit(f"experiments.process: {error}")

@@ -4,6 +4,7 @@ import sys
 
 from absl import flags
 
+from experiments import progress
 from experiments.command_line import set_up
 from experiments.training.detail import detail_path
 from experiments.training.stored_run import RunError, load_run_scene, restore
@@ -25,19 +26,20 @@ def main() -> None:
             raise
         sys.exit('experiments.view: viser is missing: install jaxcloseup with the extra "viewer"')
     try:
-        record, stage = run_from_flags()
-        server.check_address(FLAGS.host, FLAGS.port)
-        scene = load_run_scene(record, FLAGS.data)
-        programs, state = restore(record, scene, stage)
-        viser_server = server.serve(FLAGS.host, FLAGS.port)
-        viewer = page.Viewer(
-            viser_server,
-            programs,
-            state,
-            stage=stage,
-            seed=record.identity["seed"],
-            kept=detail_path(record.folder, stage),
-        )
+        with progress.showing():
+            record, stage = run_from_flags()
+            server.check_address(FLAGS.host, FLAGS.port)
+            scene = load_run_scene(record, FLAGS.data)
+            programs, state = restore(record, scene, stage)
+            viser_server = server.serve(FLAGS.host, FLAGS.port)
+            viewer = page.Viewer(
+                viser_server,
+                programs,
+                state,
+                stage=stage,
+                seed=record.identity["seed"],
+                kept=detail_path(record.folder, stage),
+            )
     except (RunError, server.ServeError, SceneError, CheckpointError, OSError) as error:
         sys.exit(f"experiments.view: {error}")
     print(f"open http://{FLAGS.host}:{FLAGS.port} in a browser; press Ctrl-C to stop", flush=True)

@@ -14,6 +14,7 @@ from experiments.processing.pairs import choose_pairing
 from experiments.processing.photographs import Copied, copy_photographs, list_files
 from experiments.processing.stages import Stages
 from experiments.processing.summary import draw_from_above, other_models, why_left_out
+from experiments.progress import saying
 from jaxcloseup.version import __version__
 
 
@@ -122,7 +123,8 @@ def make_capture(request: Request, folder: pathlib.Path, stages: Stages) -> dict
         "left_out": {source[name]: why for name, why in reasons.items()} | gathered["left_out"],
     }
     stages.keep("summary", summary)
-    draw_from_above(folder / MODEL, folder / IMAGES, folder / PICTURE)
+    with saying("drawing cameras and points from above"):
+        draw_from_above(folder / MODEL, folder / IMAGES, folder / PICTURE)
     return summary
 
 

@@ -90,7 +90,8 @@ def summary_lines(summary: Mapping[str, Any]) -> list[str]:
     for name, reason in summary["left_out"].items():
         by_reason.setdefault(reason, []).append(name)
     for reason, names in by_reason.items():
-        more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+        hidden = len(names) - _SHOWN
+        more = f" and {hidden} more (process.json names all)" if hidden > 0 else ""
         lines.append(f"left out: {', '.join(names[:_SHOWN])}{more}: {reason}")
     if registered < total / 2:
         lines.append("less than half have a pose: add photographs that overlap more")

@@ -137,10 +137,10 @@ def part(name: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def saying(what: str) -> Iterator[None]:
-    """Say at once what the body does."""
-    with _doing(what, aloud=True):
-        yield
+def saying(what: str) -> Iterator[list[str]]:
+    """Say at once what the body does; yields a list of the text, which the body may replace."""
+    with _doing(what, aloud=True) as text:
+        yield text
 
 
 @contextlib.contextmanager

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from experiments.evaluation.metrics_text import format_metric
+from experiments.reporting.page import table
 from experiments.reporting.plots import Curve, gains_over, line_plot, zoom_curves
 from experiments.training.gate import verdict
 
@@ -63,48 +64,53 @@ def label_plots(labels: Mapping[str, Any], left_out: Mapping[str, Any] | None) -
 
 def labels_table(labels: Mapping[str, Any]) -> str:
     """Return the table of labels against the exact scene."""
-    lines = "".join(
-        f"<tr><td>{depth.replace('_', ' ')}"
-        + "".join(f"<td>{format_metric(key, values[key])}" for key in ("error", "kept", "leaked"))
+    header = [
+        *("depth", "mean absolute error of kept labels"),
+        *("share of seen pixels that keep a label", "share of kept labels that leaked"),
+    ]
+    body = [
+        [depth.replace("_", " ")]
+        + [format_metric(key, values[key]) for key in ("error", "kept", "leaked")]
         for depth, values in labels.items()
-    )
+    ]
     return (
         "<h2>Labels against the exact scene</h2><p>The table compares labels of random virtual "
         "close-ups with the true image, blurred to the resolution of the source photograph. The "
         "labels are made from the exact depth and from the trained depth. Good labels have a small "
         "error, cover much of what the source photograph sees, and leak little: a leaked label "
-        "colors a surface that the source does not see.</p><table><tr><th>depth"
-        "<th>mean absolute error of kept labels<th>share of seen pixels that keep a label"
-        f"<th>share of kept labels that leaked{lines}</table>"
+        f"colors a surface that the source does not see.</p>{table(header, body)}"
     )
 
 
 def gate_table(gate: Mapping[str, Any]) -> str:
     """Return the table of labels against left-out photographs."""
-    lines = "".join(
-        f"<tr><td>{row['rgb_tolerance']}<td>{row['depth_tolerance']}<td>{row['coverage']:.0%}"
-        f"<td>{format_metric('psnr', row['label_psnr'])}"
-        f"<td>{format_metric('psnr', row['model_psnr'])}"
+    header = [
+        *("color tolerance", "depth tolerance", "share with a label"),
+        *("PSNR of labels (dB)", "PSNR of the model (dB)"),
+    ]
+    body = [
+        [f"{row['rgb_tolerance']}", f"{row['depth_tolerance']}", f"{row['coverage']:.0%}"]
+        + [format_metric("psnr", row[key]) for key in ("label_psnr", "model_psnr")]
         for row in gate["left_out"]
-    )
+    ]
     return (
         "<h2>Labels against left-out photographs (the gate)</h2><p>The gate leaves out training "
         "photographs one by one and labels them from the others. Each row shows, for one pair of "
         "tolerances, the share of pixels with a label, and the PSNR of the labels and of the model "
         "on these pixels. The model was trained on these photographs, so labels may score below "
         "it and still help elsewhere. The first row decides, because labels do harm on scenes "
-        f"where few of them agree so closely. Here {html.escape(verdict(gate))}.</p><table><tr>"
-        "<th>color tolerance<th>depth tolerance<th>share with a label<th>PSNR of labels (dB)"
-        f"<th>PSNR of the model (dB){lines}</table>"
+        f"where few of them agree so closely. Here {html.escape(verdict(gate))}.</p>"
+        f"{table(header, body)}"
     )
 
 
 def detail_table(detail: Mapping[str, Any]) -> str:
     """Return the table of predicted against actual shares of detail."""
-    lines = "".join(
-        f"<tr><td>{row['predicted']:.2f}<td>{row['actual']:.2f}<td>{row['pixels']:.1%}"
+    header = ["predicted share", "actual share", "share of pixels"]
+    body = [
+        [f"{row['predicted']:.2f}", f"{row['actual']:.2f}", f"{row['pixels']:.1%}"]
         for row in detail["reliability"]
-    )
+    ]
     (height, width), *_ = detail["sizes"]
     return (
         "<h2>Detail of the photographs</h2><p>The stage <i>detail</i> shows the renders of "
@@ -112,6 +118,6 @@ def detail_table(detail: Mapping[str, Any]) -> str:
         "show beyond them. How much of it is added at a pixel is predicted from how well the "
         "photographs agree, how sharply and from which angles they see the surface. The table "
         "compares the prediction with left-out photographs: of the detail that the other "
-        "photographs show, the share that is predicted and that is really there.</p><table><tr>"
-        f"<th>predicted share<th>actual share<th>share of pixels{lines}</table>"
+        "photographs show, the share that is predicted and that is really there.</p>"
+        f"{table(header, body)}"
     )

@@ -24,6 +24,7 @@ class Picture(NamedTuple):
     image: np.ndarray
 
 
+_READABLE = 0.7  # of the width of a row of panels, whose titles are smaller otherwise
 _SMALL = 70  # quality of pictures that are many
 _COMPARISON_NOTE = (
     "Each picture shows the true image, renders in the order trained, and the error of the last "
@@ -47,17 +48,25 @@ def figures(pictures: Sequence[Picture]) -> list[str]:
             parts.append(f"<h2>{html.escape(section)}</h2>")
             note = _PICTURE_NOTES.get(section.split(": ")[-1])  # a sweep's begin with the scene
             parts += [f"<p>{note}</p>"] if note else []
-        parts.append(figure(picture.image, picture.caption, quality=_SMALL))
+        parts.append(figure(picture.image, picture.caption, quality=_SMALL, row=True))
     return parts
 
 
-def figure(image: np.ndarray, caption: str, *, quality: int = 90) -> str:
-    """Return an image with its caption; `quality` is that of `webp_data_uri`."""
+def figure(image: np.ndarray, caption: str, *, quality: int = 90, row: bool = False) -> str:
+    """Return an image with its caption.
+
+    Args:
+      image: uint8 `[H, W, 3]`.
+      caption: text below it.
+      quality: that of `webp_data_uri`.
+      row: whether it is a row of panels with titles: on a phone it then goes on sideways, so that
+        these can be read.
+    """
     caption = html.escape(caption)
-    return (
-        f"<figure><img alt='{caption}' src='{webp_data_uri(image, quality=quality)}'>"
-        f"<figcaption>{caption}</figcaption></figure>"
-    )
+    least = f" style='min-width: {_READABLE * image.shape[1]:.0f}px'" if row else ""
+    image = f"<img alt='{caption}' src='{webp_data_uri(image, quality=quality)}'{least}>"
+    image = f"<div class=wide>{image}</div>" if row else image
+    return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"
 
 
 def slider(
@@ -135,6 +144,7 @@ th:first-child, td:first-child, .names2 :nth-child(2) { text-align: left; white-
 .wide { overflow-x: auto }
 .verdict { font-size: 1.25em }
 .quiet, figcaption { color: #555 }
+figcaption, h1, p { overflow-wrap: anywhere }
 figure { margin: 1em 0 }
 .plots, .tables { display: flex; flex-wrap: wrap; gap: 1em 3em }
 .tables > div { min-width: 0 }

@@ -108,13 +108,11 @@ def write_report(
         f"{sizes}, on 8-bit images.</p>",
         *_exhibition(shown, best_stage(results["stages"])),
         *_moving(dolly),
-        "<h2>Scores</h2>",
-        *score_tables(tables(results)),
-        _STAGES,
     ]
     views = [picture for picture in pictures if picture.section in SPLIT_TITLES.values()]
     labels = [picture for picture in pictures if picture not in views]
     parts += figures(views)
+    parts += ["<h2>Scores</h2>", *score_tables(tables(results)), _STAGES]
     parts += folded("PSNR by magnification", zoom_plots(results["stages"]))
     header, *body = rows(results)
     parts += folded("All scores", [table(header, body, names=2)])
@@ -125,7 +123,7 @@ def write_report(
     if results["detail"]:
         parts += folded("How right is the detail?", [detail_table(results["detail"])])
     config = html.escape(json.dumps({k: results[k] for k in ("config", "versions")}, indent=1))
-    parts += [*folded("Configuration", [f"<pre>{config}</pre>"]), "</html>"]
+    parts += [*folded("Configuration", [f"<pre class=wide>{config}</pre>"]), "</html>"]
     write_file(path, "\n".join(parts).encode())
 
 
@@ -136,6 +134,13 @@ def _moving(dolly):
     source = f"data:image/webp;base64,{base64.b64encode(dolly).decode()}"
     image = f"<img alt='{text}' src='{source}'>"
     return [f"<figure class=moving>{image}<figcaption>{text}</figcaption></figure>"]
+
+
+def _say_of_pixels(size):
+    """Say how large a photograph's pixels are in a close-up."""
+    if size < 1:
+        return f"whose pixels are {1 / size:.1f} times finer"
+    return f"whose pixels are {size:.1f} times as large"
 
 
 def _exhibition(shown, stage):
@@ -153,9 +158,7 @@ def _exhibition(shown, stage):
         if one.cutout is None:
             parts += ["<div class=pair>", figure(one.render, psnr), truth, "</div>"]
             continue
-        caption = (
-            f"left: {one.photograph}, with pixels {one.pixel:.1f} times as large; right: {psnr}"
-        )
+        caption = f"left: {one.photograph}, {_say_of_pixels(one.pixel)}; right: {psnr}"
         pair = slider(one.cutout, one.render, (one.photograph, psnr), caption)
         parts.append(f"<div class=pair>{pair}{truth}</div>")
     return parts

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rich.progress import track
 
+from experiments.progress import track
 from experiments.training.programs import Programs
 from jaxcloseup.artifacts.images import to_uint8
 from jaxcloseup.artifacts.mesh import Mesh, surface_mesh
@@ -94,13 +94,13 @@ def see_training_views(
     cameras, weight = larger_views(scene, finer)
     numbers = range(len(scene.train))
     rgb, depths = [], []
-    for index in track(numbers, description="   training views"):
+    for index in track(numbers, "rendering training views"):
         colors, depth = see(camera_at(cameras, index))
         rgb.append(to_uint8(colors))
         depths.append(np.asarray(depth))
     maps = Maps(Views(cameras, jnp.asarray(np.stack(rgb)), weight), jnp.asarray(np.stack(depths)))
     pixels, kept = pixel_grid(cameras.height, cameras.width), []
-    for index in track(numbers, description="   support"):
+    for index in track(numbers, "finding which views see each surface"):
         camera, depth = camera_at(cameras, index), maps.depths[index]
         count = _count_seen(camera, pixels, depth, *maps)
         kept.append(weight[index] * (count >= support))

@@ -183,9 +183,13 @@ class Visitor:
         return "Colors show how many photographs saw the surface"
 
     def _on_render(self, _, *, tuned):
-        camera = self._camera if self._camera is not None else self._own_camera()
+        here = self._own_camera()
         what = "fine-tuning for this camera" if tuned else "rendering"
-        self._viewer.later(what, lambda: self._render(camera, tuned), self._say)
+
+        def render():  # a click before it may have moved the close-up camera by then
+            return self._render(here if self._camera is None else self._camera, tuned)
+
+        self._viewer.later(what, render, self._say)
 
     def _on_download(self, _):
         if self._picture is None:

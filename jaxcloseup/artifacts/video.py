@@ -84,12 +84,26 @@ def _formats() -> Iterator[tuple[str, Callable]]:
 
         def open_opencv(path, size, fps, codec=codec):
             fourcc = cv2.VideoWriter_fourcc(*codec)
-            writer = cv2.VideoWriter(str(path), fourcc, fps, size)
+            with _silent():
+                writer = cv2.VideoWriter(str(path), fourcc, fps, size)
             if not writer.isOpened():
                 return None
             return (lambda frame: writer.write(frame[..., ::-1])), writer.release
 
         yield ending, open_opencv
+
+
+@contextlib.contextmanager
+def _silent() -> Iterator[None]:
+    """Keep what C++ prints from the terminal: OpenCV warns of VP8 in WebM, which is right."""
+    held, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nothing, 2)
+    try:
+        yield
+    finally:
+        os.dup2(held, 2)
+        os.close(held)
+        os.close(nothing)
 
 
 def _open_ffmpeg(program, path, size, fps):

@@ -16,6 +16,7 @@ from jaxcloseup.captures.points import read_ply_points
 from jaxcloseup.captures.reduced_photos import attach_reduced
 from jaxcloseup.captures.scale import check_positions, plausible
 from jaxcloseup.captures.splits import (
+    FindPoints,
     divide,
     splits_from_fields,
     splits_from_file,
@@ -84,8 +85,9 @@ def read_listing(
     zoom: int = 1,
     downscale: int = 1,
     photographs: int | None = None,
+    find_points: FindPoints | None = None,
 ) -> Listing:
-    """List a folder's photographs by split; `load_scene` documents the arguments.
+    """List a folder's photographs by split; `load_scene` and `divide` document the arguments.
 
     Raises:
       SceneError: the folder holds no known format, or one of its files is wrong.
@@ -120,7 +122,7 @@ def read_listing(
     if split == "given" and not given:
         given = splits_from_file(folder, content.frames)
     points, rgb = content.points
-    division = divide(scene, content.frames, given, split, points, zoom)
+    division = divide(scene, content.frames, given, split, points, zoom, find_points=find_points)
     if split != "zoom":  # crops share files with training photographs but show finer detail
         warn_duplicates(folder, division.frames)
     train = division.frames["train"]

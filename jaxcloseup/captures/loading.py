@@ -11,13 +11,14 @@ import numpy as np
 
 from jaxcloseup.captures.depth_range import near_far_from_cameras, near_far_from_points
 from jaxcloseup.captures.formats import Listing, read_listing
-from jaxcloseup.captures.images import pad_images
+from jaxcloseup.captures.frames import Frame
+from jaxcloseup.captures.images import pad_images, read_image
 from jaxcloseup.captures.json_fields import affine_transform, number
 from jaxcloseup.captures.photo_checks import check_sizes, check_weights
 from jaxcloseup.captures.photo_reading import Photo, Reading, read_photos
 from jaxcloseup.captures.scale import LENGTH, check_positions
 from jaxcloseup.captures.splits import unique_names
-from jaxcloseup.captures.triangulation import triangulate
+from jaxcloseup.captures.triangulation import Triangulated, triangulate
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.messages import printable
 from jaxcloseup.photographs import Views
@@ -25,6 +26,7 @@ from jaxcloseup.scene import NearFarWarning, Scene, SceneError
 
 
 _UP = (0.0, 0.0, 1.0)
+_MEASURED_SIDE = 800  # pixels of photographs whose features tell how near they are
 _MIN_POINTS = 100  # fewer triangulated points say too little about where the scene is
 
 _log = logging.getLogger(__name__)
@@ -53,6 +55,7 @@ def load_capture(
             zoom=reading.zoom,
             downscale=reading.downscale,
             photographs=photographs,
+            find_points=functools.partial(_points_of, reading),
         )
     except OSError as error:  # from listing folders; reading a file raises SceneError
         raise SceneError(
@@ -183,12 +186,7 @@ def _with_points(
     count = len(photos)  # held-out photographs must not leak into training
     if count < 2:
         return listing
-    points, rgb = triangulate(
-        [photo.rgb for photo in photos],
-        [photo.mask for photo in photos],
-        camtoworld[:count],
-        intrinsics[:count],
-    )
+    points, rgb, _ = _triangulate(photos, camtoworld[:count], intrinsics[:count])
     if len(points) < _MIN_POINTS:
         return listing
     note = printable(
@@ -197,6 +195,25 @@ def _with_points(
     )
     _log.info(note)
     return listing._replace(points=points, rgb=rgb, notes=(*listing.notes, note))
+
+
+def _triangulate(
+    photos: Sequence[Photo], camtoworld: np.ndarray, intrinsics: np.ndarray
+) -> Triangulated:
+    images, masks = [photo.rgb for photo in photos], [photo.mask for photo in photos]
+    return triangulate(images, masks, camtoworld, intrinsics)
+
+
+def _points_of(reading: Reading, frames: Sequence[Frame]) -> tuple[list[Frame], np.ndarray]:
+    """Triangulate points of all photographs, to measure how near each is; see `FindPoints`."""
+    size = frames[0].size or read_image(frames[0].file).shape[1::-1]
+    downscale = max(1, round(max(size) / _MEASURED_SIDE))
+    photos = read_photos({"train": frames}, reading._replace(downscale=downscale, zoom=1))["train"]
+    poses = np.stack([frame.camtoworld for frame in frames])
+    intrinsics = np.stack([photo.intrinsics(reading.half_pixel) for photo in photos])
+    points, _, views = _triangulate(photos, poses, intrinsics)
+    seen = [np.flatnonzero((views == i).any(axis=1)) for i in range(len(frames))]
+    return [frame._replace(seen=s) for frame, s in zip(frames, seen, strict=True)], points
 
 
 def _near_far(

@@ -24,6 +24,10 @@ _LISTS = {"train": "train_filenames", "test": "test_filenames", "test_far": "val
 _SPLIT_FILE_KEYS = {"train", "test", "test_far", "unused"}
 
 
+# Returns frames that tell which points they show, and these points `[P, 3]`.
+FindPoints = Callable[[Sequence[Frame]], tuple[list[Frame], np.ndarray]]
+
+
 class Division(NamedTuple):
     """The photographs of a capture by split.
 
@@ -96,6 +100,8 @@ def divide(
     split: str,
     points: np.ndarray,
     zoom: int = 1,
+    *,
+    find_points: FindPoints | None = None,
 ) -> Division:
     """Split the photographs of a capture.
 
@@ -106,6 +112,7 @@ def divide(
       split: one of `SPLITS`, see `load_scene`; `given` without lists holds out every 8th.
       points: `[P, 3]` world points, which `closest` needs.
       zoom: how many times finer the close-ups of `zoom` are.
+      find_points: finds them for `closest` where there are none.
 
     Raises:
       SceneError: `closest` has too few photographs, or no points that they see.
@@ -114,7 +121,7 @@ def divide(
         return Division(given)
     frames = sorted({frame.file: frame for frame in frames}.values(), key=lambda f: f.listed)
     if split == "closest":
-        return _closest(name, frames, points)
+        return _closest(name, frames, points, find_points)
     if split == "zoom":
         return _zoom(name, frames, zoom)
     parts = _every_eighth(frames)
@@ -202,15 +209,21 @@ def _every_eighth(frames: Sequence[Frame]) -> dict[str, list[Frame]]:
     }
 
 
-def _closest(name: str, frames: Sequence[Frame], points: np.ndarray) -> Division:
+def _closest(
+    name: str, frames: Sequence[Frame], points: np.ndarray, find_points: FindPoints | None
+) -> Division:
     if len(frames) < 2:
         raise SceneError(f"{name}: split closest needs at least 2 photographs, got 1: add some.")
-    sizes = [_size_of_pixel(frame, points) for frame in frames]
+    showing, by = frames, ""
+    if not len(points) and find_points:
+        showing, points = find_points(frames)
+        by = f" by {len(points)} points triangulated from their features"
+    sizes = [_size_of_pixel(frame, points) for frame in showing]
     if not np.isfinite(sizes).any():
         raise SceneError(
-            f"{name}: split closest needs points that the photographs see, and the capture lists "
-            "none: read its COLMAP model (--format=colmap), give ply_file_path, or choose "
-            "--split=zoom, which needs no points."
+            f"{name}: split closest needs points that the photographs see, but the capture lists "
+            "none and the photographs' features give none: read its COLMAP model "
+            "(--format=colmap), give ply_file_path, or choose --split=zoom, which needs no points."
         )
     nearest = np.argsort(sizes, kind="stable")[: max(1, round(CLOSEST_SHARE * len(frames)))]
     held_out = sorted(nearest.tolist())
@@ -221,7 +234,7 @@ def _closest(name: str, frames: Sequence[Frame], points: np.ndarray) -> Division
     median = np.median([size_by_file[frame.file] for frame in parts["train"]])
     ratios = tuple(float(median / sizes[i]) for i in held_out)
     note = (
-        f"{name}: test is the {len(held_out)} nearest of {len(frames)} photographs, "
+        f"{name}: test is the {len(held_out)} nearest of {len(frames)} photographs{by}, "
         f"{min(ratios):.2f} to {max(ratios):.2f} times nearer (median {np.median(ratios):.2f}) "
         f"than the median of {len(parts['train'])} training photographs; test_far is "
         f"{len(parts.get('test_far', ()))} others"

@@ -21,6 +21,20 @@ _MAX_ERROR = 2.0  # in pixels
 _MIN_ANGLE = np.radians(1.5)  # between rays; below it, depth is unreliable
 
 
+class Triangulated(NamedTuple):
+    """Points that two photographs both show; P may be 0.
+
+    Attributes:
+      points: `[P, 3]` float32 world points.
+      rgb: `[P, 3]` float32 colors in [0, 1].
+      views: `[P, 2]` indices of the photographs.
+    """
+
+    points: np.ndarray
+    rgb: np.ndarray
+    views: np.ndarray
+
+
 class _Features(NamedTuple):
     """Features of one photograph: pixels `[F, 2]`, descriptors `[F, 128]` and colors `[F, 3]`.
 
@@ -37,7 +51,7 @@ def triangulate(
     masks: Sequence[np.ndarray],
     camtoworld: np.ndarray,
     intrinsics: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> Triangulated:
     """Triangulate points that two neighboring photographs both show.
 
     A surface point may appear once per pair of photographs.
@@ -47,21 +61,20 @@ def triangulate(
       masks: uint8 masks `[H, W]`; features are used where the mask is at least 128.
       camtoworld: `[V, 3, 4]` OpenCV poses.
       intrinsics: `[V, 4]` fx, fy, cx, cy in pixels.
-
-    Returns:
-      World points `[P, 3]` and colors `[P, 3]` in [0, 1], float32; P may be 0.
     """
     found = [_find_features(image, mask) for image, mask in zip(images, masks, strict=True)]
-    points, colors = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    points, colors, views = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros((0, 2), int)]
     for i, j in _neighbors(camtoworld):
         first, second = _match(found[i].descriptors, found[j].descriptors)
         pixels = found[i].pixels[first], found[j].pixels[second]
         world, good = _intersect(pixels, camtoworld[[i, j]], intrinsics[[i, j]])
         points.append(world[good])
         colors.append(found[i].rgb[first][good])
-    return (
+        views.append(np.tile([i, j], (good.sum(), 1)))
+    return Triangulated(
         np.concatenate(points).astype(np.float32),
         np.concatenate(colors).astype(np.float32) / 255,
+        np.concatenate(views),
     )
 
 
