@@ -66,14 +66,15 @@ def for_image(config: RasterizeConfig, *, height: int, width: int) -> RasterizeC
     """The settings with the sizes that are fastest for an image, where they leave them open.
 
     Small tiles evaluate fewer splats in vain, but more pairs have to be sorted; docs/results.md
-    has the times on a CPU. Small tiles that are chosen here get twice the `capacity`, since splats
-    touch about twice as many. A GPU evaluates thousands of tiles at once: its sizes are a guess.
+    has the times on a CPU. Small tiles that are chosen here get three times the `capacity`, since
+    splats touch two to three times as many. A GPU evaluates thousands of tiles at once: its sizes
+    are a guess.
     """
     on_cpu = jax.default_backend() == "cpu"
     tile, capacity = config.tile, config.capacity
     if tile is None:
         small = on_cpu and height * width <= _SMALL
-        tile, capacity = (4, 2 * capacity) if small else (8, capacity)
+        tile, capacity = (4, 3 * capacity) if small else (8, capacity)
     return dataclasses.replace(
         config,
         capacity=capacity,
