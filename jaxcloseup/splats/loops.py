@@ -20,6 +20,7 @@ from jaxcloseup.splats.kernel import (
     Trace,
     Walk,
     channels,
+    pass_splat,
     pull_back,
     row_bar,
     shade,
@@ -134,16 +135,12 @@ def _running_products(before, alpha):
 def _pass_chunk(walk, seen, before, afters, place):
     """Weights `[B, P]` of each of a chunk's splats, and the walk behind them."""
     weights = []
-    remaining, stop, reference, median = walk
     for k, after in enumerate(afters):
-        open_, drawn = after >= TRANSMITTANCE_MIN, seen.alpha[k] > 0
-        weights.append(jnp.where(open_, seen.alpha[k] * before, 0))
-        remaining = jnp.where(open_, after, remaining)
-        stop = jnp.where(open_, place[k] + 1, stop)
-        reference = reference + jnp.where(drawn & (before == 1), seen.inverse_depth[k], 0)
-        median = jnp.where(drawn & (before > 0.5), seen.z[k], median)
+        splat = seen.alpha[k], seen.inverse_depth[k], seen.z[k]
+        weight, walk = pass_splat(walk, *splat, before, after, place[k])
+        weights.append(weight)
         before = after
-    return weights, Walk(remaining, stop, reference, median)
+    return weights, walk
 
 
 def _with_none(lists: TileLists):
