@@ -21,6 +21,7 @@ from absl import app, flags
 import experiments
 from experiments import progress
 from jaxcloseup.files import cache_folder
+from jaxcloseup.memory import reuse_freed_memory
 
 
 try:
@@ -51,6 +52,11 @@ flags.DEFINE_string(
     "outputs/compare/<date_time> of compare; process needs one",
 )
 
+# Of XLA on a CPU: the widest vectors that there are, and no unrolling of loops, which are short.
+_COMPILED_FOR_SPEED = (
+    "--xla_cpu_prefer_vector_width=512 "
+    "--xla_backend_extra_options=xla_cpu_disable_loop_unrolling"
+)
 _TOPICS = {
     "What is trained": "scene scenes method methods preset set stages arms seed seeds downscale "
     "windows",
@@ -75,6 +81,8 @@ def start(main: Callable[[list[str]], None]) -> None:
         with contextlib.suppress(BrokenPipeError):  # `--help | head`
             print(_describe_program(), flush=True)
         os._exit(0)
+    reuse_freed_memory()
+    os.environ["XLA_FLAGS"] = " ".join([_COMPILED_FOR_SPEED, os.environ.get("XLA_FLAGS", "")])
     app.run(main, flags_parser=_parse)
 
 

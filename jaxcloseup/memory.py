@@ -1,6 +1,7 @@
-"""How much memory there is, so that what cannot fit is refused before it is begun."""
+"""How much memory there is, and what becomes of memory that is freed."""
 
 import contextlib
+import ctypes
 import os
 import pathlib
 
@@ -11,3 +12,31 @@ def installed_memory() -> int:
     with contextlib.suppress(OSError, ValueError):  # the file says "max" without a limit
         held = min(held, int(pathlib.Path("/sys/fs/cgroup/memory.max").read_text()))
     return held
+
+
+# Parameters of glibc's mallopt.
+_TRIM_THRESHOLD, _MMAP_MAX, _ARENA_MAX = -1, -4, -8
+
+
+def reuse_freed_memory() -> None:
+    """Keep what is freed for the next buffers, until `give_back_memory`; call it before JAX starts.
+
+    XLA's buffers are large and live for a part of a step. By default glibc gives them back to the
+    system, which must find and zero their pages again in the next step.
+    """
+    with _glibc() as library:
+        library.mallopt(_ARENA_MAX, 1)  # threads free what others allocated
+        library.mallopt(_MMAP_MAX, 0)
+        library.mallopt(_TRIM_THRESHOLD, 2**31 - 1)
+
+
+def give_back_memory() -> None:
+    """Return freed memory to the system, such as hundreds of MiB that a compilation took."""
+    with _glibc() as library:
+        library.malloc_trim(0)
+
+
+@contextlib.contextmanager
+def _glibc():
+    with contextlib.suppress(OSError, TypeError, AttributeError):  # another C library
+        yield ctypes.CDLL(None)

@@ -1,7 +1,6 @@
 """Set-up that the stages of a run and the arms of a sweep share: states, labels, checkpoints."""
 
 import contextlib
-import ctypes
 import dataclasses
 import functools
 import pathlib
@@ -26,7 +25,7 @@ from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.field import Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.label_rules import LABEL_RULES, label_depth
-from jaxcloseup.memory import installed_memory
+from jaxcloseup.memory import give_back_memory, installed_memory
 from jaxcloseup.photographs import Views, camera_at
 from jaxcloseup.pseudo import (
     LabelSources,
@@ -309,13 +308,7 @@ def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
     with progress.part(name):
         yield
     seconds[name] = time.perf_counter() - start
-    _give_back_memory()
-
-
-def _give_back_memory():
-    """Return freed memory to the system: XLA's compiler frees hundreds of MiB that glibc keeps."""
-    with contextlib.suppress(OSError, TypeError, AttributeError):  # another C library
-        ctypes.CDLL(None).malloc_trim(0)
+    give_back_memory()
 
 
 @contextlib.contextmanager
