@@ -54,8 +54,7 @@ flags.DEFINE_string(
 
 # Of XLA on a CPU: the widest vectors that there are, and no unrolling of loops, which are short.
 _COMPILED_FOR_SPEED = (
-    "--xla_cpu_prefer_vector_width=512 "
-    "--xla_backend_extra_options=xla_cpu_disable_loop_unrolling"
+    "--xla_cpu_prefer_vector_width=512 --xla_backend_extra_options=xla_cpu_disable_loop_unrolling"
 )
 _TOPICS = {
     "What is trained": "scene scenes method methods preset set stages arms seed seeds downscale "
