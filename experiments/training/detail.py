@@ -4,6 +4,7 @@ Everything is made from the state and its training photographs, so a run keeps i
 where they have changed.
 """
 
+import functools
 import hashlib
 import io
 import json
@@ -158,8 +159,10 @@ def calibrate(detail: Detail, windows: Sequence[Window]) -> tuple[Any, list[dict
       `pixels`. Each fold of the photographs is tried with weights that the others teach.
     """
     found: dict[int, list[Evidence]] = {}
-    for window in windows:
-        found.setdefault(window.view, []).append(_testify(detail, window))
+    testify = functools.partial(_testify, detail)
+    evidence_of = progress.each(testify, windows, "windows of left-out photographs")
+    for window, one in zip(windows, evidence_of, strict=True):
+        found.setdefault(window.view, []).append(one)
     photographs = list(found.values())
     sums, folds = np.zeros((TENTHS, 4)), min(FOLDS, len(photographs))
     for fold in range(folds):
