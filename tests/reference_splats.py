@@ -15,10 +15,10 @@ ALPHA_MIN, ALPHA_MAX, T_MIN, LOW_PASS = 1 / 255, 0.99, 1e-4, 2.0
 
 
 def rotation_of(wxyz):
-    """Rotation matrix `[3, 3]` of one quaternion, from rotating the basis with q v q*."""
-    w, *v = np.asarray(wxyz, np.float64) / np.linalg.norm(wxyz)
-    v = np.array(v)
-    return np.stack([e + 2 * np.cross(v, np.cross(v, e) + w * e) for e in np.eye(3)], axis=1)
+    """Rotation matrix `[3, 3]` of one quaternion: its vector, as a cross product, in q v q*."""
+    w, x, y, z = np.asarray(wxyz, np.float64) / np.linalg.norm(wxyz)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])  # np.cross takes ten times as long
+    return np.eye(3) + 2 * (w * cross + cross @ cross)
 
 
 def sh_color(sh, direction):
