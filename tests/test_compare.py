@@ -72,6 +72,15 @@ def shown(page):
     ]
 
 
+def test_runs_of_one_quality_are_as_good_as_each_other(tmp_path, compare):
+    runs = [write_run(tmp_path / name / "run", [20, 21, 22, 23], level=50) for name in "xy"]
+    about, _ = compare(*runs)
+    assert about["verdict"] == (
+        "Close-ups are best in x/run, with a PSNR of 21.5 dB: as good as y/run (better in 0 of 4 "
+        "views)."
+    )
+
+
 def test_runs_are_compared_by_their_last_fair_stage(tmp_path, compare, capsys):
     first = write_run(tmp_path / "x" / "one", [20, 21, 22, 23], level=50)
     config = {"field": {"capacity": 9}, "x": 1}

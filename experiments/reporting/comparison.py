@@ -174,8 +174,9 @@ def say_which_is_best(runs: Sequence[Finished]) -> str:
         if mean[other.name] is None or not both:
             continue
         wins = sum(ours[view] > theirs[view] for view in both)
-        change = than(mean[best.name] - mean[other.name], 2)
-        parts.append(f"{change} than {other.name} (better in {wins} of {len(both)} views)")
+        ahead = mean[best.name] - mean[other.name]
+        change = f"{than(ahead, 2)} than" if round(ahead, 2) else "as good as"
+        parts.append(f"{change} {other.name} (better in {wins} of {len(both)} views)")
     text = f"{SPLIT_TITLES[split]} are best in {best.name}, with a PSNR of {mean[best.name]:.1f} dB"
     return f"{text}: {', '.join(parts)}." if parts else f"{text}."
 
