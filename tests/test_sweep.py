@@ -138,7 +138,15 @@ def test_a_sweep_cut_off_and_resumed_ends_the_same(capture_folder, tmp_path, mon
     scene = load_scene(str(capture_folder))
     programs = Programs(TINY_STEPS, scene)  # compiled once for both
     monkeypatch.setattr(sweep_stages, "Programs", lambda preset, scene: programs)
+    render, rendered_by = programs.render, set()
+
+    def render_and_note(state, *camera):
+        rendered_by.add(len(jax.tree.leaves(state.params)[0].devices()))
+        return render(state, *camera)
+
+    monkeypatch.setattr(programs, "render", render_and_note)
     whole = sweep_tiny(scene, tmp_path / "sweep").scores
+    assert rendered_by == {1} and len(jax.devices()) == 8  # devices
     assert list(whole) == ["baseline", "control", "diverse", "test_time"]
     assert all(list(of_arm) == ["0", "1"] for of_arm in whole.values())
     psnr = {arm: whole[arm]["0"]["splits"]["test"]["psnr"] for arm in whole}

@@ -202,6 +202,9 @@ def train_together(
     steps = training.programs.preset.closeup_steps
     views = training.programs.photographs
     states = training.train(name, "arms", state, views, sources, settings, steps=steps)
+    # A slice of what lies on all devices would too: each would render it, in step with the others,
+    # while threads render several views at once.
+    states = jax.device_put(states, jax.local_devices()[0])
     for i, (arm, seed) in enumerate(group):
         alone = jax.tree.map(lambda leaf, i=i: leaf[i], states.replace(step=None))
         skipped = sum(chunk["skipped"][i] for chunk in training.history[name])
