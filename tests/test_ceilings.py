@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import plane
+import pytest
 from tiny_runs import TINY
 
 from experiments.methods import pseudo_settings
@@ -55,7 +56,8 @@ def test_better_depth_makes_better_labels():
     assert errors[0.0] < 0.5 * errors[0.5] < 0.4 * errors[1.0]
 
 
-def test_undefined_depth_stays_undefined():
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_undefined_depth_stays_undefined(share):
     views, exact = plane.make_views([plane.camera_above(0.0, 0.0, 4.0)])
     none = np.zeros((0, 3))
     scene = Scene(
@@ -69,6 +71,6 @@ def test_undefined_depth_stays_undefined():
         exact,
         lambda _: nothing,
         pseudo_settings(TINY.labels),
-        share=0.5,
+        share=share,
     )
     np.testing.assert_array_equal(labels.weight, 0)

@@ -104,7 +104,7 @@ def jacobian(name, antialias):
 @pytest.mark.parametrize(
     ("name", "precision", "antialias"),
     [
-        ("in front", "float64", False),
+        *(("in front", "float32", False), ("in front", "float64", False)),
         *(("through the camera", "float32", False), ("through the camera", "float64", False)),
         ("in front", "float64", True),
         *((f"volumes {name}", "float64", True) for name in ("in front", "through the camera")),
@@ -158,13 +158,14 @@ def test_float32_keeps_the_digits_of_small_splats():
         np.testing.assert_allclose(single, double, atol=1e-4 * np.abs(double).max(), rtol=0)
 
 
-def test_tile_sizes_do_not_change_the_image():
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_tile_sizes_do_not_change_the_image(precision):
     scene = random_scene(5, depth=(0.1, 2.0), log_scale=(-4.0, 0.0))
-    with jax.enable_x64(True):
+    with jax.enable_x64(precision == "float64"):
         images = [
             render(
-                to_surfels(scene, "float64"),
-                to_camera(dtype="float64"),
+                to_surfels(scene, precision),
+                to_camera(dtype=precision),
                 config=RasterizeConfig(
                     capacity=1024, near=NEAR, tile=tile, chunk=chunk, block=block
                 ),
@@ -173,7 +174,12 @@ def test_tile_sizes_do_not_change_the_image():
         ]
     for other in images[1:]:
         for name in OUTPUTS:
-            np.testing.assert_allclose(other[name], images[0][name], atol=1e-12, rtol=0)
+            # Depth and distortion are not of order 1, so float32 rounds them more coarsely.
+            if precision == "float64":
+                atol, rtol = 1e-12, 0
+            else:
+                atol, rtol = 1e-6, 0 if name in ("alpha", *VECTORS) else 5e-5
+            np.testing.assert_allclose(other[name], images[0][name], atol=atol, rtol=rtol)
 
 
 def test_sizes_left_open_suit_the_image():
