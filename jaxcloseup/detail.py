@@ -2,49 +2,30 @@
 
 The residual of a photograph is the photograph minus the model's render of its view. Gathered into
 another view, it adds what the model did not learn, as far as it is really there: where photographs
-disagree or depth is wrong, it is noise. Photographs that are left out tell how much of it is there.
-A ridge regression on what is known of each pixel, and a monotone curve, learn to predict it.
+disagree or depth is wrong, it is noise. Photographs that are left out tell how much of it is there
+(`detail_weights`).
 """
 
-from collections.abc import Sequence
+import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from scipy.optimize import isotonic_regression
 
-from jaxcloseup.gather import DEFAULT, Gathered, GatherSettings, GatherSources, gather
+from jaxcloseup.detail_weights import CONTRAST, DetailWeights, Evidence, blend
+from jaxcloseup.gather import Gathered, GatherSettings, GatherSources, gather_parts
 from jaxcloseup.geometry.cameras import Camera
-from jaxcloseup.numerics import matmul, safe_divide
+from jaxcloseup.numerics import safe_divide
 from jaxcloseup.pyramids import Pyramid
 
 
-# Interpolation and averaging take contrast: left-out photographs have up to twice the gathered
-# residual where everything else is sure.
-CONTRAST = 2.5
-TENTHS = 10
+# Residuals want many photographs, and colors only those that confirm the depth closely.
+SETTINGS = GatherSettings(), GatherSettings(tolerance=0.02)
+FEATURES = 29  # that tell how far to trust what is gathered
 _NEAREST, _FARTHEST = -1.0, 3.0  # log2 of how much finer views are than photographs can imitate
-FEATURES = 14  # that tell how far to trust a residual
-KNOTS = 12  # of the monotone curve, each with an equal share of the evidence
-_RIDGE = 1e-2
-FOLDS = 5
-
-
-@struct.dataclass
-class DetailWeights:
-    """How features predict the share of a gathered residual that is really there.
-
-    Attributes:
-      coefficients: `[F]` of the ridge regression.
-      regressed: `[K]` values of the regression, ascending.
-      actual: `[K]` shares that left-out photographs have there, ascending.
-    """
-
-    coefficients: jax.Array
-    regressed: jax.Array
-    actual: jax.Array
+_BLURS = 1.0, 4.0  # standard deviations in pixels
 
 
 @struct.dataclass
@@ -52,14 +33,15 @@ class Detail:
     """What a model's renders lack, as the photographs show it.
 
     Attributes:
-      residuals: `[V, P, 3]` photograph minus render, finest level first.
+      shown: `[V, P, 6]` photograph minus render, then the photograph's colors c as 2 c - 1, in the
+        exposure of its render.
       sources: the model's depth maps of the photographs.
-      weights: how far to trust a gathered residual.
+      weights: how far to trust what is gathered.
       finer: `[]` log2 of how much finer the finest level is than the photographs that the model
         learned from.
     """
 
-    residuals: Pyramid
+    shown: Pyramid
     sources: GatherSources
     weights: DetailWeights
     finer: jax.Array
@@ -80,18 +62,23 @@ class Detailed(NamedTuple):
     footprint: jax.Array
 
 
-class Evidence(NamedTuple):
-    """What a left-out photograph says about the residual gathered from the others, N pixels.
+class Candidates(NamedTuple):
+    """What the photographs offer for a render `[H, W]`.
 
     Attributes:
-      features: `[N, F]`.
-      power: `[N]` square of the gathered residual, weighted.
-      product: `[N]` its product with the photograph's own residual, weighted.
+      features: `[H, W, F]` what is known of each pixel, smooth in the camera.
+      residual: `[H, W, 3]` gathered residual.
+      colors: `[H, W, 3]` gathered colors minus the render; 0 where no photograph confirms the
+        depth.
+      weight: `[H, W]` sum of the photographs' weights.
+      footprint: `[H, W]` side of the finest pixel that saw the surface, in pixels of the view.
     """
 
-    features: np.ndarray
-    power: np.ndarray
-    product: np.ndarray
+    features: jax.Array
+    residual: jax.Array
+    colors: jax.Array
+    weight: jax.Array
+    footprint: jax.Array
 
 
 def add_detail(
@@ -101,7 +88,6 @@ def add_detail(
     rgb: jax.Array,
     alpha: jax.Array,
     depth: jax.Array,
-    settings: GatherSettings = DEFAULT,
 ) -> Detailed:
     """Add what the photographs show beyond a render to its colors.
 
@@ -112,152 +98,113 @@ def add_detail(
       rgb: `[H, W, 3]` rendered colors.
       alpha: `[H, W]` rendered opacity.
       depth: `[H, W]` rendered z-depth; 0 is undefined and gets no detail.
-      settings: how photographs are weighed.
     """
-    found = gather(camera, pixels, depth, detail.sources, detail.residuals, settings)
-    weight = predict(detail.weights, detail_features(found, alpha, depth, finer=detail.finer))
+    found = find_candidates(detail, camera, pixels, rgb, alpha, depth)
+    mixed, weight = blend(detail.weights, found.features, found.residual, found.colors)
     weight = jnp.where(found.weight > 0, weight, 0)
-    added = weight[..., None] * CONTRAST * found.mean
+    added = weight[..., None] * mixed
     # Photographs and view may differ in exposure, so detail keeps the mean color of the view.
     shift = safe_divide(jnp.sum(added, axis=(0, 1)), jnp.sum(weight))
     added = added - weight[..., None] * shift[None, None]
     return Detailed(jnp.clip(jnp.clip(rgb, 0, 1) + added, 0, 1), weight, found.footprint)
 
 
-def detail_features(
-    gathered: Gathered, alpha: jax.Array, depth: jax.Array, *, finer: jax.Array | float
-) -> jax.Array:
-    """What is known of each pixel's gathered residual, `[H, W, F]`, smooth in the camera.
+def find_candidates(
+    detail: Detail,
+    camera: Camera,
+    pixels: jax.Array,
+    rgb: jax.Array,
+    alpha: jax.Array,
+    depth: jax.Array,
+    *,
+    exclude: jax.Array | int = -1,
+    finest: jax.Array | int = 0,
+) -> Candidates:
+    """Gather what the photographs show at the surface of a render.
 
     Args:
-      gathered: residuals in a view `[H, W]`.
-      alpha: `[H, W]` opacity of the view's render.
-      depth: `[H, W]` its z-depth; 0 is undefined.
-      finer: log2 of how much finer the photographs are than those that the model learned from.
+      detail: of the state that was rendered; its weights are not needed.
+      camera: camera of the render.
+      pixels: `[H, W, 2]` its pixel centers, neighbors in the image.
+      rgb: `[H, W, 3]` rendered colors.
+      alpha: `[H, W]` rendered opacity.
+      depth: `[H, W]` rendered z-depth; 0 is undefined.
+      exclude: index of a photograph to leave out; -1 leaves out none.
+      finest: the first level to read, as if there were no finer one.
     """
-    energy = _blur(jnp.mean(gathered.mean**2, axis=-1))
-    variance = _blur(gathered.variance)
-    spread = safe_divide(variance, variance + energy, fill=1.0)
-    # log2 of how much finer the view is than the model, and than the finest photographs.
-    beyond_model = jnp.clip(finer - gathered.detail, _NEAREST, _FARTHEST)
-    beyond_photographs = jnp.clip(-gathered.detail, 0, _FARTHEST)
-    angle = jnp.minimum(gathered.angle, 0.6) / 0.2
-    count = jnp.log2(1 + jnp.minimum(gathered.count, 31)) / 2
-    features = (
-        *(jnp.ones_like(spread), beyond_model, beyond_model**2, beyond_photographs),
-        *(spread, spread**2, spread * beyond_model, spread * count),
-        *(angle, angle * beyond_model, count, count * beyond_model),
-        *(_edges(depth), alpha),
+    residual, colors = gather_parts(
+        *(camera, pixels, depth, detail.sources, detail.shown, SETTINGS),
+        exclude=exclude,
+        finest=finest,
     )
-    return jnp.stack(features, axis=-1)
+    finer = detail.finer - detail.shown.coarseness(exclude)[finest]
+    instead = (1 + colors.mean) / 2 - jnp.clip(rgb, 0, 1)
+    instead = jnp.where(colors.weight[..., None] > 0, instead, 0)
+    features = _features(residual, colors, instead, alpha, depth, finer)
+    return Candidates(features, residual.mean, instead, residual.weight, residual.footprint)
 
 
-def evidence(
-    features: jax.Array, gathered: Gathered, residual: jax.Array, weight: jax.Array
-) -> Evidence:
-    """What one left-out photograph says.
-
-    Args:
-      features: `[..., F]` of its pixels.
-      gathered: residuals gathered from the other photographs.
-      residual: `[..., C]` its own residual.
-      weight: `[...]` weight of its pixels.
-    """
-    mean = CONTRAST * gathered.mean
-    power = weight * jnp.sum(mean**2, axis=-1)
-    product = weight * jnp.sum(mean * residual, axis=-1)
-    return Evidence(features.reshape(-1, features.shape[-1]), power.ravel(), product.ravel())
-
-
-def learn_weights(photographs: Sequence[Sequence[Evidence]]) -> DetailWeights:
-    """Ridge regression of the share that is really there, then a monotone curve through it.
-
-    The share s minimizes the sum of |residual - s gathered|^2 over all pixels. The curve is the
-    isotonic regression of the actual share on the regressed one, so that predictions mean what they
-    say; each photograph's share is regressed from other photographs for it, since its own would
-    look more certain than it is.
+def testify(found: Candidates, own: jax.Array, weight: jax.Array) -> Evidence:
+    """What one left-out photograph says of the candidates for its own view.
 
     Args:
-      photographs: the evidence of each left-out photograph.
+      found: gathered from the other photographs.
+      own: `[H, W, 3]` its own residual.
+      weight: `[H, W]` weight of its pixels.
     """
-    sums = [_normal_equations(found) for found in photographs]
-    total = [sum(parts) for parts in zip(*sums, strict=True)]
-    folds = min(FOLDS, len(photographs))
-    columns = []
-    for fold in range(folds):
-        others = [parts for i, parts in enumerate(sums) if i % folds != fold] or sums
-        coefficients = _regress(*(sum(parts) for parts in zip(*others, strict=True)))
-        columns += [
-            np.stack([one.features @ coefficients, one.power, one.product])
-            for found in photographs[fold::folds]
-            for one in found
-        ]
-    x, y = _monotone(*np.concatenate(columns, axis=1).astype(np.float64))
-    return DetailWeights(*(jnp.asarray(array, jnp.float32) for array in (_regress(*total), x, y)))
+    images = found.features, found.residual, found.colors, own, weight[..., None]
+    *rows, weight = (image.reshape(-1, image.shape[-1]) for image in images)
+    return Evidence(*rows, weight[:, 0])
 
 
-def _normal_equations(found):
-    count = found[0].features.shape[-1]
-    squares, products = np.zeros((count, count)), np.zeros(count)
-    for one in found:
-        squares += (one.features * one.power[:, None]).T @ one.features
-        products += one.features.T @ one.product
-    return squares, products
+def _features(residual: Gathered, colors: Gathered, instead, alpha, depth, finer):
+    """`[H, W, F]`; `instead` is what gathered colors would add to the render."""
+    # log2 of how much finer the view is than the model, and than the finest photographs.
+    beyond_model = jnp.clip(finer - residual.detail, _NEAREST, _FARTHEST)
+    beyond_photographs = jnp.clip(-residual.detail, 0, _FARTHEST)
+    ways = (
+        *(beyond_model, beyond_photographs, jnp.clip(colors.detail, -4, 4)),
+        *(_log2_size(residual.footprint), _log2_size(colors.footprint)),
+        *(jnp.minimum(residual.angle, 0.6), jnp.minimum(colors.angle, 0.6)),
+        *(jnp.log2(1 + jnp.minimum(residual.count, 31)), jnp.minimum(colors.count, 8)),
+        *(jnp.where(colors.weight > 0, 1.0, 0.0), _edges(depth), alpha),
+    )
+    # How much the photographs differ among themselves, what they would add, and how much the two
+    # candidates differ: here, and around here.
+    powers = (
+        *(residual.variance, colors.variance / 4),
+        *(jnp.mean(residual.mean**2, axis=-1), jnp.mean(instead**2, axis=-1)),
+        jnp.mean((CONTRAST * residual.mean - instead) ** 2, axis=-1),
+    )
+    product = jnp.mean(residual.mean * instead, axis=-1)
+    around = [*map(_log_power, powers)]
+    for blur in _BLURS:
+        *means, alike = (_blur(image, blur) for image in (*powers, product))
+        alike = alike / jnp.sqrt(means[2] * means[3] + 1e-8)
+        around += [*map(_log_power, means), alike]
+    return jnp.stack([*ways, *around], axis=-1)
 
 
-def _regress(squares, products):
-    scale = np.sqrt(np.diag(squares)) + 1e-12
-    squares = squares / np.outer(scale, scale) + _RIDGE * np.eye(len(scale))
-    return np.linalg.solve(squares, products / scale) / scale
+def _log2_size(footprint):
+    return jnp.log2(jnp.clip(footprint, 0.25, 16))
 
 
-def _monotone(regressed, power, product):
-    """Knots `[K]` of the actual share, product / power, as a rising function of the regressed."""
-    order = np.argsort(regressed, kind="stable")
-    regressed, power, product = regressed[order], power[order], product[order]
-    reached = np.cumsum(power)
-    knot = np.minimum((reached / max(reached[-1], 1e-12) * KNOTS).astype(int), KNOTS - 1)
-    mass, x, y = (np.bincount(knot, c, KNOTS) for c in (power, power * regressed, product))
-    known = mass > 0
-    if not known.any():
-        return np.zeros(KNOTS), np.zeros(KNOTS)
-    x, y = x[known] / mass[known], y[known] / mass[known]
-    y = np.clip(isotonic_regression(y, weights=mass[known]).x, 0, 1)
-    # Always as many knots, so that nothing recompiles.
-    at, index = np.linspace(0, len(x) - 1, KNOTS), np.arange(len(x))
-    return np.interp(at, index, x), np.interp(at, index, y)
+def _log_power(values):
+    return jnp.log2(jnp.maximum(values, 0) + 1e-5)
 
 
-def predict(weights: DetailWeights, features: jax.Array) -> jax.Array:
-    """Predicted share `[...]` of a gathered residual that is really there, in [0, 1]."""
-    regressed = matmul(features, weights.coefficients[:, None])[..., 0]
-    return jnp.interp(regressed, weights.regressed, weights.actual)
-
-
-def reliability(weights: DetailWeights, found: Sequence[Evidence]) -> np.ndarray:
-    """Sums `[10, 4]` over the pixels of each tenth of the prediction.
-
-    The columns sum the power, the power times the predicted share, and the product (the power times
-    the actual share); the last one counts pixels.
-    """
-    sums = np.zeros((TENTHS, 4))
-    for one in found:
-        share = np.asarray(predict(weights, jnp.asarray(one.features)))
-        tenth = np.minimum((share * TENTHS).astype(int), TENTHS - 1)
-        columns = one.power, one.power * share, one.product, one.power > 0
-        sums += np.stack([np.bincount(tenth, column, TENTHS) for column in columns], axis=1)
-    return sums
-
-
-def _blur(image):
-    """Mean `[H, W]` over 5 x 5 pixels by binomial weights."""
+def _blur(image, deviation):
+    """Mean `[H, W]` over neighbors by Gaussian weights."""
+    reach = int(np.ceil(2.5 * deviation))
+    taps = np.exp(-((np.arange(-reach, reach + 1) / deviation) ** 2) / 2)
     for axis in (0, 1):
-        padded = jnp.pad(image, [(2, 2) if i == axis else (0, 0) for i in (0, 1)], mode="edge")
-        size = image.shape[axis]
-        image = sum(
-            tap / 16 * jax.lax.slice_in_dim(padded, i, i + size, axis=axis)
-            for i, tap in enumerate((1, 4, 6, 4, 1))
+        padding = [(reach, reach) if i == axis else (0, 0) for i in (0, 1)]
+        padded, size = jnp.pad(image, padding, mode="edge"), image.shape[axis]
+        parts = (
+            float(tap) * jax.lax.slice_in_dim(padded, i, i + size, axis=axis)
+            for i, tap in enumerate(taps / taps.sum())
         )
+        image = functools.reduce(jnp.add, parts)
     return image
 
 

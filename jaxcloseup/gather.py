@@ -4,7 +4,9 @@ Any field and any values: colors make a view from photographs alone, residuals (
 render) show what the photographs know beyond a model.
 """
 
+import functools
 import itertools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import chex
@@ -148,7 +150,42 @@ def gather(
       `Gathered` of the pixels `[...]`. `mean` is differentiable in float values and in `depth`,
       which no photograph's choice of level or of photographs makes discontinuous.
     """
+    return gather_parts(
+        camera, pixels, depth, sources, pyramid, (settings,), exclude=exclude, finest=finest
+    )[0]
+
+
+def gather_parts(
+    camera: Camera,
+    pixels: jax.Array,
+    depth: jax.Array,
+    sources: GatherSources,
+    pyramid: Pyramid,
+    settings: Sequence[GatherSettings],
+    *,
+    exclude: jax.Array | int = -1,
+    finest: jax.Array | int = 0,
+) -> tuple[Gathered, ...]:
+    """Gather equal parts of a pyramid's channels, each by settings of its own, in one visit.
+
+    Args:
+      camera: camera of the view.
+      pixels: `[..., 2]` pixel centers of the view.
+      depth: `[...]` their z-depth; 0 is undefined.
+      sources: depth maps of the photographs.
+      pyramid: values of the same photographs, one part of their channels after the other.
+      settings: of each part.
+      exclude: index of a photograph to leave out; -1 leaves out none.
+      finest: the first level to read, as if there were no finer one.
+
+    Returns:
+      `Gathered` of the pixels `[...]` for each part, as from `gather`.
+    """
     chex.assert_equal_shape_prefix([pixels, depth], depth.ndim)
+    if pyramid.values.shape[-1] % len(settings):
+        raise ValueError(
+            f"{pyramid.values.shape[-1]} channels are not {len(settings)} parts of one size"
+        )
     defined = (depth > 0) & jnp.isfinite(depth)
     points = pixels_to_points(camera, pixels, jnp.where(defined, depth, 1)).reshape(-1, 3)
     side = jnp.where(defined, depth, 0).reshape(-1) / mean_focal(camera.intrinsics)
@@ -157,7 +194,7 @@ def gather(
     pad = -count % chunk
     points = jnp.pad(points, ((0, pad), (0, 0))).reshape(-1, chunk, 3)
     side = jnp.pad(side, (0, pad)).reshape(-1, chunk)
-    reader = _Reader(camera.position, sources, pyramid, settings, finest)
+    reader = _Reader(camera.position, sources, pyramid, tuple(settings), finest)
     found = jax.lax.map(lambda data: _gather_chunk(*data, reader, exclude), (points, side))
 
     def restore(array):
@@ -173,7 +210,7 @@ class _Reader(NamedTuple):
     position: jax.Array
     sources: GatherSources
     pyramid: Pyramid
-    settings: GatherSettings
+    settings: tuple[GatherSettings, ...]
     finest: jax.Array | int
 
 
@@ -192,25 +229,30 @@ def _gather_chunk(points, side, reader, exclude):
     views = jnp.arange(reader.sources.trust.shape[0])
     may_see = jax.vmap(lambda camera: _may_see(camera, points, side))(reader.sources.cameras)
     may_see &= views != exclude
+    channels = reader.pyramid.values.shape[-1] // len(reader.settings)
 
-    def sums(reference):
+    def sums(references):
         def add(so_far, item):
             view, visible = item
             return jax.lax.cond(
                 visible,
-                lambda: _add_view(so_far, points, side, view, reader, reference),
+                lambda: _add_view(so_far, points, side, view, reader, references),
                 lambda: so_far,
             ), None
 
-        none, channels = jnp.zeros(side.shape, points.dtype), reader.pyramid.values.shape[-1]
+        none = jnp.zeros(side.shape, points.dtype)
         zero = jnp.zeros((*side.shape, channels), points.dtype)
         start = _Sums(none, zero, none, none, jnp.full_like(none, jnp.inf), none, none)
-        return _finish(jax.lax.scan(add, start, (views, may_see))[0])
+        start = (start,) * len(reader.settings)
+        return tuple(map(_finish, jax.lax.scan(add, start, (views, may_see))[0]))
 
-    found = sums(None)
-    if reader.settings.robust:
-        robust = sums((found.mean, found.variance))
-        found = found._replace(mean=robust.mean, weight=robust.weight)
+    found = sums((None,) * len(reader.settings))
+    if any(settings.robust for settings in reader.settings):
+        robust = sums(tuple((one.mean, one.variance) for one in found))
+        found = tuple(
+            one._replace(mean=again.mean, weight=again.weight) if settings.robust else one
+            for one, again, settings in zip(found, robust, reader.settings, strict=True)
+        )
     return found
 
 
@@ -228,46 +270,54 @@ def _finish(sums: _Sums) -> Gathered:
     )
 
 
-def _add_view(sums, points, side, view, reader, reference):
-    sources, settings = reader.sources, reader.settings
+def _add_view(sums, points, side, view, reader, references):
+    """The sums of all parts, with what one photograph shows."""
+    sources, pyramid = reader.sources, reader.pyramid
     source = camera_at(sources.cameras, view)
     landed, depth = points_to_pixels(source, points)
     maps = jnp.stack([sources.inverse_depth[view], sources.trust[view]], axis=-1)
     inverse, trust = jnp.moveaxis(backward_warp(maps, landed), -1, 0)
-    difference = (depth * inverse - 1) / settings.tolerance
-    seen = trust * jnp.maximum(1 - difference * difference, 0) ** 2
-    seen = jnp.where((side > 0) & (depth > 0), seen, 0)
+    known = (side > 0) & (depth > 0)
 
-    intrinsics = reader.pyramid.intrinsics[view]
-    alike = jnp.where((side > 0) & (depth > 0), depth, 1)
-    own = jnp.where(side > 0, side, 1)
     # log2 of the footprint of the finest level's pixel, and of the finest that is read.
-    size = jnp.log2(alike / own) - jnp.log2(mean_focal(intrinsics[0]))
-    coarseness = reader.pyramid.coarseness(view)
+    size = jnp.log2(jnp.where(known, depth, 1) / jnp.where(side > 0, side, 1))
+    size = size - jnp.log2(mean_focal(pyramid.intrinsics[view][0]))
+    coarseness = pyramid.coarseness(view)
     sharpest = size + coarseness[reader.finest]
-    angle = _angle(points - reader.position[None], points - source.position[None])
-    weight = seen * jnp.exp(-jnp.minimum(angle / settings.angle_scale, _WIDEST))
     footprint = jnp.exp2(sharpest)
-    weight = weight / jnp.clip(footprint, 1, _COARSEST) ** 2
-
-    level = _level(-size - settings.finer, coarseness)
-    level = jnp.maximum(level, jnp.asarray(reader.finest, size.dtype))
+    angle = _angle(points - reader.position[None], points - source.position[None])
     ray = (landed - source.intrinsics[None, 2:]) / source.intrinsics[None, :2]
-    value = _read(reader.pyramid, view, ray, level)
-    if reference is not None:
-        mean, variance = reference
-        apart = jnp.mean((value - mean) ** 2, axis=-1)
-        apart = settings.robust * safe_divide(apart, variance)
-        weight = weight / (1 + apart) ** 2
-    return _Sums(
-        sums.weight + weight,
-        sums.values + weight[:, None] * value,
-        sums.squares + weight * jnp.mean(value * value, axis=-1),
-        sums.count + seen,
-        jnp.where(seen > 0, jnp.minimum(sums.footprint, footprint), sums.footprint),
-        sums.detail - weight * sharpest,
-        sums.angle + weight * angle,
-    )
+
+    @functools.cache  # parts that are read alike are read together
+    def read(finer):
+        level = _level(-size - finer, coarseness)
+        level = jnp.maximum(level, jnp.asarray(reader.finest, size.dtype))
+        return jnp.split(_read(pyramid, view, ray, level), len(sums), axis=-1)
+
+    def add(so_far, part, settings, reference):
+        difference = (depth * inverse - 1) / settings.tolerance
+        seen = trust * jnp.maximum(1 - difference * difference, 0) ** 2
+        seen = jnp.where(known, seen, 0)
+        weight = seen * jnp.exp(-jnp.minimum(angle / settings.angle_scale, _WIDEST))
+        weight = weight / jnp.clip(footprint, 1, _COARSEST) ** 2
+        value = read(settings.finer)[part]
+        if reference is not None:
+            mean, variance = reference
+            apart = jnp.mean((value - mean) ** 2, axis=-1)
+            apart = settings.robust * safe_divide(apart, variance)
+            weight = weight / (1 + apart) ** 2
+        return _Sums(
+            so_far.weight + weight,
+            so_far.values + weight[:, None] * value,
+            so_far.squares + weight * jnp.mean(value * value, axis=-1),
+            so_far.count + seen,
+            jnp.where(seen > 0, jnp.minimum(so_far.footprint, footprint), so_far.footprint),
+            so_far.detail - weight * sharpest,
+            so_far.angle + weight * angle,
+        )
+
+    parts = zip(sums, range(len(sums)), reader.settings, references, strict=True)
+    return tuple(add(*part) for part in parts)
 
 
 def _level(wanted, coarseness):

@@ -160,7 +160,7 @@ def test_a_tuned_state_has_the_detail_of_photographs_that_see_the_view(rendered,
         others = tuned_detail(programs, state, cameras, blind)
     left = np.array([i for i in range(len(programs.scene.train)) if i != 1])
     assert len(left) == 4
-    np.testing.assert_array_equal(others.residuals.values, detail.residuals.values[left])
+    np.testing.assert_array_equal(others.shown.values, detail.shown.values[left])
 
     # A state that blurs more has its own residuals: with those of the first it stays further away.
     wide = state.params.replace(log_scales=state.params.log_scales + 0.4)

@@ -7,6 +7,7 @@ where they have changed.
 import functools
 import hashlib
 import io
+import itertools
 import json
 import pathlib
 import zipfile
@@ -24,22 +25,16 @@ from experiments.training.programs import Programs, describe_photographs
 from experiments.training.residuals import Window, render_residuals, reproduced
 from jaxcloseup.detail import (
     FEATURES,
-    FOLDS,
-    KNOTS,
-    TENTHS,
     Detail,
     Detailed,
-    DetailWeights,
-    Evidence,
     add_detail,
-    detail_features,
-    evidence,
-    learn_weights,
-    reliability,
+    find_candidates,
+    testify,
 )
+from jaxcloseup.detail_weights import HIDDEN, KNOTS, DetailWeights, Evidence, learn_weights
 from jaxcloseup.field import Rendering
 from jaxcloseup.files import read_bytes, write_file
-from jaxcloseup.gather import GatherSources, gather, gather_sources
+from jaxcloseup.gather import GatherSources, gather_sources
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.label_rules import label_depth
 from jaxcloseup.photographs import Views, camera_at
@@ -48,8 +43,9 @@ from jaxcloseup.train import TrainState
 
 
 LEFT_OUT = 20  # photographs that teach the weights
-_RECIPE = 2  # a change of how detail is made raises it, so that kept detail is made again
+_RECIPE = 3  # a change of how detail is made raises it, so that kept detail is made again
 _TEXTS = ("key", "about")
+_WEIGHTS = ("center", "scale", "share", "actual")
 _LARGEST = 2**32  # bytes of a file that keeps detail
 
 _add = jax.jit(add_detail)
@@ -113,16 +109,16 @@ def make_detail(programs: Programs, state: TrainState) -> tuple[Detail, dict[str
     print(f"   detail of {describe_photographs(pyramid, divisor)}", flush=True)
     count = len(scene.train)
     left_out = np.unique(np.linspace(0, count - 1, LEFT_OUT).round().astype(int)).tolist()
-    residuals, windows, depths = render_residuals(programs, state, pyramid, left_out)
+    shown, windows, depths = render_residuals(programs, state, pyramid, left_out)
     finer = jnp.float32(np.log2(pyramid.sizes[0][1] / scene.train.cameras.width))
-    detail = Detail(residuals, _sources(scene.train, residuals, depths), None, finer)
+    detail = Detail(shown, _sources(scene.train, shown, depths), None, finer)
     weights, table = calibrate(detail, windows)
     about = {"divisor": divisor, "sizes": list(map(list, pyramid.sizes)), "reliability": table}
     return detail.replace(weights=weights), about
 
 
-def _sources(views, residuals, depths):
-    trust = views.weight * reproduced(residuals)
+def _sources(views, shown, depths):
+    trust = views.weight * reproduced(shown)
     return jax.jit(gather_sources)(views.cameras, depths, trust)
 
 
@@ -138,9 +134,9 @@ def refresh_detail(
       views: the photographs.
     """
     pyramid, _ = programs.pyramid()
-    residuals, _, depths = render_residuals(programs, state, pyramid, views=views)
+    shown, _, depths = render_residuals(programs, state, pyramid, views=views)
     own = jax.tree.map(lambda leaf: leaf[np.asarray(views)], programs.scene.train)
-    return detail.replace(residuals=residuals, sources=_sources(own, residuals, depths))
+    return detail.replace(shown=shown, sources=_sources(own, shown, depths))
 
 
 def calibrate(detail: Detail, windows: Sequence[Window]) -> tuple[Any, list[dict[str, float]]]:
@@ -159,23 +155,20 @@ def calibrate(detail: Detail, windows: Sequence[Window]) -> tuple[Any, list[dict
       `pixels`. Each fold of the photographs is tried with weights that the others teach.
     """
     found: dict[int, list[Evidence]] = {}
-    testify = functools.partial(_testify, detail)
-    evidence_of = progress.each(testify, windows, "windows of left-out photographs")
+    evidence_of = progress.each(
+        functools.partial(_testify, detail), windows, "windows of left-out photographs"
+    )
     for window, one in zip(windows, evidence_of, strict=True):
         found.setdefault(window.view, []).append(one)
-    photographs = list(found.values())
-    sums, folds = np.zeros((TENTHS, 4)), min(FOLDS, len(photographs))
-    for fold in range(folds):
-        teachers = [one for i, one in enumerate(photographs) if i % folds != fold]
-        tried = [window for one in photographs[fold::folds] for window in one]
-        sums += reliability(learn_weights(teachers or photographs), tried)
+    with progress.saying("learning how far to trust the photographs"):
+        weights, sums = learn_weights(list(found.values()))
     table = []
     for power, predicted, actual, count in sums:
         if power > 0:
             means = {"predicted": predicted / power, "actual": actual / power}
             means["pixels"] = count / sums[:, 3].sum()
             table.append({name: float(value) for name, value in means.items()})
-    return learn_weights(photographs), table
+    return weights, table
 
 
 def _testify(detail, window):
@@ -183,7 +176,7 @@ def _testify(detail, window):
     side, _ = window.depth.shape
     own = camera_at(detail.sources.cameras, window.view)
     # All levels share one static size, so that nothing is compiled twice.
-    intrinsics = detail.residuals.intrinsics[window.view, window.level]
+    intrinsics = detail.shown.intrinsics[window.view, window.level]
     camera = own.replace(intrinsics=intrinsics, height=side, width=side)
     pixels = np.asarray(pixel_grid(side, side)) + window.corner
     return Evidence(*map(np.asarray, _compare(detail, camera, pixels, window)))
@@ -191,11 +184,10 @@ def _testify(detail, window):
 
 @jax.jit
 def _compare(detail, camera, pixels, window):
+    seen = window.rgb, window.alpha, window.depth
     without = {"exclude": window.view, "finest": window.finest}
-    found = gather(camera, pixels, window.depth, detail.sources, detail.residuals, **without)
-    finer = detail.finer - detail.residuals.coarseness(window.view)[window.finest]
-    features = detail_features(found, window.alpha, window.depth, finer=finer)
-    return evidence(features, found, window.residual, window.weight)
+    found = find_candidates(detail, camera, pixels, *seen, **without)
+    return testify(found, window.residual, window.weight)
 
 
 def _hash(programs, state):
@@ -209,13 +201,12 @@ def _hash(programs, state):
 
 def _save(path, key, detail, about):
     arrays = {
-        "values": detail.residuals.values,
-        "intrinsics": detail.residuals.intrinsics,
+        "values": detail.shown.values,
+        "intrinsics": detail.shown.intrinsics,
         "inverse_depth": detail.sources.inverse_depth,
         "trust": detail.sources.trust,
-        "coefficients": detail.weights.coefficients,
-        "regressed": detail.weights.regressed,
-        "actual": detail.weights.actual,
+        **{name: getattr(detail.weights, name) for name in _WEIGHTS},
+        **{f"layer_{i}": layer for i, layer in enumerate(detail.weights.layers)},
         "finer": detail.finer,
     }
     arrays |= {"key": key, "about": json.dumps(about)}
@@ -232,11 +223,15 @@ def _check(arrays, about, sizes, cameras):
     """Raise unless a file holds what `_save` writes for these cameras."""
     count, pixels = cameras.intrinsics.shape[0], sum(height * width for height, width in sizes)
     depths = (count, cameras.height, cameras.width)
+    nets = len(arrays["layer_0"])
+    widths = FEATURES, HIDDEN, HIDDEN, 2
     shapes = {
-        **{"values": (count, pixels, 3), "intrinsics": (count, len(sizes), 4)},
+        **{"values": (count, pixels, 6), "intrinsics": (count, len(sizes), 4)},
         **{"inverse_depth": depths, "trust": depths, "finer": ()},
-        **{"coefficients": (FEATURES,), "regressed": (KNOTS,), "actual": (KNOTS,)},
+        **{"center": (FEATURES,), "scale": (FEATURES,), "share": (KNOTS,), "actual": (KNOTS,)},
     }
+    for i, (before, after) in enumerate(itertools.pairwise(widths)):
+        shapes |= {f"layer_{2 * i}": (nets, before, after), f"layer_{2 * i + 1}": (nets, after)}
     expected = {name: (shape, np.dtype(np.float32)) for name, shape in shapes.items()}
     expected["values"] = shapes["values"], np.dtype(np.int8)
     if {name: (array.shape, array.dtype) for name, array in arrays.items()} != expected:
@@ -265,7 +260,9 @@ def _load(path, key, cameras):
         print(f"{path} is damaged ({type(error).__name__}): the detail is made again")
         return None
     arrays = {name: jnp.asarray(array) for name, array in arrays.items()}
-    residuals = Pyramid(arrays["values"], arrays["intrinsics"], sizes)
+    shown = Pyramid(arrays["values"], arrays["intrinsics"], sizes)
     sources = GatherSources(cameras, arrays["inverse_depth"], arrays["trust"])
-    weights = DetailWeights(*(arrays[name] for name in ("coefficients", "regressed", "actual")))
-    return Detail(residuals, sources, weights, arrays["finer"]), about
+    count = sum(name.startswith("layer_") for name in arrays)
+    layers = tuple(arrays[f"layer_{i}"] for i in range(count))
+    weights = DetailWeights(layers=layers, **{name: arrays[name] for name in _WEIGHTS})
+    return Detail(shown, sources, weights, arrays["finer"]), about

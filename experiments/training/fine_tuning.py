@@ -106,7 +106,7 @@ def _shares(detail, camera, depth):
     """The share of each photograph in what is gathered into a view, `[V]`; its sum is at most 1."""
     count = detail.sources.trust.shape[0]
     # Each photograph shows nothing but its own number, in as fine pixels as it has.
-    numbers = Pyramid(jnp.eye(count)[:, None], detail.residuals.intrinsics[:, :1], ((1, 1),))
+    numbers = Pyramid(jnp.eye(count)[:, None], detail.shown.intrinsics[:, :1], ((1, 1),))
     every = max(1, round((depth.size / _PIXELS) ** 0.5))
     pixels = pixel_grid(camera.height, camera.width)[::every, ::every]
     found = gather(camera, pixels, depth[::every, ::every], detail.sources, numbers)

@@ -35,6 +35,7 @@ class Window(NamedTuple):
       level: level of the pyramid.
       finest: the finest level that other photographs may show there.
       corner: `[2]` x, y of its first pixel.
+      rgb: `[S, S, 3]` rendered colors.
       residual: `[S, S, 3]` in [-1, 1].
       weight: `[S, S]` weight of its pixels.
       depth: `[S, S]` rendered z-depth.
@@ -45,6 +46,7 @@ class Window(NamedTuple):
     level: int
     finest: int
     corner: np.ndarray
+    rgb: np.ndarray
     residual: np.ndarray
     weight: np.ndarray
     depth: np.ndarray
@@ -72,18 +74,18 @@ def render_residuals(
       views: the photographs; all by default.
 
     Returns:
-      The residuals of these V photographs, int8; windows of `left_out`; and the depths `[V, H, W]`
-      at their training size.
+      What these V photographs show, int8 `[V, P, 6]`, see `Detail`; windows of `left_out`; and the
+      depths `[V, H, W]` at their training size.
     """
     scene = programs.scene
     cameras, last = scene.train.cameras, len(pyramid.sizes) - 1
     most = FINER_RAYS if programs.method.renders_pixels else FINER
     rendered = pyramid.level_near(most * cameras.width)
     views = range(len(scene.train)) if views is None else views
-    values = np.empty((len(views), pyramid.values.shape[1], 3), np.int8)
+    values = np.empty((len(views), pyramid.values.shape[1], 6), np.int8)
 
     def compare(view):
-        """Level, residual, weight, opacity and depth, the coarsest first."""
+        """Level, what is shown, weight, colors, opacity and depth, the coarsest first."""
         found = []
         for level in range(last, -1, -1):
             camera = pyramid.camera(camera_at(cameras, view), view, level)
@@ -97,17 +99,17 @@ def render_residuals(
             if level == last:
                 # The size that the model learned from shows the exposure.
                 colors = _match(photograph, *shown[:2])
-            found.append((level, *_subtract(photograph, shown[0], colors), *shown[1:]))
+            found.append((level, *_subtract(photograph, shown[0], colors), *shown))
         return [(level, *map(np.asarray, images)) for level, *images in found]
 
     windows, depths, rng = [], [], np.random.default_rng(0)
     compared = progress.each(compare, views, "residuals of photographs")
     for view, own, found in zip(views, values, compared, strict=True):
         depths.append(found[0][-1])
-        for level, residual, weight, alpha, depth in found:
-            own[pyramid.pixels_of(level)] = residual.reshape(-1, 3)
+        for level, both, weight, rgb, alpha, depth in found:
+            own[pyramid.pixels_of(level)] = both.reshape(-1, 6)
             if view in left_out:
-                images = [residual / np.float32(127), weight, depth, alpha]
+                images = [rgb, both[..., :3] / np.float32(127), weight, depth, alpha]
                 windows += _cut(rng, view, level, pyramid.sizes, images)
     found = Pyramid(jnp.asarray(values), pyramid.intrinsics[np.asarray(views)], pyramid.sizes)
     return found, windows, jnp.stack(depths)
@@ -138,16 +140,17 @@ def _cut(rng, view, level, sizes, shown):
             yield Window(view, level, finest, corner, *(image[inside] for image in shown))
 
 
-def reproduced(residuals: Pyramid) -> jax.Array:
+def reproduced(shown: Pyramid) -> jax.Array:
     """How far the model reproduces each photograph at its coarsest level, `[V, H, W]` in [0, 1].
 
     Where it fails at the size that it learned from, its depth is not to be trusted either: a
     floater in front of one camera would else spoil every view that it sees.
 
     Args:
-      residuals: of V photographs.
+      shown: by V photographs, see `Detail`.
     """
-    error = np.abs(np.asarray(residuals.level(len(residuals.sizes) - 1), np.float32)).mean(-1)
+    coarsest = shown.level(len(shown.sizes) - 1)[..., :3]
+    error = np.abs(np.asarray(coarsest, np.float32)).mean(-1)
     error = np.stack([cv2.GaussianBlur(one, (0, 0), 1.5) for one in error])
     typical = max(float(np.median(error)), 1e-6)
     return jnp.asarray(1 / (1 + (error / (MISFIT * typical)) ** 4) ** 2, jnp.float32)
@@ -176,8 +179,10 @@ def _match(photograph, rgb, alpha):
 
 @jax.jit
 def _subtract(photograph, rgb, colors):
+    """Residual and matched colors of a photograph, int8 `[H, W, 6]`, and its weight."""
     values, (matrix, offset) = to_float(photograph), colors
     weight = values[..., 3]
     matched = matmul(values[..., :3], matrix[None]) + offset[None, None]
-    residual = jnp.where(weight[..., None] > 0, matched - jnp.clip(rgb, 0, 1), 0)
-    return jnp.round(127 * jnp.clip(residual, -1, 1)).astype(jnp.int8), weight
+    both = jnp.concatenate([matched - jnp.clip(rgb, 0, 1), 2 * matched - 1], axis=-1)
+    both = jnp.where(weight[..., None] > 0, both, 0)
+    return jnp.round(127 * jnp.clip(both, -1, 1)).astype(jnp.int8), weight
