@@ -162,10 +162,14 @@ def _first_layers(features, count):
 def _outputs(weights, features):
     """What each network says of features `[..., F]`, one after the other: `[..., 2]`."""
     shape = features.shape[:-1]
-    usual = (features.reshape(-1, features.shape[-1]) - weights.center[None]) * weights.scale[None]
-    usual = jnp.clip(usual, -_UNUSUAL, _UNUSUAL)
+    usual = _usual(weights, features.reshape(-1, features.shape[-1]))
     for layers in zip(*weights.layers, strict=True):
         yield _perceive(layers, usual).reshape(*shape, 2)
+
+
+def _usual(weights, features):
+    usual = (features - weights.center[None]) * weights.scale[None]
+    return jnp.clip(usual, -_UNUSUAL, _UNUSUAL)
 
 
 def _perceive(layers, values):
@@ -184,11 +188,9 @@ def _mix(outputs, residual, colors):
 
 def _train(weights, found, counts):
     """Layers that predict the photographs' own residuals, by Adam; pixels count `[K, N]`."""
-    usual = jnp.asarray((found.features - weights.center) * weights.scale)
-    usual = jnp.clip(usual, -_UNUSUAL, _UNUSUAL)
     typical = max(float(np.mean(found.weight[:, None] * found.own**2)), 1e-12)
     data = *(jnp.asarray(array) for array in (found.residual, found.colors, found.own)), typical
-    return _descend(weights.layers, usual, jnp.asarray(counts), data)
+    return _descend(weights.layers, _usual(weights, found.features), jnp.asarray(counts), data)
 
 
 @jax.jit
@@ -207,7 +209,8 @@ def _descend(layers, features, counts, data):
         key = jax.random.fold_in(jax.random.key(0), index)
         chosen = jax.random.randint(key, (_BATCH,), 0, features.shape[0])
         slope = jax.vmap(functools.partial(jax.grad(loss), chosen=chosen))(layers, counts)
-        change, moments = adam.update(slope, moments)
+        with jax.numpy_dtype_promotion("standard"):  # optax multiplies by counts of steps
+            change, moments = adam.update(slope, moments)
         return optax.apply_updates(layers, change), moments
 
     return jax.lax.fori_loop(0, _STEPS, step, (layers, adam.init(layers)))[0]

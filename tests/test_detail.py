@@ -21,7 +21,7 @@ from experiments.training.fine_tuning import fine_tune, tuned_detail
 from experiments.training.residuals import _enlarge
 from experiments.training.setup import label_closeups, label_targets, start_labels
 from experiments.training.stored_run import load_run_scene, read_run, restore
-from jaxcloseup.detail import Evidence, learn_weights, predict, reliability
+from jaxcloseup.detail_weights import CONTRAST, Evidence, blend, learn_weights
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.photographs import camera_at, to_float
 from jaxcloseup.pyramids import scene_pyramid
@@ -32,33 +32,51 @@ def made_up(share, count=20_000, seed=0):
     """Evidence whose true share of the gathered residual is `share(feature)`, plus noise."""
     rng = np.random.default_rng(seed)
     x = rng.uniform(0, 1, count)
-    features = np.stack([np.ones(count), x, x**2], axis=-1).astype(np.float32)
+    features = np.stack([np.ones(count), x, x**2], axis=-1)
     gathered = rng.normal(0, 0.1, (count, 3))
-    residual = share(x)[:, None] * gathered + rng.normal(0, 0.02, (count, 3))
-    power, product = (gathered**2).sum(-1), (gathered * residual).sum(-1)
-    return Evidence(features, power.astype(np.float32), product.astype(np.float32)), x
+    own = share(x)[:, None] * gathered + rng.normal(0, 0.02, (count, 3))
+    images = features, gathered / CONTRAST, rng.normal(0, 0.1, (count, 3)), own, np.ones(count)
+    return Evidence(*(image.astype(np.float32) for image in images)), x
 
 
 @pytest.mark.parametrize(
     "share", [lambda x: 0.2 + 0.6 * x, lambda x: 1 / (1 + np.exp(12 * (x - 0.5)))]
 )
 def test_weights_are_the_share_that_is_there(share):
-    found, x = made_up(share)
-    weights = learn_weights([[found]])
-    predicted = np.asarray(predict(weights, jnp.asarray(found.features)))
-    assert np.abs(predicted - share(x)).mean() < 0.05
-    other, _ = made_up(share, seed=1)
-    for power, guessed, actual, count in reliability(weights, [other]):
+    found = [made_up(share, seed=seed)[0] for seed in range(3)]
+    weights, sums = learn_weights([[one] for one in found])
+    other, x = made_up(share, seed=3)
+    mixed, predicted = map(np.asarray, blend(weights, *other[:3]))
+    added = predicted[:, None] * mixed
+    expected = share(x)[:, None] * CONTRAST * other.residual
+    # Colors are noise here: what is added is the share of the residual.
+    assert np.abs(added - expected).mean() < 0.1 * np.abs(expected).mean()
+    assert sums[:, 3].sum() == 3 * 20_000
+    for power, guessed, actual, count in sums:
         if count > 300:
             assert guessed / power == pytest.approx(actual / power, abs=0.05)
 
 
+def test_colors_are_taken_where_they_are_right_and_the_residual_elsewhere():
+    rng, count = np.random.default_rng(0), 40_000
+    exact = rng.uniform(size=count) < 0.5
+    own, noise = rng.normal(0, 0.1, (2, count, 3))
+    colors = np.where(exact[:, None], own, noise)
+    residual = np.where(exact[:, None], noise, own) / CONTRAST
+    images = exact[:, None] * 1.0, residual, colors, own, np.ones(count)
+    found = Evidence(*(image.astype(np.float32) for image in images))
+    weights, _ = learn_weights([[found]])
+    mixed, share = blend(weights, *found[:3])
+    assert np.abs(np.asarray(mixed) - own).mean() < 0.1 * np.abs(own).mean()
+    assert float(share.min()) > 0.9
+
+
 def test_weights_stay_in_their_range_and_need_evidence():
     found, _ = made_up(lambda x: 3 * x - 1)
-    predicted = predict(learn_weights([[found]]), jnp.asarray(found.features))
-    assert float(predicted.min()) == 0 and float(predicted.max()) == 1
-    none = found._replace(power=0 * found.power, product=0 * found.product)
-    assert not np.asarray(predict(learn_weights([[none]]), jnp.asarray(found.features))).any()
+    _, predicted = blend(learn_weights([[found]])[0], *found[:3])
+    assert 0 <= float(predicted.min()) < 0.05 and 0.95 < float(predicted.max()) <= 1
+    none = found._replace(weight=0 * found.weight)
+    assert not np.asarray(blend(learn_weights([[none]])[0], *found[:3])[1]).any()
 
 
 @pytest.fixture(scope="module")
@@ -214,7 +232,8 @@ def test_damaged_detail_is_made_again(rendered, found, monkeypatch, capsys):
     damages = [b"", whole[:100], whole[:-9], b"x" * 100]
     damages += [whole[:middle] + bytes(9) + whole[middle + 9 :], changed(actual=None)]
     damages += [changed(trust=arrays["trust"][:, 1:]), changed(values=arrays["values"] * 1.0)]
-    damages += [changed(coefficients=arrays["coefficients"][1:]), changed(about="{}")]
+    damages += [changed(layer_2=arrays["layer_2"][:, 1:]), changed(about="{}")]
+    damages += [changed(center=arrays["center"][1:]), changed(layer_0=None)]
     damages += [changed(about=json.dumps(about | {"sizes": [3]})), changed(other=np.zeros(3))]
     damages += [changed(values=np.array([{}], object))]
     for count, damaged in enumerate(damages, 2):

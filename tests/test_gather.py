@@ -9,7 +9,7 @@ import plane
 import pytest
 import reference
 
-from jaxcloseup.gather import GatherSettings, gather, gather_sources
+from jaxcloseup.gather import GatherSettings, gather, gather_parts, gather_sources
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points
 from jaxcloseup.photographs import camera_at
 from jaxcloseup.pyramids import Pyramid, photograph_pyramid
@@ -83,6 +83,26 @@ def test_gather_against_an_oracle(capture, closeup, exclude, finest):
         for name, value in expected.items():
             actual = np.asarray(getattr(found, name)[row, column])
             np.testing.assert_allclose(actual, value, rtol=2e-3, atol=2e-4, err_msg=name)
+
+
+def test_parts_are_gathered_as_if_alone(capture, closeup):
+    """Each by its own settings; a part that is read finer has other values."""
+    sources, pyramid = capture
+    camera, depth = closeup
+    strict = GatherSettings(tolerance=0.02, finer=0.8)
+    twice = pyramid.replace(values=jnp.concatenate([pyramid.values, pyramid.values[..., ::-1]], -1))
+    parts = jax.jit(functools.partial(gather_parts, settings=(SETTINGS, strict)))
+    first, second = parts(camera, GRID, depth, sources, twice, exclude=1)
+    alone = gathered(camera, GRID, depth, sources, pyramid, exclude=1, finest=0)
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5), first, alone)
+    alone = jax.jit(functools.partial(gather, settings=strict))(
+        camera, GRID, depth, sources, pyramid, exclude=1
+    )
+    alone = alone._replace(mean=alone.mean[..., ::-1])
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5), second, alone)
+    assert np.abs(np.asarray(first.weight - second.weight)).max() > 0.002
+    with pytest.raises(ValueError, match="6 channels are not 4 parts of one size"):
+        gather_parts(camera, GRID, depth, sources, twice, (strict,) * 4)
 
 
 def test_undefined_depth_gathers_nothing(capture, closeup):

@@ -34,7 +34,8 @@ MAY_IMPORT = {
     "pyramids": {"geometry", "photographs", "scene"},
     "windows": {"geometry", "photographs", "pyramids"},
     "gather": {"numerics", "geometry", "photographs", "pyramids"},
-    "detail": {"numerics", "geometry", "gather", "pyramids"},
+    "detail_weights": {"numerics"},
+    "detail": {"numerics", "geometry", "gather", "pyramids", "detail_weights"},
     "tsdf": {"numerics", "geometry", "gather", "photographs"},
     "draws": {"geometry", "photographs", "pseudo", "pyramids", "windows"},
     "train": {

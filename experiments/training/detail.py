@@ -42,7 +42,7 @@ from jaxcloseup.pyramids import Pyramid
 from jaxcloseup.train import TrainState
 
 
-LEFT_OUT = 20  # photographs that teach the weights
+LEFT_OUT = 60  # photographs, at most, that teach the weights
 _RECIPE = 3  # a change of how detail is made raises it, so that kept detail is made again
 _TEXTS = ("key", "about")
 _WEIGHTS = ("center", "scale", "share", "actual")
