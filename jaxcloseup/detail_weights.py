@@ -8,6 +8,7 @@ is really there. A monotone curve then makes that share mean what it says.
 """
 
 import functools
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -26,7 +27,7 @@ from jaxcloseup.numerics import matmul
 CONTRAST = 2.5
 TENTHS = 10
 FOLDS = 3  # and as many networks, each taught without one fold of the photographs
-HIDDEN = 32
+WIDTHS = 32, 32, 2  # units of each layer after the features
 KNOTS = 12  # of the monotone curve, each with an equal share of the evidence
 PIXELS = 600_000  # that teach the networks
 _STEPS, _BATCH, _RATE = 600, 4096, 1e-2
@@ -151,7 +152,7 @@ def _sample(photographs):
 
 def _first_layers(features, count):
     rng, layers = np.random.default_rng(0), []
-    for before, after in ((features, HIDDEN), (HIDDEN, HIDDEN), (HIDDEN, 2)):
+    for before, after in itertools.pairwise((features, *WIDTHS)):
         # Small outputs, so that shares begin near one half.
         size = np.sqrt(2 / before) * (0.1 if after == 2 else 1)
         layers.append(jnp.asarray(rng.normal(0, size, (count, before, after)), jnp.float32))
@@ -173,12 +174,10 @@ def _usual(weights, features):
 
 
 def _perceive(layers, values):
-    last = len(layers) - 2
-    for i in range(0, last + 2, 2):
-        values = matmul(values, layers[i]) + layers[i + 1][None]
-        if i < last:
-            values = jax.nn.relu(values)
-    return values
+    *hidden, last = zip(layers[::2], layers[1::2], strict=True)
+    for matrix, offset in hidden:
+        values = jax.nn.relu(matmul(values, matrix) + offset[None])
+    return matmul(values, last[0]) + last[1][None]
 
 
 def _mix(outputs, residual, colors):

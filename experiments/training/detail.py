@@ -31,7 +31,7 @@ from jaxcloseup.detail import (
     find_candidates,
     testify,
 )
-from jaxcloseup.detail_weights import HIDDEN, KNOTS, DetailWeights, Evidence, learn_weights
+from jaxcloseup.detail_weights import KNOTS, WIDTHS, DetailWeights, Evidence, learn_weights
 from jaxcloseup.field import Rendering
 from jaxcloseup.files import read_bytes, write_file
 from jaxcloseup.gather import GatherSources, gather_sources
@@ -224,13 +224,12 @@ def _check(arrays, about, sizes, cameras):
     count, pixels = cameras.intrinsics.shape[0], sum(height * width for height, width in sizes)
     depths = (count, cameras.height, cameras.width)
     nets = len(arrays["layer_0"])
-    widths = FEATURES, HIDDEN, HIDDEN, 2
     shapes = {
         **{"values": (count, pixels, 6), "intrinsics": (count, len(sizes), 4)},
         **{"inverse_depth": depths, "trust": depths, "finer": ()},
         **{"center": (FEATURES,), "scale": (FEATURES,), "share": (KNOTS,), "actual": (KNOTS,)},
     }
-    for i, (before, after) in enumerate(itertools.pairwise(widths)):
+    for i, (before, after) in enumerate(itertools.pairwise((FEATURES, *WIDTHS))):
         shapes |= {f"layer_{2 * i}": (nets, before, after), f"layer_{2 * i + 1}": (nets, after)}
     expected = {name: (shape, np.dtype(np.float32)) for name, shape in shapes.items()}
     expected["values"] = shapes["values"], np.dtype(np.int8)
