@@ -62,7 +62,8 @@ class DetailWeights:
       layers: matrices `[K, A, B]` and offsets `[K, B]`, alternating, from the features to two
         outputs.
       share: `[P]` shares as the networks predict them, ascending.
-      actual: `[P]` shares that left-out photographs have there, ascending.
+      actual: `[P]` shares that left-out photographs have there, ascending; below 0 where the
+        mixture points away from the truth.
     """
 
     center: jax.Array
@@ -84,11 +85,12 @@ def blend(
       colors: `[..., 3]` gathered colors minus the render.
 
     Returns:
-      `[..., 3]` the mixture, and `[...]` the share of it that is really there, in [0, 1].
+      `[..., 3]` the mixture, and `[...]` the share of it that is really there, in [0, 1]; 0 too
+      where a share below 0 is predicted.
     """
     outputs = sum(_outputs(weights, features)) / weights.layers[0].shape[0]
     mixed, share = _mix(outputs, residual, colors)
-    return mixed, jnp.interp(share, weights.share, weights.actual)
+    return mixed, jnp.interp(share, weights.share, jnp.maximum(weights.actual, 0))
 
 
 def learn_weights(
@@ -107,7 +109,7 @@ def learn_weights(
       The weights, and sums `[10, 4]` over the pixels of each tenth of the predicted share: of the
       power |g|^2, of the power times that share, of the product of g with the photograph's own
       residual (the power times the actual share), and the number of pixels. Each fold is predicted
-      by the network and the curve of the others.
+      by the network and the curve of the others. The first tenth holds what is below 0, too.
     """
     found, fold = _sample(photographs)
     folds = int(fold.max()) + 1
@@ -226,13 +228,13 @@ def _monotone(regressed, power, product):
     if not known.any():
         return np.zeros(KNOTS), np.zeros(KNOTS)
     x, y = x[known] / mass[known], y[known] / mass[known]
-    y = np.clip(isotonic_regression(y, weights=mass[known]).x, 0, 1)
+    y = np.clip(isotonic_regression(y, weights=mass[known]).x, -1, 1)
     # Always as many knots, so that nothing recompiles.
     at, index = np.linspace(0, len(x) - 1, KNOTS), np.arange(len(x))
     return np.interp(at, index, x), np.interp(at, index, y)
 
 
 def _by_tenths(share, power, product):
-    tenth = np.minimum((share * TENTHS).astype(int), TENTHS - 1)
+    tenth = np.clip((share * TENTHS).astype(int), 0, TENTHS - 1)
     columns = power, power * share, product, power > 0
     return np.stack([np.bincount(tenth, column, TENTHS) for column in columns], axis=1)

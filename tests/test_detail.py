@@ -79,6 +79,22 @@ def test_weights_stay_in_their_range_and_need_evidence():
     assert not np.asarray(blend(learn_weights([[none]])[0], *found[:3])[1]).any()
 
 
+def test_what_points_away_from_the_truth_is_predicted_below_zero_and_not_added():
+    def share(x):
+        return np.where(x < 0.4, -0.3, 0.8)
+
+    found = []
+    for seed in range(3):
+        one, x = made_up(share, seed=seed)
+        found.append([one._replace(colors=CONTRAST * one.residual)])
+    weights, sums = learn_weights(found)
+    power, guessed, actual, _ = sums[0]
+    assert actual / power == pytest.approx(-0.3, abs=0.03)
+    assert guessed / power == pytest.approx(actual / power, abs=0.05)
+    _, predicted = map(np.asarray, blend(weights, *found[-1][0][:3]))
+    assert not predicted[x < 0.35].any() and predicted[x > 0.45].min() > 0.6
+
+
 @pytest.fixture(scope="module")
 def rendered(kept, tmp_path_factory):
     """The run's programs, its state blurred, and where its detail is kept."""
