@@ -73,14 +73,15 @@ def test_whatever_shows_is_kept(kwargs, share, antialias):
         *((2 * COUNT, number) for number in (0, 1)),
     ],
 )
-def test_a_function_of_the_shown_items_alone(many, number, monkeypatch):
-    """Values and gradients against NumPy, of few shown items, of too many, and of few in all."""
+@pytest.mark.parametrize("parts", [8, 7])
+def test_a_function_of_the_shown_items_alone(many, number, parts, monkeypatch):
+    """Values and gradients against NumPy, of few items in all, and of the shown ones of many."""
     monkeypatch.setattr(culling, "_MANY", many)
-    few = number <= (COUNT // 4 if many == 16 else 0)
+    monkeypatch.setattr(culling, "_PARTS", parts)
     rng = np.random.default_rng(5)
     items, faint = rng.normal(size=(COUNT, 3)), rng.uniform(size=COUNT)
     shown = np.isin(np.arange(COUNT), rng.permutation(COUNT)[:number])
-    computed = shown if few else np.ones(COUNT, bool)
+    computed = shown if many == 16 or not number else np.ones(COUNT, bool)
 
     def function(items, shared):
         values, faint = items
@@ -103,6 +104,9 @@ def test_a_function_of_the_shown_items_alone(many, number, monkeypatch):
     assert not table[rows:].any() and len(table) == COUNT
 
     (moved, fainter), by_shared = jax.grad(total, argnums=(0, 1))(*given)
+    # What is shared may be left alone.
+    for both, alone in zip((moved, fainter), jax.grad(total)(*given), strict=True):
+        np.testing.assert_allclose(both, alone, atol=1e-6)
     bar = -np.sin(expected)
     np.testing.assert_allclose(moved[computed], bar * 2 * faint[:, None] * np.cos(items), atol=1e-6)
     np.testing.assert_allclose(
@@ -114,7 +118,6 @@ def test_a_function_of_the_shown_items_alone(many, number, monkeypatch):
 
 def test_culling_changes_no_image(monkeypatch):
     monkeypatch.setattr(culling, "_MANY", 16)
-    monkeypatch.setattr(culling, "_PART", 1)  # any number is few
     surfels = to_surfels(random_scene(4, count=COUNT, log_scale=(-4.0, -2.0)))
     intrinsics, size = window("middle")
     camera, alive = to_camera(intrinsics=intrinsics, size=size), jnp.arange(COUNT) % 7 != 3

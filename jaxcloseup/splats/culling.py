@@ -4,12 +4,18 @@ A window or a close-up shows a small part of a scene, and should cost no more th
 """
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.custom_derivatives import (
+    CustomVJPPrimal,
+    SymbolicZero,
+    custom_vjp_primal_tree_values,
+)
 
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.geometry.rotations import quaternion_to_matrix
@@ -22,8 +28,8 @@ from jaxcloseup.splats.projection import MAX_LOG_SCALE
 from jaxcloseup.splats.surfels import Surfels
 
 
-_MANY = 2**14  # fewer items are not worth compiling everything twice
-_PART = 4  # one of so many items is few
+_MANY = 2**14  # items of which the shown ones are worth picking
+_PARTS = 8
 
 
 def may_show(
@@ -84,13 +90,10 @@ def _ellipses_in_view(camera, center, cutoff, scale, near):
     return seen
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
 def map_shown(
     function: Callable[[Any, Any], Any], items: Any, shared: Any, shown: jax.Array
 ) -> Any:
-    """`function(items, shared)` of all items or, where few of many are shown, of those alone.
-
-    The derivative computes everything anew, so that nothing is kept for it.
+    """`function(items, shared)` of few items, or of the shown ones of many.
 
     Args:
       function: maps arrays with a leading axis of items to others with the same axis, item by item.
@@ -99,58 +102,88 @@ def map_shown(
       shown: `[N]` bool.
 
     Returns:
-      The results, arrays with `N` rows: of all items; or of the shown items, in their order, and
-      then zeros. Differentiable in items and `shared`.
+      The results, arrays with `N` rows: of all items, in the first case; or of the shown items, in
+      their order, and then zeros. All are zeros where nothing is shown. Differentiable in items and
+      `shared`.
+    """
+    if shown.size >= _MANY:
+        return _map_parts(function, items, shared, shown)
+    return _if_any(jnp.any(shown), lambda: jax.checkpoint(function)(items, shared))
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _map_parts(function, items, shared, shown):
+    """`map_shown` of many items, a part of the shown ones at a time.
+
+    The derivative computes everything anew, so that nothing is kept for it.
     """
     count = shown.size
 
-    def of_few(index, there):
-        found = _only(there, function(_pick(items, index), shared))
-        return jax.tree.map(lambda leaf: _pad(leaf, count), found)
+    def compute(_, index):
+        def some():
+            return _only(index < count, function(_pick(items, index), shared))
 
-    def of_none():
-        return _zeros(jax.eval_shape(function, items, shared))
+        return None, _if_any(index[0] < count, some)
 
-    return _choose(shown, of_none, of_few, lambda: function(items, shared))
-
-
-def _map_shown_forward(function, items, shared, shown):
-    return map_shown(function, items, shared, shown), (items, shared, shown)
+    _, found = lax.scan(compute, None, _parts(shown))
+    return jax.tree.map(lambda leaf: _flat(leaf)[:count], found)
 
 
-def _map_shown_backward(function, residuals, cotangents):
-    items, shared, shown = residuals
-
-    def of_few(index, there):
-        _, pull_back = jax.vjp(function, _pick(items, index), shared)
-        first = jax.tree.map(lambda leaf: leaf[: index.size], cotangents)
-        picked_bar, shared_bar = pull_back(_only(there, first))
-        place = lambda all_, new: all_.at[index].set(new, mode="drop")  # noqa: E731
-        return jax.tree.map(place, _zeros(items), picked_bar), shared_bar
-
-    def of_all():
-        return jax.vjp(function, items, shared)[1](cotangents)
-
-    return *_choose(shown, lambda: _zeros((items, shared)), of_few, of_all), None
+def _map_parts_forward(function, items, shared, shown):
+    # A camera is rarely trained, and its derivative takes as long to compile as all others.
+    trained = any(leaf.perturbed for leaf in jax.tree.leaves(shared, is_leaf=_is_primal))
+    items, shared, shown = map(custom_vjp_primal_tree_values, (items, shared, shown))
+    kept = (shared, None) if trained else (None, shared)
+    return _map_parts(function, items, shared, shown), (items, *kept, shown)
 
 
-map_shown.defvjp(_map_shown_forward, _map_shown_backward)
+def _map_parts_backward(function, residuals, cotangents):
+    items, trained, fixed, shown = residuals
+    count, parts = shown.size, _parts(shown)
+
+    def of_trained(items, trained):
+        return function(items, fixed if trained is None else trained)
+
+    def pull_back(total, part):
+        index, bars = part
+
+        def some():
+            _, bar_of = jax.vjp(of_trained, _pick(items, index), trained)
+            return bar_of(_only(index < count, bars))
+
+        picked_bar, trained_bar = _if_any(index[0] < count, some)
+        return jax.tree.map(jnp.add, total, trained_bar), picked_bar
+
+    bars = jax.tree.map(lambda bar: _split(bar, parts.shape), cotangents)
+    trained_bar, picked_bar = lax.scan(pull_back, _zeros(trained), (parts, bars))
+    # Where each item is among those that are shown.
+    place = jnp.cumsum(shown, dtype=jnp.int32) - 1
+    items_bar = _only(shown, _pick(jax.tree.map(_flat, picked_bar), place))
+    return items_bar, trained_bar, None
 
 
-def _choose(shown, of_none, of_few, of_all):
-    """`of_few(index, there)` with room for a part of the items, if that suffices; or `of_all()`."""
-    # XLA computes what a conditional returns once; without one it computes most of the projection
-    # anew for each column of what is made from it. So there is one for small numbers too.
-    count, number = shown.size, jnp.sum(shown, dtype=jnp.int32)
-    if count < _MANY:
-        return lax.cond(number > 0, of_all, of_none)
-    few = count // _PART
+_map_parts.defvjp(_map_parts_forward, _map_parts_backward, symbolic_zeros=True)
 
-    def picked():
-        index = jnp.nonzero(shown, size=few, fill_value=count)[0].astype(jnp.int32)
-        return of_few(index, jnp.arange(few, dtype=jnp.int32) < number)
 
-    return lax.cond(number <= few, picked, of_all)
+def _is_primal(leaf):
+    return isinstance(leaf, CustomVJPPrimal)
+
+
+def _parts(shown):
+    """Indices `[K, M]` of the shown items in their order, in K parts, then the number of items."""
+    count = shown.size
+    size = -(-count // _PARTS)
+    index = jnp.nonzero(shown, size=_PARTS * size, fill_value=count)[0]
+    return index.astype(jnp.int32).reshape(_PARTS, size)
+
+
+def _if_any(there, some):
+    """`some()` if anything is there, else zeros.
+
+    XLA computes what a conditional returns once. Without one it computes most of the projection
+    anew for each column of what is made from it.
+    """
+    return lax.cond(there, some, lambda: _zeros(jax.eval_shape(some)))
 
 
 def _pick(items, index):
@@ -168,5 +201,14 @@ def _zeros(shapes):
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
 
-def _pad(leaf, count):
-    return jnp.zeros((count, *leaf.shape[1:]), leaf.dtype).at[: leaf.shape[0]].set(leaf)
+def _flat(leaf):
+    """The rows of all parts, one after the other."""
+    return leaf.reshape(-1, *leaf.shape[2:])
+
+
+def _split(bar, shape):
+    """A cotangent `[N, ...]` in parts `[K, M, ...]`, filled up with zeros."""
+    if isinstance(bar, SymbolicZero):
+        bar = jnp.zeros(bar.shape, bar.dtype)
+    missing = math.prod(shape) - bar.shape[0]
+    return jnp.pad(bar, ((0, missing),) + ((0, 0),) * (bar.ndim - 1)).reshape(*shape, *bar.shape[1:])
