@@ -210,5 +210,5 @@ def _split(bar, shape):
     """A cotangent `[N, ...]` in parts `[K, M, ...]`, filled up with zeros."""
     if isinstance(bar, SymbolicZero):
         bar = jnp.zeros(bar.shape, bar.dtype)
-    missing = math.prod(shape) - bar.shape[0]
-    return jnp.pad(bar, ((0, missing),) + ((0, 0),) * (bar.ndim - 1)).reshape(*shape, *bar.shape[1:])
+    missing, *rest = math.prod(shape) - bar.shape[0], *bar.shape[1:]
+    return jnp.pad(bar, ((0, missing), *[(0, 0)] * len(rest))).reshape(*shape, *rest)
