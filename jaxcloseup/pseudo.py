@@ -138,6 +138,7 @@ def make_label(
     return label_pixels(camera, pixels, depth, source_index, label_sources(views, depths), settings)
 
 
+@jax.jit
 def label_pixels(
     camera: Camera,
     pixels: jax.Array,
@@ -147,6 +148,8 @@ def label_pixels(
     settings: PseudoSettings,
 ) -> PseudoLabel:
     """Label pixels of a virtual view from the training photographs.
+
+    It is compiled, because a run's steps, gate, audit and pictures all call it.
 
     Args:
       camera: the virtual camera.

@@ -195,12 +195,15 @@ def closeup_step(
     def loss(params, buffers, keys, views, sources, settings):
         batch = sample_batch(keys.batch, views, config.num_rays)
         virtual = sample_closeup(keys.label, sources, settings, config.num_label_rays)
-        camera, pixels = virtual.camera, virtual.pixels
+        camera = virtual.camera
         key_depth = rule.depth_key(virtual.key_depth)
         fixed = jax.lax.stop_gradient(params)
-        rendering = render(fixed, buffers, camera, pixels, key_depth)
-        label = _label(rendering, virtual, sources, settings, depth=rule.depth)
-        labeled = Batch(camera, pixels, label.rgb, label.weight)
+        rendering = render(fixed, buffers, camera, virtual.pixels, key_depth)
+        depth, pixels = _depth(rendering, depth=rule.depth), virtual.pixels
+        if pixels is None:
+            pixels = pixel_grid(camera.height, camera.width)
+        label = label_pixels(camera, pixels, depth, virtual.source_index, sources, settings)
+        labeled = Batch(camera, virtual.pixels, label.rgb, label.weight)
         add = add_label_loss if whole else rule.loss
         value, metrics = add(
             lambda batch, key: loss_of(params, buffers, batch, key),
@@ -312,11 +315,8 @@ def render_depths(
 
 
 @functools.partial(jax.jit, static_argnames="depth")
-def _label(rendering, virtual, sources, settings, *, depth):
-    camera, pixels = virtual.camera, virtual.pixels
-    if pixels is None:
-        pixels = pixel_grid(camera.height, camera.width)
-    return label_pixels(camera, pixels, depth(rendering), virtual.source_index, sources, settings)
+def _depth(rendering, *, depth):
+    return depth(rendering)
 
 
 def _update(state, loss, data, field, optimizer, config, spread, lr_scale=None):

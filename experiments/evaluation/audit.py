@@ -5,6 +5,7 @@ with the true close-up, blurred to the footprint of the source's pixels. On all 
 photographs are left out one by one, labeled from the others, and compared with their labels.
 """
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -22,11 +23,10 @@ from jaxcloseup.label_rules import label_depth
 from jaxcloseup.photographs import camera_at, to_float
 from jaxcloseup.pseudo import (
     LabelSources,
-    PseudoLabel,
     PseudoSettings,
     best_source,
     label_pixels,
-    make_label,
+    label_sources,
     sample_virtual_camera,
 )
 from jaxcloseup.scenes import Scene
@@ -115,15 +115,16 @@ def audit_labels(
       share of all pixels.
     """
     sample = jax.jit(sample_virtual_camera)
-    label_image = jax.jit(_label_twice)
     of_curve: list[tuple[np.ndarray, ...]] = []
     pixels_total = 0
     error = kept = kept_visible = visible_total = 0.0
     for one in progress.track(jax.random.split(key, count), "close-ups"):
         camera, index = sample(one, sources, settings)
         pixels = pixel_grid(camera.height, camera.width)
-        label = label_image(camera, pixels, render_depth(camera), index, sources, settings)
-        weight, any_color_weight = np.asarray(label.weight)
+        known = camera, pixels, render_depth(camera), index, sources
+        label = label_pixels(*known, settings)
+        weight = np.asarray(label.weight)
+        any_color_weight = np.asarray(label_pixels(*known, _any_color(settings)).weight)
         truth = scene.surface(camera)
         visible, footprint = _seen_by(
             camera, pixels, truth.depth, camera_at(scene.train.cameras, index), exact_depths[index]
@@ -201,21 +202,6 @@ def error_curve(
     return curve | {"ause": float(np.trapezoid(gap, shares) / largest) if largest else 0.0}
 
 
-def _label_twice(camera, pixels, depth, index, sources, settings):
-    """Return the label with two weights `[2, H, W]`: by the settings' mask, and with any color."""
-    variants = settings, _any_color(settings)
-
-    def label(use_mask, rgb_tolerance):
-        changed = settings.replace(use_mask=use_mask, rgb_tolerance=rgb_tolerance)
-        return label_pixels(camera, pixels, depth, index, sources, changed)
-
-    # vmap computes the unbatched parts once, above all the warps.
-    return jax.vmap(label, out_axes=PseudoLabel(None, 0, None, None))(
-        jnp.stack([one.use_mask for one in variants]),
-        jnp.stack([one.rgb_tolerance for one in variants]),
-    )
-
-
 def _any_color(settings: PseudoSettings) -> PseudoSettings:
     """Return settings that keep every label that both warps reach, whatever its colors."""
     return settings.replace(use_mask=jnp.float32(1), rgb_tolerance=jnp.float32(jnp.inf))
@@ -243,12 +229,13 @@ def audit_left_out(
       For each candidate `label_psnr` and `model_psnr` in dB over the labeled pixels, None without
       any, and `coverage`, the share of labeled pixels.
     """
-    audit = jax.jit(_left_out)
     sums = np.zeros((len(candidates), 4))
     for index in _spread(sources.views, count):
         seen = render(camera_at(sources.views.cameras, index))
+        label_by = _leave_out(index, label_depth(seen), sources)
+        truth, weight = to_float(sources.views.rgb[index]), sources.views.weight[index]
         for row, settings in enumerate(candidates):
-            sums[row] += audit(index, seen.rgb, label_depth(seen), sources, settings)
+            sums[row] += _compare(label_by(settings), seen.rgb, truth, weight)
     rows = []
     for label, model, kept, total in sums:
         of_label, of_model = (
@@ -272,12 +259,12 @@ def left_out_curve(
     that keeps that many labels trains on worse colors than the model has. Arguments are those of
     `audit_left_out`.
     """
-    label_of = jax.jit(_label_left_out)
     found: list[tuple[np.ndarray, ...]] = []
     total = 0
     for index in _spread(sources.views, count):
         seen = render(camera_at(sources.views.cameras, index))
-        label, truth, weight = label_of(index, label_depth(seen), sources, _any_color(settings))
+        label = _leave_out(index, label_depth(seen), sources)(_any_color(settings))
+        truth, weight = to_float(sources.views.rgb[index]), sources.views.weight[index]
         inside = np.asarray(label.weight * weight) > 0
         columns = (
             np.abs(label.backward - label.forward).max(axis=-1),
@@ -294,20 +281,20 @@ def _spread(views, count):
     return np.unique(np.linspace(0, len(views) - 1, count).round().astype(int))
 
 
-def _label_left_out(index, depth, sources, settings):
-    """Return a training photograph's label from the others, its true colors and its weight."""
+def _leave_out(index, depth, sources):
+    """A function of settings that labels a training photograph from the others."""
     views, depths = sources.views, sources.depths
-    camera, weight = camera_at(views.cameras, index), views.weight[index]
+    camera = camera_at(views.cameras, index)
     others = views.replace(weight=views.weight.at[index].set(0))
-    source = best_source(camera, others, depths, depth=depth)
+    source = jax.jit(best_source)(camera, others, depths, depth=depth)
     pixels = pixel_grid(camera.height, camera.width)
-    label = make_label(camera, pixels, depth, source, others, depths, settings)
-    return label, to_float(views.rgb[index]), weight
+    without = jax.jit(label_sources)(others, depths)
+    return functools.partial(label_pixels, camera, pixels, depth, source, without)
 
 
-def _left_out(index, rgb, depth, sources, settings):
+@jax.jit
+def _compare(label, rgb, truth, weight):
     """Return `[4]` sums: squared errors of labels and of the model, kept weight, all weight."""
-    label, truth, weight = _label_left_out(index, depth, sources, settings)
     kept = label.weight * weight
 
     def error(image):

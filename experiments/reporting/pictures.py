@@ -105,7 +105,6 @@ def label_pictures(
     Returns:
       The pictures, for the report.
     """
-    label_image = jax.jit(label_pixels)
     sample = jax.jit(sample_virtual_camera)
     sizes = scene.sizes("train")
     shots: list[tuple[str, Camera, jax.Array, Any, Any, tuple[int, int]]] = []
@@ -125,7 +124,7 @@ def label_pictures(
     pictures = []
     for name, camera, depth, index, truth, (width, height) in shots:
         pixels = pixel_grid(camera.height, camera.width)
-        label = label_image(camera, pixels, depth, index, sources, settings)
+        label = label_pixels(camera, pixels, depth, index, sources, settings)
         kept = np.where(label.weight[..., None] > 0, label.rgb, 0)
         panels = {"backward warp": label.backward, "forward warp": label.forward, "kept": kept}
         panels["mask"] = np.repeat(np.asarray(label.weight)[..., None], 3, axis=-1)
