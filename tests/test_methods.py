@@ -88,8 +88,13 @@ def test_refinement_and_exports_keep_the_shapes_that_the_filter_made(capture_fol
     depth = jnp.full((plane.HEIGHT, plane.WIDTH), 4.0)
     gray = Rendering(jnp.full((*depth.shape, 3), 0.5), depth, jnp.ones_like(depth))
     pyramid, _ = scene_pyramid(scene)
+
+    def render(shown, shown_buffers, camera):
+        assert shown.means.shape == (600, 3) and shown_buffers.alive.sum() == 100
+        return gray
+
     finer, kept = METHODS["mip_gaussians"].refine(
-        jax.random.key(1), config, params, buffers, lambda camera: gray, scene, pyramid
+        jax.random.key(1), config, params, buffers, render, scene, pyramid
     )
     added = SMOOTHING_VARIANCE * np.asarray(buffers.interval)[:, None] ** 2
     variances = (np.exp(2 * np.asarray(one.log_scales, float)) for one in (params, finer))

@@ -181,8 +181,9 @@ class Method(NamedTuple):
         are seen from `position[3]`; None: they draw the scene's points.
       background: `(config) -> float`, gray level in [0, 1] behind the scene.
       refine: `(key, config, params, buffers, render, scene, pyramid) -> (params, buffers)` gives
-        what `CoarseConfig` trained the room and the detail of `config`; `render` renders a camera,
-        `pyramid` holds the scene's training photographs. None for methods without `coarse`.
+        what `CoarseConfig` trained the room and the detail of `config`; `render(params, buffers,
+        camera)` renders a state with this room, `pyramid` holds the scene's training photographs.
+        None for methods without `coarse`.
     """
 
     presets: Mapping[str, Preset]

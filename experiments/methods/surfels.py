@@ -40,7 +40,7 @@ from jaxcloseup.splats.filters import sampling_intervals, smoothed
 from jaxcloseup.splats.mcmc import McmcConfig
 from jaxcloseup.splats.rasterize import RasterizeConfig
 from jaxcloseup.splats.refinement import join_surfels, surfels_where_wrong
-from jaxcloseup.splats.surfels import Surfels
+from jaxcloseup.splats.surfels import Surfels, pad_rows
 from jaxcloseup.train import TrainConfig
 
 
@@ -227,7 +227,7 @@ def refine(
     config: SplatTraining,
     surfels: Surfels,
     buffers: SurfelBuffers,
-    render: Callable[[Camera], Rendering],
+    render: Callable[[Surfels, SurfelBuffers, Camera], Rendering],
     scene: Scene,
     pyramid: Pyramid,
 ) -> tuple[Surfels, SurfelBuffers]:
@@ -238,10 +238,14 @@ def refine(
     each = min(max(0, free) // views, math.prod(pyramid.sizes[level]))
     kind = {"sh_degree": config.sh_degree, "num_scales": config.num_scales}
     sample = jax.jit(functools.partial(surfels_where_wrong, count=each, **kind))
+    # With all rows, so that what is compiled here is what renders the field later.
+    shown = jax.tree.map(
+        lambda leaf: pad_rows(leaf, config.capacity) if leaf.ndim else leaf, (surfels, buffers)
+    )
 
     def search(view):
         camera = pyramid.camera(camera_at(cameras, view), view, level)
-        photograph, seen = to_float(pyramid.image(view, level)), render(camera)
+        photograph, seen = to_float(pyramid.image(view, level)), render(*shown, camera)
         data = photograph[..., :3], photograph[..., 3], seen.rgb, label_depth(seen)
         return sample(jax.random.fold_in(key, view), camera, *data)
 

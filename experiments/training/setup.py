@@ -115,7 +115,10 @@ class Training:
         views, steps = coarse.programs.photographs, preset.coarse.steps
         state = coarse.train(f"coarse_{stage}", "photographs", start, views, steps=steps)
         pyramid, _ = programs.pyramid(preset.windows.finest)
-        render = functools.partial(coarse.programs.render, state)
+
+        def render(params, buffers, camera):
+            return programs.render(state.replace(params=params, buffers=buffers), camera)
+
         key_fine, key_refine = jax.random.split(jax.random.fold_in(state.key, state.step))
         with timed(self.seconds, f"refine_{stage}"):
             params, buffers = programs.method.refine(
