@@ -118,6 +118,7 @@ def detail_table(detail: Mapping[str, Any]) -> str:
         "show beyond them. How much of it is added at a pixel is predicted from how well the "
         "photographs agree, how sharply and from which angles they see the surface. The table "
         "compares the prediction with left-out photographs: of the detail that the other "
-        "photographs show, the share that is predicted and that is really there.</p>"
+        "photographs show, the share that is predicted and that is really there. Below 0 it points "
+        "away from the truth, and nothing is added.</p>"
         f"{table(header, body)}"
     )
