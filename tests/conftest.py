@@ -12,8 +12,11 @@ from tiny_runs import keep_run, write_plane
 
 
 # Arms of sweeps are spread over all devices. Tests compile more than they compute, so LLVM takes
-# its quicker passes. Read when the first array is made.
-QUICKLY = "--xla_backend_optimization_level=1"
+# its quicker passes, each program is one piece to it, and JAX 0.10 uses XLA's older, smaller code
+# of fused loops, which 0.11 no longer has. Read when the first array is made.
+QUICKLY = "--xla_backend_optimization_level=1 --xla_cpu_parallel_codegen_split_count=1"
+if jax.__version_info__ < (0, 11):
+    QUICKLY += " --xla_cpu_use_fusion_emitters=false"
 DEVICES = "--xla_force_host_platform_device_count=8"
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICKLY} {DEVICES}".strip()
 jax.config.update("jax_numpy_rank_promotion", "raise")
