@@ -1,7 +1,7 @@
 """The compositor in `jax.lax`, for every platform.
 
 A step evaluates a chunk of `K` splats of each of `B` tiles at all `P` pixels of these tiles, in
-arrays `[K, B, P]`; only the products along a list are sequential. A tile whose list has ended makes
+arrays `[B, K, P]`; only the products along a list are sequential. A tile whose list has ended makes
 way for the next one, longest lists first, so that nothing waits. The derivative walks the lists
 back to front, so memory is linear in pixels and pairs, and all sums have one fixed order.
 """
@@ -77,10 +77,10 @@ def _advance(queue, done):
 
 
 class _Chunk(NamedTuple):
-    """Splats `[K, B]` at the places of a chunk in their tiles' lists.
+    """Splats `[B, K]` at the places of a chunk in their tiles' lists.
 
     Attributes:
-      rows: `[K, B, C]` of the table.
+      rows: `[B, K, C]` of the table.
       index: which splats they are.
       place: in the lists.
       inside: bool; False past a list's end.
@@ -94,10 +94,10 @@ class _Chunk(NamedTuple):
     origins: jax.Array
 
     def column(self, i: int) -> jax.Array:
-        """A column `[K, B, 1]`; anchors are local to the tiles, and opacity ends with the lists."""
+        """A column `[B, K, 1]`; anchors are local to the tiles, and opacity ends with the lists."""
         value = self.rows[:, :, i]
         if i in (ANCHOR, ANCHOR + 1):
-            value = value - self.origins[None, :, i - ANCHOR].astype(value.dtype)
+            value = value - self.origins[:, None, i - ANCHOR].astype(value.dtype)
         elif i == OPACITY:
             value = jnp.where(self.inside, value, 0)
         return value[..., None]
@@ -106,10 +106,10 @@ class _Chunk(NamedTuple):
 def _chunk(table, splats, tiles, position, size):
     """The chunk of `size` splats at `position[B]` of each tile's list."""
     starts, counts, origins = tiles
-    place = position[None] + jnp.arange(size, dtype=jnp.int32)[:, None]
-    inside = place < counts[None]
+    place = position[:, None] + jnp.arange(size, dtype=jnp.int32)[None]
+    inside = place < counts[:, None]
     # Past a list's end, take the splat at its start.
-    index = splats[starts[None] + jnp.where(inside, place, 0)]
+    index = splats[starts[:, None] + jnp.where(inside, place, 0)]
     return _Chunk(table[index], index, place, inside, origins)
 
 
@@ -119,27 +119,46 @@ def _pixels(tile: int, dtype) -> tuple[jax.Array, jax.Array]:
     return jnp.tile(centers, tile), jnp.repeat(centers, tile)
 
 
-def _running_products(before, alpha):
-    """Transmittances `[K, B, P]` behind each splat, from those in front of the chunk.
+def _along(step, first, splats, *, reverse=False):
+    """The states between the splats of a chunk, one after the other.
 
-    They keep falling once a pixel is finished, so the pixel stays finished.
+    Args:
+      step: the next state from the one before and from a splat; all are tuples of `[B, P]`.
+      first: the state in front of the first splat, or with `reverse` behind the last one.
+      splats: tuple of arrays `[B, K, P]`.
+      reverse: whether to go from the last splat to the first.
+
+    Returns:
+      The state after all splats, and arrays `[B, K + 1, P]` of the states in front of each splat
+      and behind the last one.
     """
+    count = splats[0].shape[1]
 
-    def attenuate(product, splat):
-        product = product - splat * product
-        return product, product
+    def go(i, carry):
+        k = count - 1 - i if reverse else i
+        state, states = carry
+        splat = (lax.dynamic_index_in_dim(each, k, 1, keepdims=False) for each in splats)
+        state = step(state, tuple(splat))
+        return state, _put(states, state, k if reverse else k + 1)
 
-    return lax.scan(attenuate, before, alpha)[1]
+    shape = splats[0].shape[0], count + 1, splats[0].shape[2]
+    states = tuple(jnp.zeros(shape, part.dtype) for part in first)
+    return lax.fori_loop(0, count, go, (first, _put(states, first, count if reverse else 0)))
 
 
-def _pass_chunk(walk, seen, before, afters, place):
+def _put(states, state, k):
+    pairs = zip(states, state, strict=True)
+    return tuple(lax.dynamic_update_index_in_dim(parts, part, k, 1) for parts, part in pairs)
+
+
+def _pass_chunk(walk, seen, products, place):
     """Weights `[B, P]` of each of a chunk's splats, and the walk behind them."""
     weights = []
-    for k, after in enumerate(afters):
-        splat = seen.alpha[k], seen.inverse_depth[k], seen.z[k]
-        weight, walk = pass_splat(walk, *splat, before, after, place[k])
+    for k in range(place.shape[1]):
+        splat = seen.alpha[:, k], seen.inverse_depth[:, k], seen.z[:, k]
+        around = products[:, k], products[:, k + 1]
+        weight, walk = pass_splat(walk, *splat, *around, place[:, k])
         weights.append(weight)
-        before = after
     return weights, walk
 
 
@@ -161,6 +180,10 @@ def forward(config, table: jax.Array, lists: TileLists) -> tuple[jax.Array, jax.
     zeros = jnp.zeros_like(ones)
     fresh = Walk(ones, jnp.zeros(ones.shape, jnp.int32), zeros, zeros)
 
+    def attenuate(product, alpha):
+        # It keeps falling once a pixel is finished, so the pixel stays finished.
+        return (product[0] - alpha[0] * product[0],)
+
     def step(state):
         queue, product, walk, sums, ended = state
         here = tuple(leaf[queue.tile] for leaf in of_tile)
@@ -171,13 +194,12 @@ def forward(config, table: jax.Array, lists: TileLists) -> tuple[jax.Array, jax.
         before = jnp.where(begins, 1, product)
         walk = jax.tree.map(lambda new, old: jnp.where(begins, new, old), fresh, walk)
         sums = tuple(jnp.where(begins, 0, total) for total in sums)
-        afters = _running_products(before, seen.alpha)
-        product = afters[-1]
-        weights, walk = _pass_chunk(walk, seen, before, afters, splats.place[..., None])
+        (product,), (products,) = _along(attenuate, (before,), (seen.alpha,))
+        weights, walk = _pass_chunk(walk, seen, products, splats.place[..., None])
         weights = lax.optimization_barrier(weights)
-        found = channels(splats.column, features, seen, walk.reference[None])
+        found = channels(splats.column, features, seen, walk.reference[:, None])
         sums = tuple(
-            total + sum(weights[k] * channel[k] for k in range(config.chunk))
+            total + sum(weights[k] * channel[:, k] for k in range(config.chunk))
             for total, channel in zip(sums, found, strict=True)
         )
         finished = jnp.max(product, axis=-1) < TRANSMITTANCE_MIN
@@ -215,15 +237,14 @@ def backward(
     basis = jnp.stack([jnp.ones_like(pixels[0]), *(at - middle for at in pixels)], axis=1)
 
     def moments(values):
-        sums = jnp.einsum("kbp,pm->kbm", values, basis, precision=_EXACT)
+        sums = jnp.einsum("bkp,pm->bkm", values, basis, precision=_EXACT)
         return jnp.moveaxis(sums, -1, 0)
 
-    def recede(carry, splat):
-        behind, after = carry
+    def recede(state, splat):
+        behind, after = state
         alpha, passing, value = splat
         before = after * passing
-        behind = behind + alpha * before * value
-        return (behind, before), (behind, before)
+        return behind + alpha * before * value, before
 
     of_tile = _with_none(lists)
     sums_bar, median_bar = cotangents
@@ -244,7 +265,7 @@ def backward(
         splats = _chunk(table, lists.splats, here, position, chunk)
         found = of_pixel[queue.tile]
         *each_bar, median_bar, remaining, stop, reference = (
-            found[None, :, i] for i in range(found.shape[1])
+            found[:, i, None] for i in range(found.shape[1])
         )
         trace = Trace(remaining, stop.astype(jnp.int32), reference)
         bars = (each_bar[-4], each_bar[-2], each_bar[-1], median_bar)
@@ -252,16 +273,13 @@ def backward(
         alpha = jnp.where(splats.place[..., None] < trace.stop, seen.alpha, 0)
         value = worth(splats.column, seen, reference, each_bar)
         begins = (queue.step == 0)[:, None]
-        ends = (jnp.where(begins, 0, behind), jnp.where(begins, remaining[0], after))
-        (behind, after), (behinds, before) = lax.scan(
-            recede, ends, (alpha, 1 / (1 - alpha), value), reverse=True
-        )
-        # Shift by one: the state behind a splat is the state in front of the next one.
-        behinds = jnp.concatenate([behinds[1:], ends[0][None]])
-        afters = jnp.concatenate([before[1:], ends[1][None]])
-        weight, pulled = pull_back(seen, alpha, before, afters, behinds, value, trace, bars)
+        ends = (jnp.where(begins, 0, behind), jnp.where(begins, remaining[:, 0], after))
+        of_splats = alpha, 1 / (1 - alpha), value
+        (behind, after), (worths, products) = _along(recede, ends, of_splats, reverse=True)
+        around = products[:, :-1], products[:, 1:], worths[:, 1:]
+        weight, pulled = pull_back(seen, alpha, *around, value, trace, bars)
         payload = jnp.einsum(
-            "kbp,bfp->kbf", weight, found[:, : len(each_bar) - 4], precision=_EXACT
+            "bkp,bfp->bkf", weight, found[:, : len(each_bar) - 4], precision=_EXACT
         )
         sums = pulled._replace(
             **{name: moments(getattr(pulled, name)) for name in ("u", "v", "w", "low_pass")},

@@ -22,7 +22,7 @@ from jaxcloseup.splats.tiling import tile_lists
 
 
 COMPOSITORS = ("auto", "loops", "kernel")
-_SMALL = 2**14  # pixels of an image that is best cut into small tiles
+_SMALL = 2**15  # pixels of an image that is best cut into small tiles
 
 
 @dataclasses.dataclass(frozen=True)
