@@ -26,7 +26,7 @@ from jaxcloseup.numerics import matmul
 # residual where everything else is sure.
 CONTRAST = 2.5
 TENTHS = 10
-FOLDS = 3  # and as many networks, each taught without one fold of the photographs
+FOLDS = 5  # and as many networks, each taught without one fold of the photographs
 WIDTHS = 32, 32, 2  # units of each layer after the features
 KNOTS = 32  # of the monotone curve, each with an equal share of the evidence
 PIXELS = 600_000  # that teach the networks
