@@ -331,36 +331,30 @@ def _update(state, loss, data, field, optimizer, config, spread, lr_scale=None):
 
     take = spread if config.num_windows > 1 else lambda give, *arguments: give(*arguments)
     (value, metrics), gradients = take(gradient, keys, state.params, state.buffers, *data)
-    updates, opt_state = optimizer.update(gradients, state.opt_state, state.params)
-    moved = _move(state, updates, opt_state, lr_scale)
-    after, skipped = _unless_broken(state, field.adapt(key_adapt, moved), value, gradients)
+    if lr_scale is None:
+        lr_scale = jnp.ones(())
+    arguments = state, key_adapt, value, gradients, lr_scale
+    after, skipped = _advance(*arguments, update=optimizer.update, adapt=field.adapt)
     return after, {"loss": value, "skipped": skipped} | metrics
 
 
-@jax.jit
-def _move(state, updates, opt_state, lr_scale):
-    if lr_scale is not None:
-        updates = jax.tree.map(lambda leaf: lr_scale.astype(leaf.dtype) * leaf, updates)
-    params = optax.apply_updates(state.params, updates)
-    return state.replace(step=state.step + 1, params=params, opt_state=opt_state)
+@functools.partial(jax.jit, static_argnames=("update", "adapt"))
+def _advance(state, key, value, gradients, lr_scale, *, update, adapt):
+    """The state after a step, and whether it was skipped, 0 or 1.
 
-
-@jax.jit
-def _unless_broken(state, after, value, gradients):
-    """The state after a step, but for a step whose loss or gradient is not finite.
-
-    One bad step must not spoil the run: it is skipped, whole, and counted.
+    A step whose loss or gradient is not finite must not spoil the run: it is skipped, whole, and
+    counted.
     """
     finite = jnp.isfinite(value)
     for leaf in jax.tree.leaves(gradients):
         finite &= jnp.all(jnp.isfinite(leaf))
 
-    def kept(new, old):
-        return jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, old)
+    def take():
+        updates, opt_state = update(gradients, state.opt_state, state.params)
+        updates = jax.tree.map(lambda leaf: lr_scale.astype(leaf.dtype) * leaf, updates)
+        params = optax.apply_updates(state.params, updates)
+        after = state.replace(step=state.step + 1, params=params, opt_state=opt_state)
+        return adapt(key, after)
 
-    after = after.replace(
-        params=kept(after.params, state.params),
-        buffers=kept(after.buffers, state.buffers),
-        opt_state=kept(after.opt_state, state.opt_state),
-    )
+    after = jax.lax.cond(finite, take, lambda: state.replace(step=state.step + 1))
     return after, 1 - finite.astype(jnp.float32)

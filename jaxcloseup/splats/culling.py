@@ -18,13 +18,12 @@ from jax.custom_derivatives import (
 )
 
 from jaxcloseup.geometry.cameras import Camera
-from jaxcloseup.geometry.rotations import quaternion_to_matrix
+from jaxcloseup.geometry.rotations import quaternion_rows
 from jaxcloseup.geometry.visibility import sphere_in_view
-from jaxcloseup.numerics import matmul, safe_norm
 from jaxcloseup.splats.ellipsoids import bounded_slopes
 from jaxcloseup.splats.filters import DILATION, LOW_PASS, PIXEL_VARIANCE
 from jaxcloseup.splats.kernel import ALPHA_MIN
-from jaxcloseup.splats.projection import MAX_LOG_SCALE
+from jaxcloseup.splats.projection import MAX_LOG_SCALE, dot, offsets, surfel_columns
 from jaxcloseup.splats.surfels import Surfels
 
 
@@ -50,17 +49,19 @@ def may_show(
       antialias: whether discs are convolved with the pixel.
     """
     surfels, opacity, camera = lax.stop_gradient((surfels, opacity, camera))
-    offset = surfels.means - camera.position[None]
-    center = matmul(offset, camera.rotation)
-    scale = jnp.exp(jnp.clip(jnp.max(surfels.log_scales, axis=-1), -MAX_LOG_SCALE, MAX_LOG_SCALE))
+    # Components, see `Vector`: products and sums of three columns take a CPU several times as long.
+    columns = surfel_columns(surfels)
+    offset = offsets(columns, camera)
+    center = jnp.stack([dot(axis, offset) for axis in camera.rotation.T], axis=-1)
+    log_scale = functools.reduce(jnp.maximum, columns.log_scales)
+    scale = jnp.exp(jnp.clip(log_scale, -MAX_LOG_SCALE, MAX_LOG_SCALE))
     cutoff = jnp.sqrt(2 * jnp.log(jnp.maximum(opacity / ALPHA_MIN, 1)))
     if surfels.log_scales.shape[1] == 3:
         seen = _ellipses_in_view(camera, center, cutoff, scale, near)
         return seen & (opacity >= ALPHA_MIN)
     if antialias:
-        normal = quaternion_to_matrix(surfels.quaternions)[..., 2]
-        distance = safe_norm(offset)
-        facing = jnp.abs(jnp.sum(offset * normal, axis=-1))
+        normal = tuple(zip(*quaternion_rows(*columns.quaternions), strict=True))[2]
+        distance, facing = jnp.sqrt(dot(offset, offset)), jnp.abs(dot(offset, normal))
         # A plane seen from its edge has no bound: it is kept.
         displaced = (1 + distance / jnp.maximum(facing, 1e-30)) * jnp.abs(center[:, 2])
         per_pixel = jnp.sqrt(jnp.sum(camera.intrinsics[:2] ** -2.0))

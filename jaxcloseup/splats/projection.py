@@ -77,10 +77,10 @@ def to_camera(surfels: Surfels, camera: Camera) -> tuple[Discs, Vector]:
     """
     tangent_u, tangent_v, normal = zip(*quaternion_rows(*surfels.quaternions), strict=True)
     offset = offsets(surfels, camera)
-    away = _dot(offset, normal) > 0
+    away = dot(offset, normal) > 0
 
     def turn(vector):
-        return tuple(_dot(axis, vector) for axis in camera.rotation.T)
+        return tuple(dot(axis, vector) for axis in camera.rotation.T)
 
     discs = Discs(
         *map(turn, (offset, tangent_u, tangent_v, normal)),
@@ -148,8 +148,8 @@ def project_discs(
         for at, other in zip(center, elsewhere, strict=True)
     ]
 
-    facing = _dot(discs.normal, mu)
-    edge_on = jnp.abs(facing) <= EDGE_ON * jnp.sqrt(lax.stop_gradient(_dot(mu, mu)))
+    facing = dot(discs.normal, mu)
+    edge_on = jnp.abs(facing) <= EDGE_ON * jnp.sqrt(lax.stop_gradient(dot(mu, mu)))
     per_facing = 1 / jnp.where(edge_on, 1, facing)
     covectors = (
         _scale(per_facing / discs.scales[0], _cross(discs.tangent_v, mu)),
@@ -195,7 +195,8 @@ def project_discs(
     )
 
 
-def _dot(a, b):
+def dot(a: Vector, b: Vector) -> jax.Array:
+    """Inner products `[N]`."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
