@@ -1,8 +1,8 @@
 """Training steps, pure, for any field: on photographs alone, and with pseudo-labels beside them.
 
 `field`, `optimizer` and `config` are static: bind them with `functools.partial` before `jax.jit`.
-Without it, a step whose field and optimizer are compiled themselves, as those of surfels are, runs
-a few compiled parts, and all kinds of steps share them.
+Without it, a step whose field compiles its rendering itself, as that of surfels does, runs a few
+compiled parts, and all kinds of steps share them.
 """
 
 import dataclasses

@@ -19,11 +19,12 @@ from jax.custom_derivatives import (
 
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.geometry.rotations import quaternion_rows
+from jaxcloseup.geometry.vectors import dot
 from jaxcloseup.geometry.visibility import sphere_in_view
 from jaxcloseup.splats.ellipsoids import bounded_slopes
 from jaxcloseup.splats.filters import DILATION, LOW_PASS, PIXEL_VARIANCE
 from jaxcloseup.splats.kernel import ALPHA_MIN
-from jaxcloseup.splats.projection import MAX_LOG_SCALE, dot, offsets, surfel_columns
+from jaxcloseup.splats.projection import MAX_LOG_SCALE, offsets, surfel_columns
 from jaxcloseup.splats.surfels import Surfels
 
 
@@ -49,7 +50,6 @@ def may_show(
       antialias: whether discs are convolved with the pixel.
     """
     surfels, opacity, camera = lax.stop_gradient((surfels, opacity, camera))
-    # Components, see `Vector`: products and sums of three columns take a CPU several times as long.
     columns = surfel_columns(surfels)
     offset = offsets(columns, camera)
     center = jnp.stack([dot(axis, offset) for axis in camera.rotation.T], axis=-1)
@@ -60,7 +60,7 @@ def may_show(
         seen = _ellipses_in_view(camera, center, cutoff, scale, near)
         return seen & (opacity >= ALPHA_MIN)
     if antialias:
-        normal = tuple(zip(*quaternion_rows(*columns.quaternions), strict=True))[2]
+        normal = [row[2] for row in quaternion_rows(*columns.quaternions)]
         distance, facing = jnp.sqrt(dot(offset, offset)), jnp.abs(dot(offset, normal))
         # A plane seen from its edge has no bound: it is kept.
         displaced = (1 + distance / jnp.maximum(facing, 1e-30)) * jnp.abs(center[:, 2])

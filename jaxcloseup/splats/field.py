@@ -196,8 +196,7 @@ def surfel_optimizer(config: SplatConfig, *, extent: float) -> optax.GradientTra
     """
     moments = scale_by_selective_adam if config.selective_adam else optax.scale_by_adam
     adam = optax.chain(moments(eps=1e-15), _scale_by_learning_rates(config, extent))
-    optimizer = _density_control(config, extent).wrap_optimizer(adam)
-    return optimizer._replace(update=jax.jit(optimizer.update))
+    return _density_control(config, extent).wrap_optimizer(adam)
 
 
 def means_lr_at(config: SplatConfig, step: jax.Array) -> jax.Array:

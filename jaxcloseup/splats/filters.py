@@ -13,6 +13,7 @@ from jax import lax
 
 from jaxcloseup.geometry.cameras import Camera, mean_focal, points_to_pixels
 from jaxcloseup.geometry.masks import in_bounds
+from jaxcloseup.geometry.vectors import cross, dot, scaled
 from jaxcloseup.splats.surfels import Surfels
 
 
@@ -46,11 +47,11 @@ def pixel_spread(homography, depth, known):
 def widen(homography, vectors, spread):
     """Homography and vectors of discs whose covariance of (u, v) is L L^T."""
     first, below, second = spread
-    u = _scale(1 / first, homography[0])
+    u = scaled(1 / first, homography[0])
     v = tuple((b - below * a) / second for a, b in zip(u, homography[1], strict=True))
     one, other = vectors
     one = tuple(first * a + below * b for a, b in zip(one, other, strict=True))
-    return (u, v, homography[2]), (one, _scale(second, other))
+    return (u, v, homography[2]), (one, scaled(second, other))
 
 
 def widen_ellipse(x, y, *, antialias: bool):
@@ -66,14 +67,14 @@ def widen_ellipse(x, y, *, antialias: bool):
       Cholesky factor (l11, l21, l22) of the covariance, and the factor on the opacity.
     """
     variance = MIP_VARIANCE if antialias else DILATION
-    first = jnp.sqrt(_dot(x, x) + variance)
+    first = jnp.sqrt(dot(x, x) + variance)
     # Divided by l11 already, so that no product of four large numbers is taken.
-    x, per_first = _scale(1 / first, x), variance / (first * first)
-    below = _dot(x, y)
-    cross = x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]
-    area = _dot(cross, cross)  # squared, of the ellipse without filter, by l11
+    x, per_first = scaled(1 / first, x), variance / (first * first)
+    below = dot(x, y)
+    across = cross(x, y)
+    area = dot(across, across)  # squared, of the ellipse without filter, by l11
     # y.y + variance - below^2, without taking large numbers from each other.
-    second = jnp.sqrt(variance + area + per_first * _dot(y, y))
+    second = jnp.sqrt(variance + area + per_first * dot(y, y))
     if not antialias:
         return (first, below, second), 1.0
     flat = area == 0
@@ -125,11 +126,3 @@ def smoothed(surfels: Surfels, interval: jax.Array | None) -> Surfels:
     return surfels.replace(
         log_scales=log_scales, opacity_logits=jnp.log(opacity) - jnp.log1p(-opacity)
     )
-
-
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _scale(factor, vector):
-    return tuple(factor * component for component in vector)

@@ -17,6 +17,7 @@ from jax import lax
 
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.geometry.rotations import quaternion_rows
+from jaxcloseup.geometry.vectors import Vector, cross, dot, scaled
 from jaxcloseup.splats.filters import LOW_PASS, pixel_spread, widen
 from jaxcloseup.splats.kernel import ALPHA_MIN
 from jaxcloseup.splats.rasterize import Footprints
@@ -25,11 +26,6 @@ from jaxcloseup.splats.surfels import Surfels
 
 EDGE_ON = 1e-4  # |cos| between normal and line of sight below which a disc is not drawn
 MAX_LOG_SCALE = 30.0  # beyond it, products of scales leave the range of float32
-
-
-# Components x, y, z `[N]` of N vectors. On a CPU, loops over many splats are several times faster
-# in arrays of single components than in arrays of short vectors.
-Vector = tuple[jax.Array, jax.Array, jax.Array]
 
 
 class Discs(NamedTuple):
@@ -152,9 +148,9 @@ def project_discs(
     edge_on = jnp.abs(facing) <= EDGE_ON * jnp.sqrt(lax.stop_gradient(dot(mu, mu)))
     per_facing = 1 / jnp.where(edge_on, 1, facing)
     covectors = (
-        _scale(per_facing / discs.scales[0], _cross(discs.tangent_v, mu)),
-        _scale(per_facing / discs.scales[1], _cross(mu, discs.tangent_u)),
-        _scale(per_facing, discs.normal),
+        scaled(per_facing / discs.scales[0], cross(discs.tangent_v, mu)),
+        scaled(per_facing / discs.scales[1], cross(mu, discs.tangent_u)),
+        scaled(per_facing, discs.normal),
     )
     ray = [(anchor[i] - principal[i]) / focal[i] for i in range(2)]
     homography = [
@@ -165,7 +161,7 @@ def project_discs(
         )
         for (x, y, z), at_center in zip(covectors, (0, 0, inverse_depth), strict=True)
     ]
-    vectors = _scale(discs.scales[0], discs.tangent_u), _scale(discs.scales[1], discs.tangent_v)
+    vectors = scaled(discs.scales[0], discs.tangent_u), scaled(discs.scales[1], discs.tangent_v)
     if antialias:
         spread = pixel_spread(homography, depth, centered & ~edge_on)
         homography, vectors = widen(homography, vectors, spread)
@@ -195,23 +191,6 @@ def project_discs(
     )
 
 
-def dot(a: Vector, b: Vector) -> jax.Array:
-    """Inner products `[N]`."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _cross(a, b):
-    return (
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    )
-
-
-def _scale(factor, vector):
-    return tuple(factor * component for component in vector)
-
-
 def _disc_box(center, vectors, cutoff, camera, near):
     """Exact bounds x0, y0, x1, y1 `[N]` in pixels of discs of radius `cutoff[N]` cut at z = near.
 
@@ -229,7 +208,7 @@ def _disc_box(center, vectors, cutoff, camera, near):
     for axis in range(2):
         a = circle[axis]
         # The derivative of (a.p) / (depth.p) vanishes, where p = (cos t, sin t, 1).
-        cos, sin, constant = _cross(a, depth)
+        cos, sin, constant = cross(a, depth)
         rim, has_rim = _meet_circle(cos, sin, -constant)
         candidates = [(point, near, has_chord) for point in chord]
         for point in rim:
