@@ -19,13 +19,13 @@ from jax.custom_derivatives import (
 
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.geometry.rotations import quaternion_rows
-from jaxcloseup.geometry.vectors import dot
 from jaxcloseup.geometry.visibility import sphere_in_view
 from jaxcloseup.splats.ellipsoids import bounded_slopes
 from jaxcloseup.splats.filters import DILATION, LOW_PASS, PIXEL_VARIANCE
 from jaxcloseup.splats.kernel import ALPHA_MIN
 from jaxcloseup.splats.projection import MAX_LOG_SCALE, offsets, surfel_columns
 from jaxcloseup.splats.surfels import Surfels
+from jaxcloseup.splats.vectors import dot
 
 
 _MANY = 2**14  # items of which the shown ones are worth picking

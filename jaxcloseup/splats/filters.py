@@ -13,8 +13,8 @@ from jax import lax
 
 from jaxcloseup.geometry.cameras import Camera, mean_focal, points_to_pixels
 from jaxcloseup.geometry.masks import in_bounds
-from jaxcloseup.geometry.vectors import cross, dot, scaled
 from jaxcloseup.splats.surfels import Surfels
+from jaxcloseup.splats.vectors import cross, dot, scaled
 
 
 LOW_PASS = 2.0  # 1/px^2: no disc is drawn smaller than a Gaussian of sigma = sqrt(1/2) pixel

@@ -17,11 +17,11 @@ from jax import lax
 
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.geometry.rotations import quaternion_rows
-from jaxcloseup.geometry.vectors import Vector, cross, dot, scaled
 from jaxcloseup.splats.filters import LOW_PASS, pixel_spread, widen
 from jaxcloseup.splats.kernel import ALPHA_MIN
 from jaxcloseup.splats.rasterize import Footprints
 from jaxcloseup.splats.surfels import Surfels
+from jaxcloseup.splats.vectors import Vector, cross, dot, scaled
 
 
 EDGE_ON = 1e-4  # |cos| between normal and line of sight below which a disc is not drawn
