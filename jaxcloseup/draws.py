@@ -60,7 +60,9 @@ def sample_batch(key: jax.Array, views: Views | Windows, count: int | None) -> B
 
 
 @functools.partial(jax.jit, static_argnums=2)
-def sample_labels(key: jax.Array, labels: Views, count: int | None) -> tuple[Batch, jax.Array]:
+def sample_labels(
+    key: jax.Array, labels: Views | Windows, count: int | None
+) -> tuple[Batch, jax.Array]:
     """`count` pixels of labeled views, or a whole one, and a key that renders them."""
     key_batch, key_render = jax.random.split(key)
     return sample_batch(key_batch, labels, count), key_render

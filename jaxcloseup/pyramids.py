@@ -90,7 +90,9 @@ def scene_pyramid(scene: Scene, *, finest: int = 1, budget: int = BUDGET) -> tup
     return photograph_pyramid(finer, train), factor
 
 
-def photograph_pyramid(views: Views, coarsest: Views | None = None) -> Pyramid:
+def photograph_pyramid(
+    views: Views, coarsest: Views | None = None, *, least: tuple[int, int] | None = None
+) -> Pyramid:
     """Photographs, halves of them, and the same photographs as training reads them.
 
     The values are `[V, P, 4]` uint8, colors and weight. A half averages 2 x 2 pixels by their
@@ -99,13 +101,15 @@ def photograph_pyramid(views: Views, coarsest: Views | None = None) -> Pyramid:
 
     Args:
       views: photographs at the finest size.
-      coarsest: the last level, after halves that are at least 1.5 times as wide; None makes only
-        one level.
+      coarsest: the last level, after halves that are at least 1.5 times as wide.
+      least: without `coarsest`, smallest height and width of a half; None makes only one level.
     """
     sizes = [views.rgb.shape[1:3]]
     if coarsest is not None:
-        while sizes[-1][1] // 2 >= 1.5 * coarsest.cameras.width:
-            sizes.append((sizes[-1][0] // 2, sizes[-1][1] // 2))
+        least = 1, 1.5 * coarsest.cameras.width
+    while least is not None and all(np.floor_divide(sizes[-1], 2) >= least):
+        sizes.append((sizes[-1][0] // 2, sizes[-1][1] // 2))
+    if coarsest is not None:
         sizes.append(coarsest.rgb.shape[1:3])
     images, weight = _bytes(views), np.asarray(views.weight)
     values = np.empty((len(images), sum(h * w for h, w in sizes), 4), np.uint8)

@@ -220,7 +220,7 @@ def closeup_step(
 def labeled_step(
     state: TrainState,
     views: Views | Windows,
-    labels: Views,
+    labels: Views | Windows,
     settings: PseudoSettings,
     *,
     field: RadianceField,
@@ -236,7 +236,7 @@ def labeled_step(
     Args:
       state: what is trained.
       views: training photographs.
-      labels: from `label_views`.
+      labels: from `label_views`, or windows of such views.
       settings: `label_loss_weight` and `lr_scale` count.
       field: static.
       optimizer: static.

@@ -10,7 +10,7 @@ from flax import struct
 from jaxcloseup.geometry.cameras import Camera, pixels_to_points
 from jaxcloseup.geometry.visibility import sample_where_visible
 from jaxcloseup.photographs import Batch, Views, camera_at, to_float
-from jaxcloseup.pyramids import Pyramid
+from jaxcloseup.pyramids import Pyramid, photograph_pyramid
 
 
 @struct.dataclass
@@ -18,7 +18,8 @@ class Windows:
     """Photographs of one capture at L sizes, V views.
 
     Attributes:
-      cameras: stacked cameras of the coarsest level, whose size all windows have.
+      cameras: stacked cameras, with the size of all windows; of photographs, of their coarsest
+        level.
       pyramid: `[V, P, 4]` colors and weights of the photographs.
       shares: `[L]` probability of each level, finest first.
       places: `[K, 3]` centers of windows, of which each is drawn alike: a view, and x and y as
@@ -46,6 +47,14 @@ def photograph_windows(cameras: Camera, pyramid: Pyramid, *, whole_share: float)
     finer = len(pyramid.sizes) - 1
     shares = [(1 - whole_share) / finer] * finer + [whole_share] if finer else [1.0]
     return Windows(cameras, pyramid, jnp.array(shares, jnp.float32))
+
+
+def view_windows(views: Views, height: int, width: int) -> Windows:
+    """Windows of views that are at least as large, at their own size and at halves, drawn alike."""
+    pyramid = photograph_pyramid(views, least=(height, width))
+    count = len(pyramid.sizes)
+    cameras = views.cameras.replace(height=height, width=width)
+    return Windows(cameras, pyramid, jnp.full(count, 1 / count, jnp.float32))
 
 
 def windows_that_see(
@@ -109,7 +118,8 @@ def sample_window(key: jax.Array, windows: Windows) -> Batch:
     key_view, key_level, key_y, key_x = jax.random.split(key, 4)
     level = jax.random.categorical(key_level, jnp.log(windows.shares))
     sizes = jnp.asarray(windows.pyramid.sizes, jnp.int32)
-    room = sizes[level] - sizes[-1] + 1
+    own = jnp.array([windows.cameras.height, windows.cameras.width], jnp.int32)
+    room = sizes[level] - own + 1
     if windows.places is None:
         view = jax.random.randint(key_view, (), 0, len(windows))
         corner = jnp.stack(
@@ -117,8 +127,8 @@ def sample_window(key: jax.Array, windows: Windows) -> Batch:
         )
     else:
         view, center = _draw_place(key_view, windows, ())
-        extent, own = sizes[level].astype(center.dtype), sizes[-1].astype(center.dtype)
-        corner = jnp.floor(center * extent - own / 2).astype(jnp.int32)
+        extent = sizes[level].astype(center.dtype)
+        corner = jnp.floor(center * extent - own.astype(center.dtype) / 2).astype(jnp.int32)
         corner = jnp.clip(corner, 0, room - 1)
     return cut_window(windows, view, level, corner)
 
@@ -147,7 +157,8 @@ def sample_window_pixels(key: jax.Array, windows: Windows, count: int) -> Batch:
     else:
         view, center = _draw_place(key_view, windows, (count,))
         within = jax.random.uniform(key_y, (count, 2)) - 0.5
-        extent, own = sizes[level].astype(center.dtype), sizes[-1].astype(center.dtype)
+        extent = sizes[level].astype(center.dtype)
+        own = jnp.array([windows.cameras.height, windows.cameras.width], center.dtype)
         pixel = jnp.floor(center * extent + within * own[None]).astype(jnp.int32)
         y, x = jnp.clip(pixel, 0, sizes[level] - 1).T
     values = to_float(pyramid.values[view, starts[level] + y * width + x])
@@ -166,7 +177,7 @@ def cut_window(
 ) -> Batch:
     """The window of one view at one level whose first pixel is in row and column `corner[2]`."""
     pyramid = windows.pyramid
-    height, width = pyramid.sizes[-1]
+    height, width = windows.cameras.height, windows.cameras.width
     sizes, starts = (jnp.asarray(x, jnp.int32) for x in (pyramid.sizes, pyramid.starts))
     rows = corner[0] + jnp.arange(height)[:, None]
     columns = corner[1] + jnp.arange(width)[None]

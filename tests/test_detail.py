@@ -26,6 +26,7 @@ from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.photographs import camera_at, to_float
 from jaxcloseup.pyramids import scene_pyramid
 from jaxcloseup.scenes import SceneError, load_scene
+from jaxcloseup.windows import view_windows
 
 
 def made_up(share, count=20_000, seed=0):
@@ -164,6 +165,16 @@ def test_target_views_may_be_labeled_by_their_detail(rendered, found, monkeypatc
     )
     assert (kind, begun, photographs) == ("target_views", state, programs.scene.train)
     jax.tree.map(np.testing.assert_array_equal, learned, labels)
+
+    # Of views larger than the windows of photographs, windows as large as these are learned.
+    train, size = programs.scene.train, (views.cameras.height - 2, views.cameras.width - 3)
+    windows = view_windows(train, *size)
+    monkeypatch.setitem(vars(programs), "photographs", windows)
+    learned = fine_tune(programs, start, views.cameras, most=1, kept=path)[3]
+    assert (learned.cameras.height, learned.cameras.width) == size
+    np.testing.assert_allclose(
+        to_float(learned.pyramid.level(0))[..., 3], labels.weight, atol=0.002
+    )
 
     near = label_closeups(programs, start, by_detail, 0, path)
     assert len(near) == gated.closeup_steps and 0.1 < near.weight.mean() < 1

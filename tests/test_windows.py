@@ -11,7 +11,7 @@ import pytest
 from splat_scenes import CONFIG, random_scene, to_surfels
 
 from jaxcloseup.geometry.cameras import Camera, pixels_to_points, points_to_pixels
-from jaxcloseup.photographs import camera_at
+from jaxcloseup.photographs import Views, camera_at
 from jaxcloseup.pyramids import photograph_pyramid
 from jaxcloseup.splats import render_surfels
 from jaxcloseup.windows import (
@@ -19,6 +19,7 @@ from jaxcloseup.windows import (
     photograph_windows,
     sample_window,
     sample_window_pixels,
+    view_windows,
     windows_that_see,
 )
 
@@ -52,6 +53,27 @@ def test_a_window_is_a_part_of_its_level(windows):
         part = whole[row : row + 12, column : column + 16]
         np.testing.assert_allclose(window.rgb, part[..., :3], rtol=1e-6)
         np.testing.assert_allclose(window.weight, part[..., 3], rtol=1e-6)
+
+
+def test_views_of_any_size_have_windows_of_a_given_one(windows, key):
+    """Windows of 13 x 17 pixels: two halvings of 48 x 64 would be smaller."""
+    image = np.asarray(windows.pyramid.image(1, 0))
+    one = camera_at(windows.cameras, 1).replace(
+        intrinsics=windows.pyramid.intrinsics[1, 0], height=48, width=64
+    )
+    cameras = jax.tree.map(lambda leaf: leaf[None], one)
+    views = Views(cameras, image[None, ..., :3], image[None, ..., 3] / np.float32(255))
+    parts = view_windows(views, 13, 17)
+    assert parts.pyramid.sizes == ((48, 64), (24, 32))
+    np.testing.assert_array_equal(parts.pyramid.image(0, 0), image)
+    drawn = jax.vmap(lambda key: sample_window(key, parts))(jax.random.split(key, 200))
+    assert drawn.rgb.shape == (200, 13, 17, 3)
+    fine = np.asarray(drawn.cameras.intrinsics[:, 0]) == one.intrinsics[0]
+    assert 0.4 < fine.mean() < 0.6
+    corner = np.asarray(one.intrinsics[2:]) - np.asarray(drawn.cameras.intrinsics[:, 2:])
+    for (x, y), rgb in zip(np.asarray(corner)[fine].astype(int), drawn.rgb[fine], strict=True):
+        there = image[y : y + 13, x : x + 17, :3]
+        np.testing.assert_allclose(rgb, there / np.float32(255), rtol=1e-6)
 
 
 def test_windows_cover_all_pixels_of_all_levels_with_the_stated_shares(windows, key):

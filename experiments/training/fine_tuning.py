@@ -1,6 +1,7 @@
 """Fine-tuning for target views: the cameras that somebody wants rendered."""
 
 import functools
+import operator
 import pathlib
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -23,7 +24,7 @@ from jaxcloseup.photographs import Views, camera_at
 from jaxcloseup.pseudo import PseudoSettings
 from jaxcloseup.pyramids import Pyramid
 from jaxcloseup.train import TrainState
-from jaxcloseup.windows import Windows, windows_that_see
+from jaxcloseup.windows import Windows, view_windows, windows_that_see
 
 
 _REPORTS = 10
@@ -37,15 +38,17 @@ class TargetData(NamedTuple):
 
     Attributes:
       photographs: as training reads them, or windows of them that see what the targets see.
-      labels: of the target views.
+      labels: of the target views, or windows of those that are larger than training's.
       settings: of these labels.
       steps: how many.
+      coverage: share of the target views that has labels.
     """
 
     photographs: Views | Windows
-    labels: Views
+    labels: Views | Windows
     settings: PseudoSettings
     steps: int
+    coverage: float
 
 
 def target_data(
@@ -68,13 +71,18 @@ def target_data(
     settings = gated(preset.target_labels, gate)
     labels = label_targets(programs, start, cameras, preset.target_labels, settings, kept)
     steps = programs.method.target_steps(preset.field, len(labels))
+    coverage = float(jnp.mean(labels.weight))
     if isinstance(photographs, Windows) and preset.target_labels.label == "residual":
         render = functools.partial(programs.render, start.state)
         depths = rendered_depths(render, cameras, programs.scene)
         seen = cameras, depths, start.sources.views, start.sources.depths
         key = jax.random.fold_in(start.state.key, start.state.step)
         photographs = jax.jit(windows_that_see)(key, photographs, *seen)
-    return TargetData(photographs, labels, settings, steps)
+        own, wanted = ((one.cameras.height, one.cameras.width) for one in (photographs, labels))
+        # What is compiled for windows of photographs serves, and a step takes as long.
+        if wanted != own and all(map(operator.ge, wanted, own)):
+            labels = view_windows(labels, *own)
+    return TargetData(photographs, labels, settings, steps, coverage)
 
 
 def tuned_detail(programs: Programs, state: TrainState, cameras: Camera, detail: Detail) -> Detail:
@@ -145,9 +153,8 @@ def fine_tune(
         return state
     data = target_data(programs, start, cameras, gate, kept)
     steps = min(data.steps, most or data.steps)
-    coverage = float(jnp.mean(data.labels.weight))
-    print(f"labels on {coverage:.0%} of the pixels to be rendered; {steps} steps", flush=True)
-    if coverage == 0:
+    print(f"labels on {data.coverage:.0%} of the pixels to be rendered; {steps} steps", flush=True)
+    if data.coverage == 0:
         print("nothing is fine-tuned")
         return state
     done = skipped = 0
