@@ -41,8 +41,9 @@ def expected_lists(box, order):
 
 @pytest.mark.parametrize(("capacity", "shown"), [(512, 40), (60, 40), (40, 40), (512, 9)])
 def test_lists_hold_the_splats_of_a_tile_nearest_first(capacity, shown, monkeypatch):
-    """In half of the room, in all of it, in too little, and, of few splats, in a quarter."""
-    monkeypatch.setattr(tiling, "_LARGE", 50)
+    """In parts of the room, in all of it, in too little, and of a few splats alone."""
+    for name, value in {"_LARGE": 50, "_FEW": 10, "_AT_ONCE": 32}.items():
+        monkeypatch.setattr(tiling, name, value)
     box, order = random_boxes()
     box[shown:] = [0, 0, -1, -1]
     make = functools.partial(tile_lists, height=HEIGHT, width=WIDTH, tile=TILE)

@@ -22,7 +22,7 @@ from jaxcloseup.splats.tiling import tile_lists
 
 
 COMPOSITORS = ("auto", "loops", "kernel")
-_SMALL = 2**15  # pixels of an image that is best cut into small tiles
+_SMALL = 2**17  # pixels of an image that is best cut into small tiles
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +36,7 @@ class RasterizeConfig:
       near: positive z-depth in world units; nothing nearer is drawn.
       antialias: convolve surfels with the pixel, see `project_discs`.
       tile: side of a tile in pixels; None: by the image's size, see `for_image`.
-      chunk: number of a tile's splats that loops evaluate at once; None: by the tile's size.
+      chunk: number of a tile's splats that loops evaluate at once; None: 8.
       block: largest number of tiles that loops evaluate at once; None: by the platform.
       compositor: "loops" blends by `jax.lax`, with chunks and blocks; "kernel" by Pallas kernels,
         which other platforms than GPUs interpret, slowly; "auto" by kernels on a GPU that runs
@@ -79,7 +79,7 @@ def for_image(config: RasterizeConfig, *, height: int, width: int) -> RasterizeC
         config,
         capacity=capacity,
         tile=tile,
-        chunk=config.chunk or (32 if tile <= 4 else 8),
+        chunk=config.chunk or 8,
         block=config.block or (256 if on_cpu else 4096),
     )
 

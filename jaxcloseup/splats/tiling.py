@@ -15,7 +15,9 @@ from jax import lax
 
 
 LARGEST = 2**31 - 1
-_LARGE = 2**16  # room that is worth shortcuts
+_LARGE = 2**16  # room for pairs that is worth shortcuts
+_FEW = 2**12  # splats that are worth a shortcut
+_AT_ONCE = 2**14  # pairs that a CPU looks at before the next ones
 
 
 @struct.dataclass
@@ -71,27 +73,11 @@ def tile_lists(
     total = jnp.sum(pairs, dtype=jnp.int32)
     too_many = jnp.sum(pairs.astype(jnp.float32)) > LARGEST / 2  # int32 may have wrapped
 
-    def sort(rows, room):
-        touched = first, extent, order, reaches
-        found = _sort(*touched, rows, room, tile=tile, across=across, down=down)
-        fill = across * down, 0
-        return tuple(
-            jnp.pad(part, (0, capacity - room), constant_values=value)
-            for part, value in zip(found, fill, strict=True)
-        )
-
-    # Sorting costs what there is room for; windows show few splats in few pairs.
-    rooms = [(count, capacity)]
-    if capacity >= _LARGE:
-        rooms = [(max(count // 4, 1), capacity // 4), (count, capacity // 2), *rooms]
-    after = jnp.max(jnp.where(pairs > 0, jnp.arange(count, dtype=jnp.int32), -1), initial=-1)
-    fits = [(after < rows) & (total <= room) & ~too_many for rows, room in rooms[:-1]]
-    branches = [functools.partial(sort, *room) for room in rooms]
-    first_fit = jnp.argmax(jnp.stack([*fits, jnp.array(True)]))
-    tile_of, splats = lax.switch(first_fit, branches)
-    tiles = jnp.arange(across * down + 1, dtype=jnp.int32)
-    starts = jnp.searchsorted(tile_of, tiles).astype(jnp.int32)
-    tiles = tiles[:-1]
+    by_depth = _nearest_first_shown(order, pairs)
+    touched = first[by_depth], extent[by_depth], by_depth
+    tile_of, rank = _touched_tiles(*touched, reaches, capacity, tile=tile, across=across, down=down)
+    starts, splats = _sorted_pairs(tile_of, rank, by_depth, total, across * down)
+    tiles = jnp.arange(across * down, dtype=jnp.int32)
     return TileLists(
         splats=splats,
         starts=starts[:-1],
@@ -106,30 +92,76 @@ def longest_first(counts: jax.Array) -> jax.Array:
     return jnp.argsort(-counts, stable=True).astype(jnp.int32)
 
 
-def _sort(first, extent, order, reaches, rows, capacity, *, tile, across, down):
-    """Sorted pairs `[capacity]` of the first `rows` splats: tiles and splats.
+def _nearest_first_shown(order, pairs):
+    """Indices `[N]` of splats, the nearest first as far as splats have any pairs `[N]`."""
+    count = order.shape[0]
+    few = count // 4
+    if few < _FEW:
+        return _nearest_first(order)
+    # Of many splats that a window leaves out, those that show come first.
+    index = jnp.arange(count, dtype=jnp.int32)
+    after = jnp.max(jnp.where(pairs > 0, index, -1), initial=-1)
 
-    Pairs are laid out by depth rank, so those of the farthest splats overflow. The tile is
-    `across * down` past the last pair.
+    def first_ones():
+        return jnp.concatenate([_nearest_first(order[:few]), index[few:]])
+
+    return lax.cond(after < few, first_ones, lambda: _nearest_first(order))
+
+
+def _touched_tiles(first, extent, splats, reaches, capacity, *, tile, across, down):
+    """Tiles `[capacity]` of the pairs of splats, which are in order of depth, and their ranks.
+
+    Pairs are laid out by rank, so those of the farthest splats overflow. The tile is
+    `across * down` where there is no pair, or nothing worth listing.
     """
-    by_depth = _nearest_first(order[:rows])
-    first, extent = first[by_depth], extent[by_depth]
     pairs, columns = extent[:, 0] * extent[:, 1], jnp.maximum(extent[:, 0], 1)
     ends = jnp.cumsum(pairs)
-    place = jnp.arange(capacity, dtype=jnp.int32)
-    ranks = jnp.arange(rows, dtype=jnp.int32)
-    rank = jnp.repeat(ranks, pairs, total_repeat_length=capacity)
-    within = place - (ends - pairs)[rank]
-    down_by = within // columns[rank]
-    row = first[rank, 1] + down_by
-    column = first[rank, 0] + within - down_by * columns[rank]
-    listed = place < ends[-1]
-    if reaches is not None:
-        listed &= reaches(by_depth[rank], tile * jnp.stack([column, row], axis=-1))
     tiles = across * down
-    tile_of = jnp.where(listed, row * across + column, tiles)
-    tile_of, rank = _sort_pairs(tile_of, rank, tiles + 1, rows)
-    return tile_of, by_depth[rank]
+    size = min(capacity, _AT_ONCE) if jax.default_backend() == "cpu" else capacity
+    steps = -(-capacity // size)
+    # How many splats' pairs end in front of each pair.
+    ended = jnp.zeros(steps * size, jnp.int32).at[ends].add(1, mode="drop").reshape(steps, size)
+
+    def find(rank, step):
+        ended, place = step
+
+        def some():
+            ranks = rank + jnp.cumsum(ended)
+            places = place + jnp.arange(size, dtype=jnp.int32)
+            listed = places < ends[-1]
+            within = places - (ends - pairs)[ranks]
+            down_by = within // columns[ranks]
+            row = first[ranks, 1] + down_by
+            column = first[ranks, 0] + within - down_by * columns[ranks]
+            if reaches is not None:
+                corner = tile * jnp.stack([column, row], axis=-1)
+                listed &= reaches(splats[ranks], corner)
+            return ranks[-1], (jnp.where(listed, row * across + column, tiles), ranks)
+
+        def none():
+            return rank, (jnp.full(size, tiles, jnp.int32), jnp.zeros(size, jnp.int32))
+
+        return lax.cond(place < ends[-1], some, none)
+
+    starts = size * jnp.arange(steps, dtype=jnp.int32)
+    _, found = lax.scan(find, jnp.int32(0), (ended, starts))
+    return tuple(part.reshape(-1)[:capacity] for part in found)
+
+
+def _sorted_pairs(tile_of, rank, by_depth, total, tiles):
+    """Where each tile's pairs start, `[T + 1]`, and splats `[capacity]` by tile and rank."""
+    capacity = tile_of.shape[0]
+    # Sorting costs what there is room for; windows show few splats in few pairs.
+    eighths = (1, 1.5, 2, 3, 4, 6) if capacity >= _LARGE else ()
+    rooms = [int(capacity * part / 8) for part in eighths] + [capacity]
+
+    def sort(room):
+        found, ranks = _sort_pairs(tile_of[:room], rank[:room], tiles + 1, len(by_depth))
+        starts = jnp.searchsorted(found, jnp.arange(tiles + 1, dtype=found.dtype))
+        return starts.astype(jnp.int32), jnp.pad(by_depth[ranks], (0, capacity - room))
+
+    smallest = jnp.argmax(jnp.stack([total <= room for room in rooms[:-1]] + [jnp.array(True)]))
+    return lax.switch(smallest, [functools.partial(sort, room) for room in rooms])
 
 
 def _tile_range(box: jax.Array, size: jax.Array, tile: int) -> tuple[jax.Array, jax.Array]:
