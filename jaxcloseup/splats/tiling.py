@@ -64,7 +64,6 @@ def tile_lists(
         of these pairs are worth listing, `[P]` bool; None lists all.
     """
     chex.assert_shape(box, (order.shape[0], 4))
-    count = order.shape[0]
     across, down = -(-width // tile), -(-height // tile)
     first, last = _tile_range(box, jnp.array([width, height]), tile)
     extent = jnp.maximum(last - first + 1, 0)
