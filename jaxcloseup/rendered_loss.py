@@ -88,8 +88,13 @@ def _at_once_forward(field, params, buffers, batch, key):
 
 def _scale_gradients(*arguments):
     """The cotangents of a loss whose forward pass has taken the gradients already."""
-    gradients, cotangent = arguments[-2:]
-    return jax.tree.map(lambda x: cotangent[0] * x, gradients), None, None, None
+    gradients, (cotangent, _) = arguments[-2:]
+    return _times(cotangent, gradients), None, None, None
+
+
+@jax.jit
+def _times(factor, tree):
+    return jax.tree.map(lambda leaf: factor * leaf, tree)
 
 
 _at_once.defvjp(_at_once_forward, _scale_gradients)

@@ -61,6 +61,7 @@ def ladder_targets(scene: Scene, exact_depths: jax.Array) -> dict[str, list[Targ
     return {f"{PREFIX}{m:g}": list(targets) for m, targets in rows}
 
 
+@jax.jit
 def _anchor(key: jax.Array, camera: Camera, depth: jax.Array, seen: jax.Array) -> jax.Array:
     """Draw a point in the middle half of the view, from those that several photographs see."""
     height, width = depth.shape

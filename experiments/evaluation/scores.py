@@ -1,5 +1,6 @@
 """Scores of held-out views: on the full frame, and where training photographs saw the surface."""
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -82,10 +83,18 @@ class Target(NamedTuple):
 
 def exact_depths(scene: Scene, cameras: Camera) -> jax.Array:
     """Return the exact z-depths `[V, H, W]` of stacked cameras on a procedural scene."""
-    depth = jax.jit(lambda camera: scene.surface(camera).depth)  # jit skips the unused colors
-    count = cameras.intrinsics.shape[0]
-    found = progress.each(lambda i: depth(camera_at(cameras, i)), range(count), "exact depths")
-    return jnp.stack(list(found))
+    geometry, count = _geometry(scene.surface), cameras.intrinsics.shape[0]
+
+    def depth(i):
+        return geometry(camera_at(cameras, i)).depth
+
+    return jnp.stack(list(progress.each(depth, range(count), "exact depths")))
+
+
+@functools.lru_cache(maxsize=4)
+def _geometry(surface):
+    """The surface without colors: they take longest to compile."""
+    return jax.jit(lambda camera: surface(camera)._replace(rgb=None))
 
 
 def make_targets(
@@ -109,7 +118,7 @@ def make_targets(
         default those of the scene.
     """
     views, sizes = finer or (getattr(scene, split), scene.sizes(split))
-    surface = scene.surface  # is compiled; within jit, its textures would be constants
+    surface = _geometry(scene.surface) if scene.surface else None
     count = jax.jit(count_seen)
 
     def make(i):

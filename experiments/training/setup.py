@@ -150,7 +150,7 @@ def initial_state(programs: Programs, seed: int) -> TrainState:
       TrainingError: it does not fit into memory.
     """
     state_shapes(programs)
-    return _initial_state(programs)(*_initial_data(programs, seed))
+    return jax.jit(_initial_state(programs))(*_initial_data(programs, seed))
 
 
 def state_shapes(programs: Programs) -> TrainState:

@@ -4,6 +4,7 @@ Density control splits surfels and moves the parts apart by chance. Where depth 
 a pixel of a photograph says where its surfel belongs, how large it is, and what color it has.
 """
 
+import functools
 import math
 
 import jax
@@ -87,6 +88,7 @@ def _turn_to(normal):
     return jnp.where((z < -0.9999)[:, None], upside_down, turn)
 
 
+@functools.partial(jax.jit, static_argnums=2)
 def join_surfels(
     old: tuple[Surfels, jax.Array], new: tuple[Surfels, jax.Array], capacity: int
 ) -> tuple[Surfels, jax.Array]:
