@@ -7,8 +7,6 @@ units; ray directions have unit camera-z, so the parameter along a ray *is* the 
 Functions take one camera and any number of pixels or points `[...]`; batch cameras with `jax.vmap`.
 """
 
-import functools
-
 import chex
 import jax
 import jax.numpy as jnp
@@ -44,7 +42,7 @@ class Camera:
         return self.camtoworld[..., 3]
 
 
-@functools.partial(jax.jit, static_argnames=("height", "width"))
+@jax.jit(static_argnames=("height", "width"))
 def pixel_grid(height: int, width: int) -> jax.Array:
     """Centers of all pixels, `[height, width, 2]` as (x, y)."""
     x, y = jnp.meshgrid(jnp.arange(0.5, width), jnp.arange(0.5, height))
