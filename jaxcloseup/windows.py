@@ -35,6 +35,11 @@ class Windows:
         """Number of photographs."""
         return self.pyramid.values.shape[0]
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of a window in pixels."""
+        return self.cameras.height, self.cameras.width
+
 
 def photograph_windows(cameras: Camera, pyramid: Pyramid, *, whole_share: float) -> Windows:
     """Windows of which a share is whole photographs of the coarsest level; other levels are alike.
@@ -118,7 +123,7 @@ def sample_window(key: jax.Array, windows: Windows) -> Batch:
     key_view, key_level, key_y, key_x = jax.random.split(key, 4)
     level = jax.random.categorical(key_level, jnp.log(windows.shares))
     sizes = jnp.asarray(windows.pyramid.sizes, jnp.int32)
-    own = jnp.array([windows.cameras.height, windows.cameras.width], jnp.int32)
+    own = jnp.array(windows.size, jnp.int32)
     room = sizes[level] - own + 1
     if windows.places is None:
         view = jax.random.randint(key_view, (), 0, len(windows))
@@ -158,7 +163,7 @@ def sample_window_pixels(key: jax.Array, windows: Windows, count: int) -> Batch:
         view, center = _draw_place(key_view, windows, (count,))
         within = jax.random.uniform(key_y, (count, 2)) - 0.5
         extent = sizes[level].astype(center.dtype)
-        own = jnp.array([windows.cameras.height, windows.cameras.width], center.dtype)
+        own = jnp.array(windows.size, center.dtype)
         pixel = jnp.floor(center * extent + within * own[None]).astype(jnp.int32)
         y, x = jnp.clip(pixel, 0, sizes[level] - 1).T
     values = to_float(pyramid.values[view, starts[level] + y * width + x])
@@ -177,7 +182,7 @@ def cut_window(
 ) -> Batch:
     """The window of one view at one level whose first pixel is in row and column `corner[2]`."""
     pyramid = windows.pyramid
-    height, width = windows.cameras.height, windows.cameras.width
+    height, width = windows.size
     sizes, starts = (jnp.asarray(x, jnp.int32) for x in (pyramid.sizes, pyramid.starts))
     rows = corner[0] + jnp.arange(height)[:, None]
     columns = corner[1] + jnp.arange(width)[None]

@@ -171,7 +171,7 @@ def test_target_views_may_be_labeled_by_their_detail(rendered, found, monkeypatc
     windows = view_windows(train, *size)
     monkeypatch.setitem(vars(programs), "photographs", windows)
     learned = fine_tune(programs, start, views.cameras, most=1, kept=path)[3]
-    assert (learned.cameras.height, learned.cameras.width) == size
+    assert learned.size == size
     np.testing.assert_allclose(
         to_float(learned.pyramid.level(0))[..., 3], labels.weight, atol=0.002
     )

@@ -1,7 +1,6 @@
 """Fine-tuning for target views: the cameras that somebody wants rendered."""
 
 import functools
-import operator
 import pathlib
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -78,11 +77,17 @@ def target_data(
         seen = cameras, depths, start.sources.views, start.sources.depths
         key = jax.random.fold_in(start.state.key, start.state.step)
         photographs = jax.jit(windows_that_see)(key, photographs, *seen)
-        own, wanted = ((one.cameras.height, one.cameras.width) for one in (photographs, labels))
+        height, width = photographs.size
         # What is compiled for windows of photographs serves, and a step takes as long.
-        if wanted != own and all(map(operator.ge, wanted, own)):
-            labels = view_windows(labels, *own)
+        if _is_larger(labels.cameras, height, width):
+            labels = view_windows(labels, height, width)
     return TargetData(photographs, labels, settings, steps, coverage)
+
+
+def _is_larger(cameras, height, width):
+    """Whether images hold such a window, and are not just that."""
+    holds = cameras.height >= height and cameras.width >= width
+    return holds and (cameras.height, cameras.width) != (height, width)
 
 
 def tuned_detail(programs: Programs, state: TrainState, cameras: Camera, detail: Detail) -> Detail:

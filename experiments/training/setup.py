@@ -143,6 +143,10 @@ def identity_of(scene: Scene, preset: Preset, names: Mapping[str, str]) -> dict[
     }
 
 
+# One program for all seeds; without it, every array program would be compiled apart.
+_init_state = jax.jit(init_state, static_argnames=("field", "optimizer"))
+
+
 def initial_state(programs: Programs, seed: int) -> TrainState:
     """The state before the first step of a seed's baseline.
 
@@ -150,7 +154,7 @@ def initial_state(programs: Programs, seed: int) -> TrainState:
       TrainingError: it does not fit into memory.
     """
     state_shapes(programs)
-    return jax.jit(_initial_state(programs))(*_initial_data(programs, seed))
+    return _initial_state(programs)(*_initial_data(programs, seed))
 
 
 def state_shapes(programs: Programs) -> TrainState:
@@ -170,7 +174,7 @@ def state_shapes(programs: Programs) -> TrainState:
 
 
 def _initial_state(programs):
-    return functools.partial(init_state, field=programs.field, optimizer=programs.optimizer)
+    return functools.partial(_init_state, field=programs.field, optimizer=programs.optimizer)
 
 
 def _initial_data(programs, seed):

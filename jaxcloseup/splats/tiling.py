@@ -115,6 +115,7 @@ def _touched_tiles(first, extent, splats, reaches, capacity, *, tile, across, do
     """
     pairs, columns = extent[:, 0] * extent[:, 1], jnp.maximum(extent[:, 0], 1)
     ends = jnp.cumsum(pairs)
+    begins = ends - pairs
     tiles = across * down
     size = min(capacity, _AT_ONCE) if jax.default_backend() == "cpu" else capacity
     steps = -(-capacity // size)
@@ -128,7 +129,7 @@ def _touched_tiles(first, extent, splats, reaches, capacity, *, tile, across, do
             ranks = rank + jnp.cumsum(ended)
             places = place + jnp.arange(size, dtype=jnp.int32)
             listed = places < ends[-1]
-            within = places - (ends - pairs)[ranks]
+            within = places - begins[ranks]
             down_by = within // columns[ranks]
             row = first[ranks, 1] + down_by
             column = first[ranks, 0] + within - down_by * columns[ranks]
