@@ -179,7 +179,7 @@ def _features(residual: Gathered, colors: Gathered, instead, alpha, depth, finer
     product = jnp.mean(residual.mean * instead, axis=-1)
     around = [*map(_log_power, powers)]
     for blur in _BLURS:
-        *means, alike = (_blur(image, blur) for image in (*powers, product))
+        *means, alike = _blur(jnp.stack([*powers, product]), blur)
         alike = alike / jnp.sqrt(means[2] * means[3] + 1e-8)
         around += [*map(_log_power, means), alike]
     return jnp.stack([*ways, *around], axis=-1)
@@ -193,19 +193,19 @@ def _log_power(values):
     return jnp.log2(jnp.maximum(values, 0) + 1e-5)
 
 
-def _blur(image, deviation):
-    """Mean `[H, W]` over neighbors by Gaussian weights."""
+def _blur(images, deviation):
+    """Means `[N, H, W]` of images over neighbors by Gaussian weights."""
     reach = int(np.ceil(2.5 * deviation))
     taps = np.exp(-((np.arange(-reach, reach + 1) / deviation) ** 2) / 2)
-    for axis in (0, 1):
-        padding = [(reach, reach) if i == axis else (0, 0) for i in (0, 1)]
-        padded, size = jnp.pad(image, padding, mode="edge"), image.shape[axis]
+    for axis in (1, 2):
+        padding = [(reach, reach) if i == axis else (0, 0) for i in range(3)]
+        padded, size = jnp.pad(images, padding, mode="edge"), images.shape[axis]
         parts = (
             float(tap) * jax.lax.slice_in_dim(padded, i, i + size, axis=axis)
             for i, tap in enumerate(taps / taps.sum())
         )
-        image = functools.reduce(jnp.add, parts)
-    return image
+        images = functools.reduce(jnp.add, parts)
+    return images
 
 
 def _edges(depth):

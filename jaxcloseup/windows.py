@@ -3,11 +3,15 @@
 A window is a camera with a shifted principal point, so a field renders it as any image.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
-from jaxcloseup.geometry.cameras import Camera, pixels_to_points
+from jaxcloseup.geometry.cameras import Camera, crop_camera, pixels_to_points
 from jaxcloseup.geometry.visibility import sample_where_visible
 from jaxcloseup.photographs import Batch, Views, camera_at, to_float
 from jaxcloseup.pyramids import Pyramid, photograph_pyramid
@@ -187,8 +191,24 @@ def cut_window(
     rows = corner[0] + jnp.arange(height)[:, None]
     columns = corner[1] + jnp.arange(width)[None]
     values = to_float(pyramid.values[view, starts[level] + rows * sizes[level, 1] + columns])
-    moved = jnp.concatenate([jnp.zeros(2), corner[::-1].astype(jnp.float32)])
-    camera = camera_at(windows.cameras, view).replace(
-        intrinsics=pyramid.intrinsics[view, level] - moved, height=height, width=width
-    )
+    camera = camera_at(windows.cameras, view).replace(intrinsics=pyramid.intrinsics[view, level])
+    camera = crop_camera(camera, corner[::-1], height=height, width=width)
     return Batch(camera, None, values[..., :3], values[..., 3])
+
+
+def in_quarters(render: Callable[[Camera], Any], camera: Camera) -> Any:
+    """What `render(camera)` gives, from four calls for a quarter of the image each.
+
+    Args:
+      render: gives arrays `[H, W, ...]` of a camera's pixels.
+      camera: one camera.
+    """
+    height, width = -(-camera.height // 2), -(-camera.width // 2)
+    corners = (0, 0), (width, 0), (0, height), (width, height)
+    parts = [crop_camera(camera, np.array(x), height=height, width=width) for x in corners]
+
+    def join(*images):
+        halves = (np.concatenate(pair, axis=1) for pair in (images[:2], images[2:]))
+        return jnp.asarray(np.concatenate(list(halves))[: camera.height, : camera.width])
+
+    return jax.tree.map(join, *map(render, parts))

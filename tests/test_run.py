@@ -192,6 +192,23 @@ def test_no_step_is_taken_on_a_truncated_image(capture_folder, capsys):
         np.testing.assert_allclose(small, large, atol=1e-5)
 
 
+def test_a_large_image_is_rendered_in_quarters(capture_folder):
+    """An image of odd size, twice as wide as what has a program of its own, has no seams."""
+    with jax.numpy_dtype_promotion("standard"):
+        scene = load_scene(str(capture_folder))
+        programs = Programs(TINY, scene)
+        state = initial_state(programs, 0)
+        camera = camera_at(scene.train.cameras, 1)
+        times = 4 + 3 / camera.width
+        size = {"height": 4 * camera.height + 1, "width": 4 * camera.width + 3}
+        camera = camera.replace(intrinsics=times * camera.intrinsics, **size)
+        whole = programs.field.render(state.params, state.buffers, camera, None, None)
+        seen = programs.render(state, camera)
+    assert np.std(whole.rgb) > 0.01
+    for name in ("rgb", "depth", "alpha"):
+        np.testing.assert_allclose(getattr(seen, name), getattr(whole, name), atol=1e-4)
+
+
 @pytest.mark.parametrize("off", [1.0, 1.02, 1.3])
 def test_labels_weigh_what_they_deserve(off):
     """With exact depth labels are right; the further depth is off, the fewer of them agree."""

@@ -10,12 +10,19 @@ import plane
 import pytest
 from splat_scenes import CONFIG, random_scene, to_surfels
 
-from jaxcloseup.geometry.cameras import Camera, pixels_to_points, points_to_pixels
+from jaxcloseup.geometry.cameras import (
+    Camera,
+    pixel_grid,
+    pixels_to_points,
+    pixels_to_rays,
+    points_to_pixels,
+)
 from jaxcloseup.photographs import Views, camera_at
 from jaxcloseup.pyramids import photograph_pyramid
 from jaxcloseup.splats import render_surfels
 from jaxcloseup.windows import (
     cut_window,
+    in_quarters,
     photograph_windows,
     sample_window,
     sample_window_pixels,
@@ -168,6 +175,26 @@ def test_windows_that_see_are_where_photographs_show_what_cameras_see(windows, k
     # Half of the pixels have no depth, and draw any place; the first photograph sees none.
     assert 0.45 < np.mean(inside) < 0.75
     assert set(places[np.array(inside), 0]) == {1.0, 2.0}
+
+
+def test_quarters_make_a_whole_image(key):
+    """Of odd size too; what a quarter is of follows from its intrinsics alone."""
+    rotation = jnp.concatenate([jnp.eye(3), jax.random.normal(key, (3, 1))], axis=1)
+    camera = Camera(rotation, jnp.array([6.0, 5.0, 3.2, 2.1]), height=5, width=7)
+
+    def see(camera):
+        pixels = pixel_grid(camera.height, camera.width)
+        _, rays = pixels_to_rays(camera, pixels)
+        return {"ray": rays, "sum": jnp.sum(rays, axis=-1), "none": None}
+
+    seen, called = in_quarters(see, camera), []
+    for name, image in see(camera).items():
+        if image is None:
+            assert seen[name] is None
+        else:
+            np.testing.assert_allclose(seen[name], image, atol=1e-6)
+    in_quarters(lambda part: called.append((part.height, part.width)), camera)
+    assert called == [(3, 4)] * 4
 
 
 def test_a_window_learns_as_that_part_of_a_whole_image():

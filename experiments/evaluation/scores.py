@@ -23,6 +23,7 @@ from jaxcloseup.metrics import SSIM_TAPS, cc_psnr, psnr, quantize, ssim
 from jaxcloseup.photographs import Views, camera_at, to_float
 from jaxcloseup.scene import Scene, SceneError, Surface
 from jaxcloseup.support import count_seen
+from jaxcloseup.windows import in_quarters
 
 
 SEEN_BY = (1, 3)  # least numbers of photographs, for metrics of the seen pixels alone
@@ -119,6 +120,9 @@ def make_targets(
     """
     views, sizes = finer or (getattr(scene, split), scene.sizes(split))
     surface = _geometry(scene.surface) if scene.surface else None
+    if surface and finer:
+        # Quarters of finer views are mostly as large as the others: one program serves both.
+        surface = functools.partial(in_quarters, surface)
     count = jax.jit(count_seen)
 
     def make(i):

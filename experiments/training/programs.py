@@ -25,7 +25,7 @@ from jaxcloseup.pseudo import LabelSources, PseudoSettings
 from jaxcloseup.pyramids import Pyramid, scene_pyramid
 from jaxcloseup.scene import Scene, SceneError
 from jaxcloseup.train import TrainState, closeup_step, labeled_step, run_steps, train_step
-from jaxcloseup.windows import Windows, photograph_windows
+from jaxcloseup.windows import Windows, in_quarters, photograph_windows
 
 
 HOSTS_WAIT = 24 * 3600  # seconds
@@ -152,9 +152,8 @@ class Programs:
             self.growth = growth
             self._compile()
 
-    def _for_width(self, width: int) -> "Programs":
+    def _for_doublings(self, doublings: int) -> "Programs":
         """Larger images have programs of their own: their room must not slow training."""
-        doublings = math.floor(math.log2(width / self._width) + 0.4)
         if doublings <= 0:
             return self
         if doublings not in self._larger:
@@ -239,8 +238,15 @@ class Programs:
             )
 
     def render(self, state: TrainState, camera: Camera, key: jax.Array | None = None) -> Rendering:
-        """Render a whole image; without a key, deterministically."""
-        programs = self._for_width(camera.width)
+        """Render a whole image; without a key, deterministically.
+
+        `aux` is for the field alone, and large images have none.
+        """
+        doublings = math.floor(math.log2(camera.width / self._width) + 0.4)
+        if doublings > 1 and key is None and jax.default_backend() == "cpu":
+            # To compile the renderer for one more size takes as long as dozens of images.
+            return in_quarters(lambda part: self._render_part(state, part), camera)
+        programs = self._for_doublings(doublings)
         while True:
             growth = programs.growth
             with programs._compiling("render", "compiling the renderer"):
@@ -248,6 +254,10 @@ class Programs:
             if rendering.overflow is None or not int(rendering.overflow):
                 return rendering
             programs._grow(growth)
+
+    def _render_part(self, state: TrainState, camera: Camera) -> Rendering:
+        """A rendering whose arrays are all per pixel."""
+        return self.render(state, camera)._replace(aux=(), overflow=None)
 
 
 def _mesh_of_windows(windows: int) -> Mesh | None:

@@ -96,6 +96,19 @@ def points_to_pixels(camera: Camera, points: jax.Array) -> tuple[jax.Array, jax.
     return xy * _match(focal, xy) + _match(center, xy), depth
 
 
+def crop_camera(camera: Camera, corner: jax.Array, *, height: int, width: int) -> Camera:
+    """The camera of a part of an image, which may reach beyond it.
+
+    Args:
+      camera: one camera.
+      corner: `[2]` x, y of the part's first pixel, 0, 0 at the image's.
+      height: of the part in pixels.
+      width: of the part in pixels.
+    """
+    moved = jnp.concatenate([jnp.zeros(2), jnp.asarray(corner, camera.intrinsics.dtype)])
+    return camera.replace(intrinsics=camera.intrinsics - moved, height=height, width=width)
+
+
 def mean_focal(intrinsics: jax.Array) -> jax.Array:
     """Geometric mean `[...]` of fx and fy in pixels, of intrinsics `[..., 4]`."""
     return jnp.sqrt(intrinsics[..., 0] * intrinsics[..., 1])
