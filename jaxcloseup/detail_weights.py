@@ -123,8 +123,7 @@ def learn_weights(
     weights = weights.replace(layers=_train(weights, found, counts * found.weight))
 
     columns = []
-    for index, outputs in enumerate(_outputs(weights, found.features)):
-        mixed, share = map(np.asarray, _mix(outputs, found.residual, found.colors))
+    for index, (mixed, share) in enumerate(jax.device_get(_predictions(weights, found))):
         power = found.weight * np.sum(mixed**2, axis=-1)
         product = found.weight * np.sum(mixed * found.own, axis=-1)
         columns.append(np.stack([share, power, product])[:, fold == index].astype(np.float64))
@@ -170,6 +169,14 @@ def _outputs(weights, features):
         yield _perceive(layers, usual).reshape(*shape, 2)
 
 
+@jax.jit
+def _predictions(weights, found):
+    """The mixture and its share as each network has them, one after the other."""
+    outputs = _outputs(weights, found.features)
+    return tuple(_mix(own, found.residual, found.colors) for own in outputs)
+
+
+@jax.jit
 def _usual(weights, features):
     usual = (features - weights.center[None]) * weights.scale[None]
     return jnp.clip(usual, -_UNUSUAL, _UNUSUAL)
