@@ -18,6 +18,7 @@ from jaxcloseup.photographs import Batch
 Loss = tuple[jax.Array, dict[str, jax.Array]]
 
 
+@jax.jit
 def label_depth(
     rendering: Rendering, *, near: float = 0.0, far: float = math.inf, min_alpha: float = 0.5
 ) -> jax.Array:

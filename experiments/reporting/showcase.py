@@ -96,13 +96,18 @@ def find_place(camera: Camera, depth: jax.Array, photograph: Camera) -> np.ndarr
       `[2, 3]` from pixels of the camera to those of the photograph, or None if it shows nothing.
     """
     pixels = pixel_grid(camera.height, camera.width)
-    landed, ahead = points_to_pixels(photograph, pixels_to_points(camera, pixels, depth))
+    landed, ahead = _land(photograph, camera, pixels, depth)
     seen = (np.asarray(depth) > 0) & (np.asarray(ahead) > 0)
     some = np.flatnonzero(seen)[:: max(1, int(seen.sum()) // 2000)]
     if len(some) < 3:
         return None
     here, there = (np.asarray(points).reshape(-1, 2)[some] for points in (pixels, landed))
     return cv2.estimateAffinePartial2D(here, there, method=cv2.LMEDS)[0]
+
+
+@jax.jit
+def _land(photograph, camera, pixels, depth):
+    return points_to_pixels(photograph, pixels_to_points(camera, pixels, depth))
 
 
 def cut_out(photographs: Pyramid, view: int, place: np.ndarray, camera: Camera) -> np.ndarray:

@@ -201,7 +201,7 @@ def audit_all(
     if exact is not None:
         ways = {
             "exact_depth": (
-                label_sources(scene.train, exact),
+                jax.jit(label_sources)(scene.train, exact),
                 lambda camera: scene.surface(camera).depth,
             ),
             "trained_depth": (start.sources, lambda camera: label_depth(render(camera))),
