@@ -100,7 +100,12 @@ def add_detail(
       depth: `[H, W]` rendered z-depth; 0 is undefined and gets no detail.
     """
     found = find_candidates(detail, camera, pixels, rgb, alpha, depth)
-    mixed, weight = blend(detail.weights, found.features, found.residual, found.colors)
+    return _add(detail.weights, found, rgb)
+
+
+@jax.jit
+def _add(weights, found, rgb):
+    mixed, weight = blend(weights, found.features, found.residual, found.colors)
     weight = jnp.where(found.weight > 0, weight, 0)
     added = weight[..., None] * mixed
     # Photographs and view may differ in exposure, so detail keeps the mean color of the view.
@@ -132,11 +137,17 @@ def find_candidates(
       exclude: index of a photograph to leave out; -1 leaves out none.
       finest: the first level to read, as if there were no finer one.
     """
-    residual, colors = gather_parts(
+    gathered = gather_parts(
         *(camera, pixels, depth, detail.sources, detail.shown, SETTINGS),
         exclude=exclude,
         finest=finest,
     )
+    return _candidates(detail, gathered, rgb, alpha, depth, exclude, finest)
+
+
+@jax.jit
+def _candidates(detail, gathered, rgb, alpha, depth, exclude, finest):
+    residual, colors = gathered
     finer = detail.finer - detail.shown.coarseness(exclude)[finest]
     instead = (1 + colors.mean) / 2 - jnp.clip(rgb, 0, 1)
     instead = jnp.where(colors.weight[..., None] > 0, instead, 0)
@@ -144,6 +155,7 @@ def find_candidates(
     return Candidates(features, residual.mean, instead, residual.weight, residual.footprint)
 
 
+@jax.jit
 def testify(found: Candidates, own: jax.Array, weight: jax.Array) -> Evidence:
     """What one left-out photograph says of the candidates for its own view.
 

@@ -6,6 +6,7 @@ render) show what the photographs know beyond a model.
 
 import functools
 import itertools
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -23,6 +24,7 @@ from jaxcloseup.pyramids import Pyramid
 
 
 _CHUNK = 4096  # points that are culled together
+_CHUNKS = 8  # chunks for which one program is compiled, to serve images of many sizes
 _WIDEST = 20  # angles in units of `angle_scale`, beyond which all weigh alike
 _COARSEST = 64  # footprints beyond which all weigh alike
 
@@ -168,6 +170,8 @@ def gather_parts(
 ) -> tuple[Gathered, ...]:
     """Gather equal parts of a pyramid's channels, each by settings of its own, in one visit.
 
+    Outside `jax.jit`, all views of up to 32,768 pixels share what takes long to compile.
+
     Args:
       camera: camera of the view.
       pixels: `[..., 2]` pixel centers of the view.
@@ -186,22 +190,54 @@ def gather_parts(
         raise ValueError(
             f"{pyramid.values.shape[-1]} channels are not {len(settings)} parts of one size"
         )
+    points, side = _surface(camera, pixels, depth)
+    view, level = (jnp.asarray(index, jnp.int32) for index in (exclude, finest))
+    reader = camera.position, sources, pyramid, level
+    found = _gather_chunks(points, side, reader, view, settings=tuple(settings))
+    return _as_images(found, shape=depth.shape)
+
+
+@jax.jit
+def _surface(camera, pixels, depth):
+    """Points `[K, N, 3]` of a view in chunks, and sides `[K, N]` of its pixels there.
+
+    The side is 0 where depth is undefined, and behind the last pixel.
+    """
     defined = (depth > 0) & jnp.isfinite(depth)
     points = pixels_to_points(camera, pixels, jnp.where(defined, depth, 1)).reshape(-1, 3)
     side = jnp.where(defined, depth, 0).reshape(-1) / mean_focal(camera.intrinsics)
-    count = side.size
-    chunk = min(_CHUNK, count)
-    pad = -count % chunk
-    points = jnp.pad(points, ((0, pad), (0, 0))).reshape(-1, chunk, 3)
-    side = jnp.pad(side, (0, pad)).reshape(-1, chunk)
-    reader = _Reader(camera.position, sources, pyramid, tuple(settings), finest)
-    found = jax.lax.map(lambda data: _gather_chunk(*data, reader, exclude), (points, side))
+    pad = -side.size % (_CHUNKS * _CHUNK)
+    points = jnp.pad(points, ((0, pad), (0, 0))).reshape(-1, _CHUNK, 3)
+    return points, jnp.pad(side, (0, pad)).reshape(-1, _CHUNK)
 
-    def restore(array):
-        array = array.reshape(-1, *array.shape[2:])[:count]
-        return array.reshape(*depth.shape, *array.shape[1:])
 
-    return jax.tree.map(restore, found)
+@functools.partial(jax.jit, static_argnames="settings")
+def _gather_chunks(points, side, reader, exclude, *, settings):
+    """`Gathered` of points in chunks, for each of the settings."""
+    position, sources, pyramid, finest = reader
+    reader = _Reader(position, sources, pyramid, settings, finest)
+
+    def gather_chunk(chunk):
+        gather = functools.partial(_gather_chunk, *chunk, reader, exclude)
+
+        def nothing():
+            zeros = jax.tree.map(jnp.zeros_like, jax.eval_shape(gather))
+            return tuple(one._replace(footprint=one.footprint + jnp.inf) for one in zeros)
+
+        return jax.lax.cond(jnp.any(chunk[1] > 0), gather, nothing)
+
+    return jax.lax.map(gather_chunk, (points, side))
+
+
+@functools.partial(jax.jit, static_argnames="shape")
+def _as_images(found, *, shape):
+    """What was found at points in chunks, as images of a shape."""
+
+    def one(array):
+        array = array.reshape(-1, *array.shape[2:])[: math.prod(shape)]
+        return array.reshape(*shape, *array.shape[1:])
+
+    return jax.tree.map(one, found)
 
 
 class _Reader(NamedTuple):

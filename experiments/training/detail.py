@@ -48,14 +48,12 @@ _TEXTS = ("key", "about")
 _WEIGHTS = ("center", "scale", "share", "actual")
 _LARGEST = 2**32  # bytes of a file that keeps detail
 
-_add = jax.jit(add_detail)
-
 
 def detailed(programs: Programs, detail: Detail, camera: Camera, rendering: Rendering) -> Detailed:
     """Add detail to a whole image that the programs rendered with `camera`."""
     pixels = pixel_grid(camera.height, camera.width)
     depth = label_depth(rendering, near=0, far=programs.scene.far)
-    return _add(detail, camera, pixels, rendering.rgb, rendering.alpha, depth)
+    return add_detail(detail, camera, pixels, rendering.rgb, rendering.alpha, depth)
 
 
 def detailed_views(programs: Programs, state: TrainState, detail: Detail, cameras: Camera) -> Views:
@@ -179,15 +177,10 @@ def _testify(detail, window):
     intrinsics = detail.shown.intrinsics[window.view, window.level]
     camera = own.replace(intrinsics=intrinsics, height=side, width=side)
     pixels = np.asarray(pixel_grid(side, side)) + window.corner
-    return Evidence(*map(np.asarray, _compare(detail, camera, pixels, window)))
-
-
-@jax.jit
-def _compare(detail, camera, pixels, window):
     seen = window.rgb, window.alpha, window.depth
     without = {"exclude": window.view, "finest": window.finest}
     found = find_candidates(detail, camera, pixels, *seen, **without)
-    return testify(found, window.residual, window.weight)
+    return jax.device_get(testify(found, window.residual, window.weight))
 
 
 def _hash(programs, state):
