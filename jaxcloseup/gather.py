@@ -5,7 +5,6 @@ render) show what the photographs know beyond a model.
 """
 
 import functools
-import itertools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -19,8 +18,8 @@ from jaxcloseup.geometry.cameras import Camera, mean_focal, pixels_to_points, po
 from jaxcloseup.geometry.visibility import sphere_in_view
 from jaxcloseup.geometry.warp import backward_warp
 from jaxcloseup.numerics import matmul, safe_divide, safe_norm
-from jaxcloseup.photographs import camera_at, to_float
-from jaxcloseup.pyramids import Pyramid
+from jaxcloseup.photographs import camera_at
+from jaxcloseup.pyramids import Pyramid, fractional_level, read_pyramid
 
 
 _CHUNK = 4096  # points that are culled together
@@ -326,9 +325,9 @@ def _add_view(sums, points, side, view, reader, references):
 
     @functools.cache  # parts that are read alike are read together
     def read(finer):
-        level = _level(-size - finer, coarseness)
+        level = fractional_level(-size - finer, coarseness)
         level = jnp.maximum(level, jnp.asarray(reader.finest, size.dtype))
-        return jnp.split(_read(pyramid, view, ray, level), len(sums), axis=-1)
+        return jnp.split(read_pyramid(pyramid, view, ray, level), len(sums), axis=-1)
 
     def add(so_far, part, settings, reference):
         difference = (depth * inverse - 1) / settings.tolerance
@@ -354,40 +353,6 @@ def _add_view(sums, points, side, view, reader, references):
 
     parts = zip(sums, range(len(sums)), reader.settings, references, strict=True)
     return tuple(add(*part) for part in parts)
-
-
-def _level(wanted, coarseness):
-    """The fractional level `[N]` that is `wanted[N]` coarser than the finest of `[L]` levels."""
-    level = jnp.zeros_like(wanted)
-    for before, after in itertools.pairwise(coarseness):
-        level += jnp.clip((wanted - before) / (after - before), 0, 1)
-    return level
-
-
-def _read(pyramid, view, ray, level):
-    """Values `[N, C]` of one view at rays (x / z, y / z) `[N, 2]` and fractional levels `[N]`."""
-    sizes, starts = (jnp.asarray(x, jnp.int32) for x in (pyramid.sizes, pyramid.starts))
-    finer = jnp.floor(jax.lax.stop_gradient(level)).astype(jnp.int32)
-    share = (level - finer.astype(level.dtype))[:, None]
-
-    def read(index):
-        index = jnp.minimum(index, len(pyramid.sizes) - 1)
-        height, width = sizes[index, 0], sizes[index, 1]
-        intrinsics = pyramid.intrinsics[view][index]
-        pixel = ray * intrinsics[:, :2] + intrinsics[:, 2:] - 0.5
-        corner = jnp.floor(jax.lax.stop_gradient(pixel))
-        wx, wy = jnp.moveaxis(pixel - corner, -1, 0)
-        x, y = jnp.moveaxis(jnp.clip(corner, -2.0, 2.0**20).astype(jnp.int32), -1, 0)
-
-        def tap(dx, dy):
-            row, column = jnp.clip(y + dy, 0, height - 1), jnp.clip(x + dx, 0, width - 1)
-            return to_float(pyramid.values[view, starts[index] + row * width + column])
-
-        top = (1 - wx)[:, None] * tap(0, 0) + wx[:, None] * tap(1, 0)
-        bottom = (1 - wx)[:, None] * tap(0, 1) + wx[:, None] * tap(1, 1)
-        return (1 - wy)[:, None] * top + wy[:, None] * bottom
-
-    return (1 - share) * read(finer) + share * read(finer + 1)
 
 
 def _may_see(camera, points, side):

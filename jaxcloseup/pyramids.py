@@ -10,7 +10,7 @@ import numpy as np
 from flax import struct
 
 from jaxcloseup.geometry.cameras import Camera, mean_focal
-from jaxcloseup.photographs import Views
+from jaxcloseup.photographs import Views, to_float
 from jaxcloseup.scene import Scene
 
 
@@ -155,3 +155,51 @@ def _halve(image, weight):
     shares = mean(weight)
     colors = mean(image * weight[..., None]) / np.maximum(shares, 1e-6)[..., None]
     return colors, shares
+
+
+def fractional_level(wanted: jax.Array, coarseness: jax.Array) -> jax.Array:
+    """The fractional level `[N]` that is `wanted[N]` coarser than the finest of `[L]` levels.
+
+    Args:
+      wanted: log2 of how much coarser.
+      coarseness: of the levels, from `Pyramid.coarseness`.
+    """
+    level = jnp.zeros_like(wanted)
+    for before, after in itertools.pairwise(coarseness):
+        level += jnp.clip((wanted - before) / (after - before), 0, 1)
+    return level
+
+
+def read_pyramid(
+    pyramid: Pyramid, view: jax.Array | int, ray: jax.Array, level: jax.Array
+) -> jax.Array:
+    """Values `[N, C]` of one view, linear between pixels and between levels.
+
+    Args:
+      pyramid: of all views.
+      view: which of them.
+      ray: `[N, 2]` x / z and y / z in the view's frame.
+      level: `[N]` fractional levels; 0 is the finest.
+    """
+    sizes, starts = (jnp.asarray(x, jnp.int32) for x in (pyramid.sizes, pyramid.starts))
+    finer = jnp.floor(jax.lax.stop_gradient(level)).astype(jnp.int32)
+    share = (level - finer.astype(level.dtype))[:, None]
+
+    def read(index):
+        index = jnp.minimum(index, len(pyramid.sizes) - 1)
+        height, width = sizes[index, 0], sizes[index, 1]
+        intrinsics = pyramid.intrinsics[view][index]
+        pixel = ray * intrinsics[:, :2] + intrinsics[:, 2:] - 0.5
+        corner = jnp.floor(jax.lax.stop_gradient(pixel))
+        wx, wy = jnp.moveaxis(pixel - corner, -1, 0)
+        x, y = jnp.moveaxis(jnp.clip(corner, -2.0, 2.0**20).astype(jnp.int32), -1, 0)
+
+        def tap(dx, dy):
+            row, column = jnp.clip(y + dy, 0, height - 1), jnp.clip(x + dx, 0, width - 1)
+            return to_float(pyramid.values[view, starts[index] + row * width + column])
+
+        top = (1 - wx)[:, None] * tap(0, 0) + wx[:, None] * tap(1, 0)
+        bottom = (1 - wx)[:, None] * tap(0, 1) + wx[:, None] * tap(1, 1)
+        return (1 - wy)[:, None] * top + wy[:, None] * bottom
+
+    return (1 - share) * read(finer) + share * read(finer + 1)

@@ -56,6 +56,7 @@ def serve(viser):
     """Return a function that serves a state at a free port; it returns the page and its address."""
     from experiments.viewing.page import Viewer
     from experiments.viewing.server import serve
+    from experiments.viewing.visitor import welcome_visitors
 
     servers = []
 
@@ -63,6 +64,7 @@ def serve(viser):
         port = free_port()
         servers.append(serve("127.0.0.1", port))
         page = Viewer(servers[0], programs, state, stage="closeup", seed=0)
+        call.visitors = welcome_visitors(servers[0], page)
         return page, f"http://127.0.0.1:{port}"
 
     with jax.numpy_dtype_promotion("standard"):
@@ -77,7 +79,7 @@ def test_a_closeup_is_chosen_and_rendered_in_a_browser(serve, kept, monkeypatch)
     def darker(programs, start, cameras, *, most, kept, tell):
         state = start.state
         tell(3, 10)
-        told.extend(visitor._status.content for visitor in page._visitors.values())
+        told.extend(visitor._status.content for visitor in serve.visitors.values())
         assert start.sources.depths.shape == programs.scene.train.weight.shape
         assert cameras.intrinsics.shape == (1, 4)
         return state.replace(params=state.params.replace(sh=state.params.sh - 1))

@@ -20,7 +20,7 @@ def main() -> None:
     """Serve the run that the flags name until Ctrl-C."""
     set_up()
     try:
-        from experiments.viewing import page, server
+        from experiments.viewing import page, server, visitor
     except ModuleNotFoundError as error:
         if error.name != "viser":
             raise
@@ -40,6 +40,7 @@ def main() -> None:
                 seed=record.identity["seed"],
                 kept=detail_path(record.folder, stage),
             )
+            visitor.welcome_visitors(viser_server, viewer)
     except (RunError, server.ServeError, SceneError, CheckpointError, OSError) as error:
         sys.exit(f"experiments.view: {error}")
     print(f"open http://{FLAGS.host}:{FLAGS.port} in a browser; press Ctrl-C to stop", flush=True)

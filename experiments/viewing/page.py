@@ -22,7 +22,6 @@ from experiments.viewing.frames import render_pictures
 from experiments.viewing.orientation import up_direction
 from experiments.viewing.picking import rank_views, ray_camera
 from experiments.viewing.server import Server
-from experiments.viewing.visitor import Visitor
 from jaxcloseup.artifacts.gaussians import Gaussians
 from jaxcloseup.artifacts.images import Image, to_uint8
 from jaxcloseup.detail import Detail
@@ -59,7 +58,7 @@ class Viewer:
         seed: int,
         kept: pathlib.Path | None = None,
     ) -> None:
-        """Wait for visitors.
+        """Show the scene on the server's pages; `welcome_visitors` fills them.
 
         Args:
           server: Viser's server.
@@ -73,7 +72,6 @@ class Viewer:
         self.title = f"{self.scene.name}, {stage}"
         self._seed, self._kept = seed, kept
         self._jobs: queue.Queue = queue.Queue(maxsize=1)
-        self._visitors: dict[int, Visitor] = {}
         cameras = self.scene.train.cameras
         positions, rotations = (np.asarray(a) for a in (cameras.position, cameras.rotation))
         near, far = self.scene.near, self.scene.far
@@ -89,8 +87,6 @@ class Viewer:
             background = programs.method.background(programs.preset.field)
             server.scene.set_background_image(to_uint8(np.full((1, 1), background)))
         server.gui.set_panel_label(self.title)
-        server.on_client_connect(self._welcome)
-        server.on_client_disconnect(self._forget)
 
     def work(self, timeout: float | None = None) -> None:
         """Wait for one job, and run it.
@@ -129,14 +125,6 @@ class Viewer:
             self._jobs.put_nowait((what, job, say))
         except queue.Full:
             say(_BUSY)
-
-    def _welcome(self, client):
-        self._visitors[client.client_id] = Visitor(self, client)
-
-    def _forget(self, client):
-        visitor = self._visitors.pop(client.client_id, None)
-        if visitor is not None:
-            visitor.leave()
 
     def _thumbnail(self, index):
         camera = self.scene.camera("train", index)

@@ -3,18 +3,16 @@
 import functools
 import threading
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from viser.transforms import SO3
 
+from experiments.viewing.page import Viewer
 from experiments.viewing.picking import closeup_camera, vertical_fov, viewer_camera
+from experiments.viewing.server import Server
 from jaxcloseup.artifacts.images import color_counts, encode_png, to_uint8
 from jaxcloseup.geometry.cameras import Camera
-
-
-if TYPE_CHECKING:
-    from experiments.viewing.page import Viewer
 
 
 _HELP = """Click on the scene to place the red close-up camera in front of that point.
@@ -25,10 +23,32 @@ _REST = 0.3  # seconds without a move after which colors are those of the new po
 _TINT = 0.7  # share of the colors of support where they are shown
 
 
+def welcome_visitors(server: Server, viewer: Viewer) -> "dict[int, Visitor]":
+    """Fill the page of each client that connects to a server; returns the visitors who are there.
+
+    Args:
+      server: Viser's server.
+      viewer: what all of them see.
+    """
+    visitors: dict[int, Visitor] = {}
+
+    def welcome(client):
+        visitors[client.client_id] = Visitor(viewer, client)
+
+    def forget(client):
+        visitor = visitors.pop(client.client_id, None)
+        if visitor is not None:
+            visitor.leave()
+
+    server.on_client_connect(welcome)
+    server.on_client_disconnect(forget)
+    return visitors
+
+
 class Visitor:
     """One visitor's page. Nothing of it is shared but the run, and what it has worked out."""
 
-    def __init__(self, viewer: "Viewer", client: Any) -> None:
+    def __init__(self, viewer: Viewer, client: Any) -> None:
         """Fill the page of a client of Viser's server."""
         self._viewer, self._client = viewer, client
         self._camera: Camera | None = None  # the close-up camera
