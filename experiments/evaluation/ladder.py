@@ -74,11 +74,13 @@ def _anchor(key: jax.Array, camera: Camera, depth: jax.Array, seen: jax.Array) -
     return pixels_to_points(camera, pixel, depth[row, column])
 
 
+@jax.jit
 def _nearer(camera: Camera, anchor: jax.Array, magnification: float) -> Camera:
     position = closeup_position(anchor, camera.position, magnification)
     return camera.replace(camtoworld=camera.camtoworld.at[:, 3].set(position))
 
 
+@jax.jit
 def _wider(camera: Camera, magnification: float) -> Camera:
     focal = camera.intrinsics[:2] * magnification
     return camera.replace(intrinsics=camera.intrinsics.at[:2].set(focal))

@@ -124,6 +124,7 @@ def make_targets(
         # Quarters of finer views are mostly as large as the others: one program serves both.
         surface = functools.partial(in_quarters, surface)
     count = jax.jit(count_seen)
+    rgb_of, weight_of = jax.device_get((views.rgb, views.weight))
 
     def make(i):
         camera, (width, height) = camera_at(views.cameras, i), sizes[i]
@@ -133,8 +134,8 @@ def make_targets(
         depth = exact.depth if exact else render(camera).depth
         pixels = pixel_grid(camera.height, camera.width)
         seen = count(camera, pixels, depth, scene.train, train_depths)[:height, :width]
-        rgb = to_float(jnp.asarray(views.rgb[i, :height, :width]))
-        weight = jnp.asarray(views.weight[i, :height, :width])
+        rgb = jnp.asarray(to_float(rgb_of[i, :height, :width]))
+        weight = jnp.asarray(weight_of[i, :height, :width])
         return Target(scene.names[split][i], camera, rgb, weight, seen, exact, landmarks)
 
     return list(progress.each(make, range(len(sizes)), f"truth of {split}"))

@@ -7,7 +7,7 @@ import pathlib
 from collections.abc import Callable
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 import optax
 
 from experiments import progress
@@ -237,20 +237,22 @@ def refine(
     free = config.capacity - int(buffers.alive.sum())
     each = min(max(0, free) // views, math.prod(pyramid.sizes[level]))
     kind = {"sh_degree": config.sh_degree, "num_scales": config.num_scales}
-    sample = jax.jit(functools.partial(surfels_where_wrong, count=each, **kind))
     # With all rows, so that what is compiled here is what renders the field later.
-    shown = jax.tree.map(
-        lambda leaf: pad_rows(leaf, config.capacity) if leaf.ndim else leaf, (surfels, buffers)
-    )
+    shown = _with_rows((surfels, buffers), config.capacity)
+
+    @jax.jit
+    def sample(key, camera, photograph, seen):
+        photograph = to_float(photograph)
+        data = photograph[..., :3], photograph[..., 3], seen.rgb, label_depth(seen)
+        return surfels_where_wrong(key, camera, *data, count=each, **kind)
 
     def search(view):
         camera = pyramid.camera(camera_at(cameras, view), view, level)
-        photograph, seen = to_float(pyramid.image(view, level)), render(*shown, camera)
-        data = photograph[..., :3], photograph[..., 3], seen.rgb, label_depth(seen)
-        return sample(jax.random.fold_in(key, view), camera, *data)
+        data = camera, pyramid.image(view, level), render(*shown, camera)
+        return sample(jax.random.fold_in(key, view), *data)
 
     new = progress.each(search, range(views), "photographs searched")
-    new = jax.tree.map(lambda *rows: jnp.concatenate(rows), *new)
+    new = jax.tree.map(lambda *rows: np.concatenate(rows), *new)
     # The filter of finer photographs is smaller, so what the coarse one made stays as it is.
     old = smoothed(surfels, buffers.interval), buffers.alive
     surfels, alive = join_surfels(old, new, config.capacity)
@@ -258,6 +260,11 @@ def refine(
     if photographs is not None:
         interval = sampling_intervals(surfels.means, photographs, near=_near(config, scene))
     return surfels, buffers.replace(alive=alive, interval=interval)
+
+
+@functools.partial(jax.jit, static_argnames="rows")
+def _with_rows(tree, rows):
+    return jax.tree.map(lambda leaf: pad_rows(leaf, rows) if leaf.ndim else leaf, tree)
 
 
 METHOD = Method(

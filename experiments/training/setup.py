@@ -126,7 +126,8 @@ class Training:
                 *(render, programs.scene, pyramid),
             )
         none = jnp.zeros_like(state.step)
-        return TrainState(none, params, buffers, programs.optimizer.init(params), key_fine)
+        moments = jax.jit(programs.optimizer.init)(params)
+        return TrainState(none, params, buffers, moments, key_fine)
 
 
 def identity_of(scene: Scene, preset: Preset, names: Mapping[str, str]) -> dict[str, Any]:

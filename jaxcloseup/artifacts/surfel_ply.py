@@ -17,6 +17,9 @@ from jaxcloseup.ply import PlyError, read_vertices, write_vertices
 from jaxcloseup.splats.surfels import Surfels
 
 
+_matrices = jax.jit(quaternion_to_matrix)
+
+
 def write_surfels(
     path: str | pathlib.Path, surfels: Surfels, alive: jax.Array, *, num_scales: int = 3
 ) -> int:
@@ -41,7 +44,7 @@ def write_surfels(
     surfels, alive = jax.device_get((surfels, alive))
     sh = np.asarray(surfels.sh, np.float32)
     scales = np.asarray(surfels.log_scales, np.float32)
-    normals = np.asarray(quaternion_to_matrix(jnp.asarray(surfels.quaternions)))[..., 2]
+    normals = np.asarray(_matrices(surfels.quaternions))[..., 2]
     if scales.shape[1] == 3:
         if num_scales == 2:
             raise ValueError("volumetric Gaussians have three scales: num_scales must be 3")
