@@ -29,6 +29,9 @@ from jaxcloseup.windows import Windows, in_quarters, photograph_windows
 
 
 HOSTS_WAIT = 24 * 3600  # seconds
+# Images this many times twice as wide as training's are rendered in quarters on a CPU, which is as
+# fast as whole, and needs no program more. Wider ones are faster whole.
+_QUARTERED = 2
 
 
 class Programs:
@@ -240,11 +243,10 @@ class Programs:
     def render(self, state: TrainState, camera: Camera, key: jax.Array | None = None) -> Rendering:
         """Render a whole image; without a key, deterministically.
 
-        `aux` is for the field alone, and large images have none.
+        `aux` is for the field alone, and images in quarters have none.
         """
         doublings = math.floor(math.log2(camera.width / self._width) + 0.4)
-        if doublings > 1 and key is None and jax.default_backend() == "cpu":
-            # To compile the renderer for one more size takes as long as dozens of images.
+        if doublings == _QUARTERED and key is None and jax.default_backend() == "cpu":
             return in_quarters(lambda part: self._render_part(state, part), camera)
         programs = self._for_doublings(doublings)
         while True:
