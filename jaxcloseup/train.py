@@ -351,11 +351,18 @@ def _advance(state, key, value, gradients, lr_scale, *, update, adapt):
 
     updates, opt_state = update(gradients, state.opt_state, state.params)
     updates = jax.tree.map(lambda leaf: lr_scale.astype(leaf.dtype) * leaf, updates)
-    moved = optax.apply_updates(state.params, updates), opt_state
+    new = optax.apply_updates(state.params, updates), opt_state
     # Selected, not in a branch of a conditional, which would copy everything once more.
     params, opt_state = jax.tree.map(
-        lambda new, old: jnp.where(finite, new, old), moved, (state.params, state.opt_state)
+        lambda new, old: jnp.where(finite, new, old), new, (state.params, state.opt_state)
     )
-    after = state.replace(step=state.step + 1, params=params, opt_state=opt_state)
-    after = jax.lax.cond(finite, lambda: adapt(key, after), lambda: after)
+    moved = state.replace(step=state.step + 1, params=params, opt_state=opt_state)
+
+    def changed(state):
+        return state.params, state.buffers, state.opt_state
+
+    params, buffers, opt_state = jax.lax.cond(
+        finite, lambda: changed(adapt(key, moved)), lambda: changed(moved)
+    )
+    after = moved.replace(params=params, buffers=buffers, opt_state=opt_state)
     return after, 1 - finite.astype(jnp.float32)

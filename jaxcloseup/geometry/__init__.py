@@ -13,6 +13,7 @@ Conventions of every module:
 
 from jaxcloseup.geometry.cameras import (
     Camera,
+    crop_camera,
     mean_focal,
     pixel_grid,
     pixels_to_points,
@@ -53,6 +54,7 @@ __all__ = [
     "backward_warp",
     "block_sources",
     "closeup_position",
+    "crop_camera",
     "depth_consistent",
     "draw_nearest",
     "euler_to_matrix",
