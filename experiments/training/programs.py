@@ -29,8 +29,8 @@ from jaxcloseup.windows import Windows, in_quarters, photograph_windows
 
 
 HOSTS_WAIT = 24 * 3600  # seconds
-# Images this many times twice as wide as training's are rendered in quarters on a CPU, which is as
-# fast as whole, and needs no program more. Wider ones are faster whole.
+# Images 2^2 times as wide as training's are rendered in quarters on a CPU: that is as fast, and
+# needs no program of their own. Wider ones are faster whole.
 _QUARTERED = 2
 
 
