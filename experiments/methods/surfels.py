@@ -107,7 +107,7 @@ REDUCED = Preset(
 )
 
 # First a coarse model, fast; then small surfels where photographs show more, taught by windows.
-# A surfel larger than that bound may hide in all photographs, and cost the close-ups 1 to 3 dB.
+# A surfel above `max_scale` may hide from all photographs, and cost the close-ups 1 to 3 dB.
 QUICK = dataclasses.replace(
     REDUCED,
     field=dataclasses.replace(

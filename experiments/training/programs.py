@@ -247,7 +247,9 @@ class Programs:
         """
         doublings = math.floor(math.log2(camera.width / self._width) + 0.4)
         if doublings == _QUARTERED and key is None and jax.default_backend() == "cpu":
-            return in_quarters(lambda part: self._render_part(state, part), camera)
+            # The rest of a rendering is not per pixel, and cannot be joined.
+            per_pixel = {"aux": (), "overflow": None}
+            return in_quarters(lambda part: self.render(state, part)._replace(**per_pixel), camera)
         programs = self._for_doublings(doublings)
         while True:
             growth = programs.growth
@@ -256,10 +258,6 @@ class Programs:
             if rendering.overflow is None or not int(rendering.overflow):
                 return rendering
             programs._grow(growth)
-
-    def _render_part(self, state: TrainState, camera: Camera) -> Rendering:
-        """A rendering whose arrays are all per pixel."""
-        return self.render(state, camera)._replace(aux=(), overflow=None)
 
 
 def _mesh_of_windows(windows: int) -> Mesh | None:
