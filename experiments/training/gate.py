@@ -4,7 +4,7 @@ The model has learned its training photographs, so it beats labels there even if
 improve it elsewhere. The gate therefore measures on how many pixels a label's two warps and the
 depth agree closely. That share separates captures on which labels help from those on which they
 harm: it is about a tenth where colors or depth are poor, and a fifth to a third where labels help
-(docs/results.md has the figures).
+(docs/labels.md has the figures).
 """
 
 import functools

@@ -65,7 +65,7 @@ class RasterizeConfig:
 def for_image(config: RasterizeConfig, *, height: int, width: int) -> RasterizeConfig:
     """The settings with the sizes that are fastest for an image, where they leave them open.
 
-    Small tiles evaluate fewer splats in vain, but more pairs have to be sorted; docs/results.md
+    Small tiles evaluate fewer splats in vain, but more pairs have to be sorted; docs/speed.md
     has the times on a CPU. Small tiles that are chosen here get three times the `capacity`, since
     splats touch two to three times as many. A GPU evaluates thousands of tiles at once: its sizes
     are a guess.
