@@ -148,9 +148,10 @@ def _exhibition(shown, stage):
     if not shown:
         return []
     parts = [
-        "<h2>Close-ups</h2><p class=quiet>The held-out close-ups with the highest, the middle and "
-        "the lowest PSNR. Move across a picture: on its left is what the photograph that shows "
-        "most of this place has, cut out, and on its right what this run renders.</p>"
+        "<h2>Close-ups beside photographs</h2><p class=quiet>The held-out close-ups with the "
+        "highest, the middle and the lowest PSNR. Move across a picture: on its left is what the "
+        "photograph that shows most of this place has, cut out, and on its right what this run "
+        "renders.</p>"
     ]
     for one in shown:
         psnr = f"{one.name}: {stage}, {one.psnr:.1f} dB"
