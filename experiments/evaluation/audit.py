@@ -230,12 +230,9 @@ def audit_left_out(
       any, and `coverage`, the share of labeled pixels.
     """
     sums = np.zeros((len(candidates), 4))
-    for index in _spread(sources.views, count):
-        seen = render(camera_at(sources.views.cameras, index))
-        label_by = _leave_out(index, label_depth(seen), sources)
-        truth, weight = to_float(sources.views.rgb[index]), sources.views.weight[index]
+    for label_by, model, truth, weight in _left_out(sources, render, count):
         for row, settings in enumerate(candidates):
-            sums[row] += _compare(label_by(settings), seen.rgb, truth, weight)
+            sums[row] += _compare(label_by(settings), model, truth, weight)
     rows = []
     for label, model, kept, total in sums:
         of_label, of_model = (
@@ -261,15 +258,13 @@ def left_out_curve(
     """
     found: list[tuple[np.ndarray, ...]] = []
     total = 0
-    for index in _spread(sources.views, count):
-        seen = render(camera_at(sources.views.cameras, index))
-        label = _leave_out(index, label_depth(seen), sources)(_any_color(settings))
-        truth, weight = to_float(sources.views.rgb[index]), sources.views.weight[index]
+    for label_by, model, truth, weight in _left_out(sources, render, count):
+        label = label_by(_any_color(settings))
         inside = np.asarray(label.weight * weight) > 0
         columns = (
             np.abs(label.backward - label.forward).max(axis=-1),
             np.abs(label.rgb - truth).mean(axis=-1),
-            np.abs(jnp.clip(seen.rgb, 0, 1) - truth).mean(axis=-1),
+            np.abs(jnp.clip(model, 0, 1) - truth).mean(axis=-1),
         )
         found.append(tuple(column[inside] for column in columns))
         total += int(np.sum(np.asarray(weight) > 0))
@@ -277,19 +272,23 @@ def left_out_curve(
     return error_curve(score, error, total, {"model": model})
 
 
-def _spread(views, count):
-    return np.unique(np.linspace(0, len(views) - 1, count).round().astype(int))
+def _left_out(sources, render, count):
+    """Left-out photographs, spread evenly.
 
-
-def _leave_out(index, depth, sources):
-    """A function of settings that labels a training photograph from the others."""
+    For each, a function of settings that labels it from the others; the model's colors; the
+    photograph; the weight of its pixels.
+    """
     views, depths = sources.views, sources.depths
-    camera = camera_at(views.cameras, index)
-    others = views.replace(weight=views.weight.at[index].set(0))
-    source = jax.jit(best_source)(camera, others, depths, depth=depth)
-    pixels = pixel_grid(camera.height, camera.width)
-    without = jax.jit(label_sources)(others, depths)
-    return functools.partial(label_pixels, camera, pixels, depth, source, without)
+    for index in np.unique(np.linspace(0, len(views) - 1, count).round().astype(int)):
+        camera = camera_at(views.cameras, index)
+        seen = render(camera)
+        depth = label_depth(seen)
+        others = views.replace(weight=views.weight.at[index].set(0))
+        source = jax.jit(best_source)(camera, others, depths, depth=depth)
+        pixels = pixel_grid(camera.height, camera.width)
+        without = jax.jit(label_sources)(others, depths)
+        label_by = functools.partial(label_pixels, camera, pixels, depth, source, without)
+        yield label_by, seen.rgb, to_float(views.rgb[index]), views.weight[index]
 
 
 @jax.jit

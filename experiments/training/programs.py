@@ -137,6 +137,13 @@ class Programs:
         return self._pyramids[finest]
 
     @functools.cached_property
+    def coarse(self) -> "Programs":
+        """What trains the preset's coarse model; all seeds share it."""
+        field = self.preset.coarse.field
+        preset = dataclasses.replace(self.preset, field=field, coarse=None, windows=None)
+        return Programs(preset, self.scene)
+
+    @functools.cached_property
     def photographs(self) -> Views | Windows:
         """What steps learn from: reduced photographs, or windows or pixels of finer ones."""
         views, windows = self.scene.train, self.preset.windows

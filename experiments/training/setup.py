@@ -109,8 +109,7 @@ class Training:
     def _train_coarse(self, stage: str, seed: int) -> TrainState:
         """The state of `preset.coarse`, with the room and the detail of the preset itself."""
         programs, preset = self.programs, self.programs.preset
-        first = dataclasses.replace(preset, field=preset.coarse.field, coarse=None, windows=None)
-        coarse = dataclasses.replace(self, programs=Programs(first, programs.scene))
+        coarse = dataclasses.replace(self, programs=programs.coarse)
         start = initial_state(coarse.programs, seed)
         views, steps = coarse.programs.photographs, preset.coarse.steps
         state = coarse.train(f"coarse_{stage}", "photographs", start, views, steps=steps)
