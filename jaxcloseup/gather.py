@@ -169,7 +169,7 @@ def gather_parts(
 ) -> tuple[Gathered, ...]:
     """Gather equal parts of a pyramid's channels, each by settings of its own, in one visit.
 
-    Outside `jax.jit`, all views of up to 32,768 pixels share what takes long to compile.
+    Outside `jax.jit`, views of all sizes share what takes long to compile.
 
     Args:
       camera: camera of the view.
@@ -192,7 +192,14 @@ def gather_parts(
     points, side = _surface(camera, pixels, depth)
     view, level = (jnp.asarray(index, jnp.int32) for index in (exclude, finest))
     reader = camera.position, sources, pyramid, level
-    found = _gather_chunks(points, side, reader, view, settings=tuple(settings))
+    # Larger views have several blocks of chunks, which a CPU's cores share. In a trace these would
+    # be as many copies of the program.
+    size = len(points) if isinstance(points, jax.core.Tracer) else _CHUNKS
+    found = [
+        _gather_chunks(*block, reader, view, settings=tuple(settings))
+        for start in range(0, len(points), size)
+        for block in [(points[start : start + size], side[start : start + size])]
+    ]
     return _as_images(found, shape=depth.shape)
 
 
@@ -230,13 +237,14 @@ def _gather_chunks(points, side, reader, exclude, *, settings):
 
 @functools.partial(jax.jit, static_argnames="shape")
 def _as_images(found, *, shape):
-    """What was found at points in chunks, as images of a shape."""
+    """What was found at points in blocks of chunks, as images of a shape."""
 
-    def one(array):
+    def one(*blocks):
+        array = jnp.concatenate(blocks)
         array = array.reshape(-1, *array.shape[2:])[: math.prod(shape)]
         return array.reshape(*shape, *array.shape[1:])
 
-    return jax.tree.map(one, found)
+    return jax.tree.map(one, *found)
 
 
 class _Reader(NamedTuple):

@@ -105,6 +105,17 @@ def test_parts_are_gathered_as_if_alone(capture, closeup):
         gather_parts(camera, GRID, depth, sources, twice, (strict,) * 4)
 
 
+def test_a_view_of_several_blocks_is_gathered_as_if_its_parts_were_alone(capture, closeup):
+    camera, depth = closeup
+    copies = 2**15 // depth.size + 1
+    pixels, depths = jnp.tile(GRID, (copies, 1, 1)), jnp.tile(depth, (copies, 1))
+    found = gather(camera, pixels, depths, *capture, SETTINGS)
+    alone = gathered(camera, GRID, depth, *capture)
+    for own, other in zip(found, alone, strict=True):
+        own = np.asarray(own).reshape(copies, *other.shape)
+        np.testing.assert_allclose(own, np.broadcast_to(other, own.shape), rtol=1e-5, atol=1e-5)
+
+
 def test_undefined_depth_gathers_nothing(capture, closeup):
     camera, depth = closeup
     found = gathered(camera, GRID, depth, *capture, exclude=-1, finest=0)
