@@ -189,32 +189,31 @@ def gather_parts(
         raise ValueError(
             f"{pyramid.values.shape[-1]} channels are not {len(settings)} parts of one size"
         )
-    points, side = _surface(camera, pixels, depth)
     view, level = (jnp.asarray(index, jnp.int32) for index in (exclude, finest))
     reader = camera.position, sources, pyramid, level
-    # Larger views have several blocks of chunks, which a CPU's cores share. In a trace these would
-    # be as many copies of the program.
-    size = len(points) if isinstance(points, jax.core.Tracer) else _CHUNKS
+    # Blocks of one size share a program; in a trace, each would be a copy of it.
+    traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((camera, pixels, depth)))
     found = [
-        _gather_chunks(*block, reader, view, settings=tuple(settings))
-        for start in range(0, len(points), size)
-        for block in [(points[start : start + size], side[start : start + size])]
+        _gather_chunks(points, side, reader, view, settings=tuple(settings))
+        for points, side in _surface(camera, pixels, depth, whole=traced)
     ]
     return _as_images(found, shape=depth.shape)
 
 
-@jax.jit
-def _surface(camera, pixels, depth):
-    """Points `[K, N, 3]` of a view in chunks, and sides `[K, N]` of its pixels there.
+@functools.partial(jax.jit, static_argnames="whole")
+def _surface(camera, pixels, depth, *, whole):
+    """Points `[K, N, 3]` of a view in chunks, and sides `[K, N]` of its pixels there, in blocks.
 
-    The side is 0 where depth is undefined, and behind the last pixel.
+    The side is 0 where depth is undefined, and behind the last pixel. `whole` makes one block.
     """
     defined = (depth > 0) & jnp.isfinite(depth)
     points = pixels_to_points(camera, pixels, jnp.where(defined, depth, 1)).reshape(-1, 3)
     side = jnp.where(defined, depth, 0).reshape(-1) / mean_focal(camera.intrinsics)
     pad = -side.size % (_CHUNKS * _CHUNK)
     points = jnp.pad(points, ((0, pad), (0, 0))).reshape(-1, _CHUNK, 3)
-    return points, jnp.pad(side, (0, pad)).reshape(-1, _CHUNK)
+    side = jnp.pad(side, (0, pad)).reshape(-1, _CHUNK)
+    blocks = 1 if whole else max(1, len(side) // _CHUNKS)
+    return list(zip(jnp.split(points, blocks), jnp.split(side, blocks), strict=True))
 
 
 @functools.partial(jax.jit, static_argnames="settings")
