@@ -276,7 +276,7 @@ def test_a_resumed_training_is_the_same_to_the_last_bit(name, capture_folder, tm
     jax.tree.map(np.testing.assert_array_equal, ended.opt_state, whole.opt_state)
 
 
-@pytest.mark.parametrize("name", ["ngp", "tensorf"])
+@pytest.mark.parametrize("name", TRAINED)
 def test_a_batch_of_steps_is_these_steps_alone(name, capture_folder):
     """The arms of a sweep are such a batch; `test_sweep` has all that fields do not see of it."""
     with jax.numpy_dtype_promotion("standard"):
