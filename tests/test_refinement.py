@@ -8,7 +8,13 @@ import pytest
 
 from jaxcloseup.geometry.cameras import points_to_pixels
 from jaxcloseup.geometry.rotations import quaternion_to_matrix
-from jaxcloseup.splats.refinement import IN_FRONT, SIZE, join_surfels, surfels_where_wrong
+from jaxcloseup.splats.refinement import (
+    IN_FRONT,
+    SIZE,
+    join_surfels,
+    replace_least,
+    surfels_where_wrong,
+)
 from jaxcloseup.splats.spherical_harmonics import sh_to_rgb
 
 
@@ -72,3 +78,25 @@ def test_joined_surfels_are_the_living_ones_of_both(found):
     fewer, alive = join_surfels(old, new, 10)
     assert alive.all()
     np.testing.assert_array_equal(fewer.means, surfels.means[:10])
+
+
+def test_new_surfels_take_free_rows_then_those_that_show_least(found):
+    """Opacity times area: a faint large surfel shows more than an opaque tiny one."""
+    _, _, _, (drawn, _) = found
+    old, new = (jax.tree.map(lambda x, s=part: x[s], drawn) for part in (slice(6), slice(6, 9)))
+    opacity, scale = np.array([0.5, 0.9, 0.9, 0.1, 0.9, 0.9]), np.array([3, 1, 2, 4, 9, 9])
+    old = old.replace(
+        opacity_logits=jnp.log(opacity / (1 - opacity)),
+        log_scales=jnp.log(jnp.stack([scale, scale], axis=-1) / 100),
+    )  # opacity times area: 4.5, 0.9, 3.6, 1.6, -, 72.9
+    alive = jnp.array([True, True, True, True, False, True])
+    surfels, living, changed = replace_least(old, alive, new, jnp.array([True, False, True]))
+    np.testing.assert_array_equal(changed, [False, True, False, False, True, False])
+    assert living.all()
+    np.testing.assert_array_equal(surfels.means[4], new.means[0])
+    np.testing.assert_array_equal(surfels.sh[1], new.sh[2])
+    kept = np.array([0, 2, 3, 5])
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[kept], b[kept]), surfels, old)
+    none, living, changed = replace_least(old, alive, new, jnp.zeros(3, bool))
+    jax.tree.map(np.testing.assert_array_equal, none, old)
+    assert not changed.any() and np.array_equal(living, alive)

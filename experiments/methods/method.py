@@ -14,7 +14,7 @@ from jaxcloseup.field import RadianceField
 from jaxcloseup.geometry.poses import PoseSettings
 from jaxcloseup.pseudo import PseudoSettings
 from jaxcloseup.scene import Scene
-from jaxcloseup.train import TrainConfig
+from jaxcloseup.train import TrainConfig, TrainState
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,11 +84,14 @@ class TargetConfig:
       label: as in `LabelConfig`.
       label_loss_weight: as there.
       lr_scale: as there.
+      control_lr_scale: the same for as many steps without labels, `test_time_control`, which may
+        learn best at other rates.
     """
 
     label: str = "warp"
     label_loss_weight: float = 0.5
     lr_scale: float = 1.0
+    control_lr_scale: float = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,7 +161,8 @@ class Preset:
         """How target views are labeled."""
         if self.targets is None:
             return self.labels
-        return dataclasses.replace(self.labels, **vars(self.targets))
+        own = {k: v for k, v in vars(self.targets).items() if k != "control_lr_scale"}
+        return dataclasses.replace(self.labels, **own)
 
 
 class Method(NamedTuple):
@@ -184,6 +188,8 @@ class Method(NamedTuple):
         what `CoarseConfig` trained the room and the detail of `config`; `render(params, buffers,
         camera)` renders a state with this room, `pyramid` holds the scene's training photographs.
         None for methods without `coarse`.
+      add_for_targets: `(key, config, state, labels, render, scene) -> state` with what `labels` of
+        target views show and `render(camera)` of the state does not.
     """
 
     presets: Mapping[str, Preset]
@@ -197,3 +203,4 @@ class Method(NamedTuple):
     gaussians: Callable[[Any, Any, Any], Gaussians] | None = None
     background: Callable[[Any], float] = lambda config: 0.0
     refine: Callable[..., tuple[Any, Any]] | None = None
+    add_for_targets: Callable[..., TrainState] = lambda key, config, state, *data: state

@@ -24,11 +24,12 @@ from jaxcloseup.artifacts.surfel_ply import write_surfels
 from jaxcloseup.field import RadianceField, Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.label_rules import label_depth
-from jaxcloseup.photographs import camera_at, to_float
+from jaxcloseup.photographs import Views, camera_at, to_float
 from jaxcloseup.pyramids import Pyramid
 from jaxcloseup.scene import Scene
 from jaxcloseup.splats.adaptive import AdaptiveConfig
 from jaxcloseup.splats.config import SurfelConfig
+from jaxcloseup.splats.control import replace_surfels
 from jaxcloseup.splats.field import (
     SurfelBuffers,
     camera_extent,
@@ -39,9 +40,9 @@ from jaxcloseup.splats.field import (
 from jaxcloseup.splats.filters import sampling_intervals, smoothed
 from jaxcloseup.splats.mcmc import McmcConfig
 from jaxcloseup.splats.rasterize import RasterizeConfig
-from jaxcloseup.splats.refinement import join_surfels, surfels_where_wrong
+from jaxcloseup.splats.refinement import join_surfels, replace_least, surfels_where_wrong
 from jaxcloseup.splats.surfels import Surfels, pad_rows
-from jaxcloseup.train import TrainConfig
+from jaxcloseup.train import TrainConfig, TrainState
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,12 +52,15 @@ class SplatTraining:
     Attributes:
       steps_per_target: steps for each target view.
       fewest_target_steps: steps for all of them, at least.
+      surfels_per_target: splats that each target view gets where its labels show more, in place of
+        those that show least.
       smoothed_at: divisor of the photographs' size whose pixels bound how small splats are, by the
         smoothing filter in space, see `filters`; at least training's size. None has no filter.
     """
 
     steps_per_target: int = 5
     fewest_target_steps: int = 1
+    surfels_per_target: int = 0
     smoothed_at: int | None = None
 
 
@@ -65,6 +69,7 @@ class SurfelTrainingConfig(SplatTraining, SurfelConfig):
     """Surfels and their training."""
 
 
+_REPLACED = 0.2  # share of all splats that target views may replace
 _REFINED_AT = 4  # times the photographs' training size, at which new surfels are looked for
 WHOLE_IMAGES = TrainConfig(num_rays=None, num_label_rays=None)
 
@@ -122,6 +127,7 @@ QUICK = dataclasses.replace(
         selective_adam=True,
         steps_per_target=20,
         fewest_target_steps=60,
+        surfels_per_target=1000,
         density=McmcConfig(start=0, stop=700, growth=1.0, noise=0.0),
         raster=RasterizeConfig(capacity=2**17, antialias=True),
     ),
@@ -134,7 +140,7 @@ QUICK = dataclasses.replace(
         steps=1500,
     ),
     windows=WindowConfig(),
-    targets=TargetConfig("residual", label_loss_weight=0.5, lr_scale=5.0),
+    targets=TargetConfig("residual", label_loss_weight=0.5, lr_scale=10.0),
     score_downscale=4,
     baseline_steps=2500,
 )
@@ -240,26 +246,61 @@ def refine(
     # With all rows, so that what is compiled here is what renders the field later.
     shown = _with_rows((surfels, buffers), config.capacity)
 
-    @jax.jit
-    def sample(key, camera, photograph, seen):
-        photograph = to_float(photograph)
-        data = photograph[..., :3], photograph[..., 3], seen.rgb, label_depth(seen)
-        return surfels_where_wrong(key, camera, *data, count=each, **kind)
-
     def search(view):
         camera = pyramid.camera(camera_at(cameras, view), view, level)
-        data = camera, pyramid.image(view, level), render(*shown, camera)
-        return sample(jax.random.fold_in(key, view), *data)
+        photograph, seen = to_float(pyramid.image(view, level)), render(*shown, camera)
+        data = photograph[..., :3], photograph[..., 3], seen.rgb, label_depth(seen)
+        return _sample(jax.random.fold_in(key, view), camera, *data, count=each, **kind)
 
     new = progress.each(search, range(views), "photographs searched")
     new = jax.tree.map(lambda *rows: np.concatenate(rows), *new)
     # The filter of finer photographs is smaller, so what the coarse one made stays as it is.
     old = smoothed(surfels, buffers.interval), buffers.alive
     surfels, alive = join_surfels(old, new, config.capacity)
-    photographs, interval = _photographs(config, scene), None
-    if photographs is not None:
-        interval = sampling_intervals(surfels.means, photographs, near=_near(config, scene))
-    return surfels, buffers.replace(alive=alive, interval=interval)
+    return surfels, buffers.replace(alive=alive, interval=_intervals(config, surfels, scene))
+
+
+def _intervals(config, surfels, scene):
+    """Intervals of the smoothing filter, or None without it."""
+    photographs = _photographs(config, scene)
+    if photographs is None:
+        return None
+    return sampling_intervals(surfels.means, photographs, near=_near(config, scene))
+
+
+def add_for_targets(
+    key: jax.Array,
+    config: SplatTraining,
+    state: TrainState,
+    labels: Views,
+    render: Callable[[Camera], Rendering],
+    scene: Scene,
+) -> TrainState:
+    """Put splats where labels of target views show more, in place of those that show least."""
+    count, height, width = labels.weight.shape
+    room = int(_REPLACED * config.capacity) // count
+    each = min(config.surfels_per_target, room, height * width)
+    if each == 0:
+        return state
+
+    def search(view):
+        camera = camera_at(labels.cameras, view)
+        seen = render(camera)
+        data = labels.rgb[view], labels.weight[view], seen.rgb, label_depth(seen)
+        return _sample(
+            *(jax.random.fold_in(key, view), camera, *data),
+            **{"count": each, "sh_degree": config.sh_degree, "num_scales": config.num_scales},
+        )
+
+    new = progress.each(search, range(count), "views searched for more")
+    new = jax.tree.map(lambda *rows: np.concatenate(rows), *new)
+    surfels, alive, changed = replace_least(state.params, state.buffers.alive, *new)
+    state = replace_surfels(state, surfels, alive, changed)
+    interval = _intervals(config, surfels, scene)
+    return state.replace(buffers=state.buffers.replace(interval=interval))
+
+
+_sample = jax.jit(surfels_where_wrong, static_argnames=("count", "sh_degree", "num_scales"))
 
 
 @functools.partial(jax.jit, static_argnames="rows")
@@ -290,4 +331,5 @@ METHOD = Method(
     ),
     background=lambda config: config.background or 0.0,
     refine=refine,
+    add_for_targets=add_for_targets,
 )

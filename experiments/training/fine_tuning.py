@@ -2,14 +2,15 @@
 
 import functools
 import pathlib
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from experiments import progress
+from experiments.methods import LabelConfig
 from experiments.training.detail import refresh_detail
 from experiments.training.gate import gated, lets_in, weigh
 from experiments.training.loop import TrainingError
@@ -33,9 +34,10 @@ _TOGETHER = 8  # numbers of photographs are multiples of this, so that little is
 
 
 class TargetData(NamedTuple):
-    """What steps for target views learn from, as `Programs.run` takes it.
+    """What steps for target views begin with and learn from, as `Programs.run` takes it.
 
     Attributes:
+      state: with what the method adds to it for these labels.
       photographs: as training reads them, or windows of them that see what the targets see.
       labels: of the target views, or windows of those that are larger than training's.
       settings: of these labels.
@@ -43,6 +45,7 @@ class TargetData(NamedTuple):
       coverage: share of the target views that has labels.
     """
 
+    state: TrainState
     photographs: Views | Windows
     labels: Views | Windows
     settings: PseudoSettings
@@ -54,7 +57,8 @@ def target_data(
     programs: Programs,
     start: LabelStart,
     cameras: Camera,
-    gate: Mapping[str, Any] | None,
+    how: LabelConfig,
+    settings: PseudoSettings,
     kept: pathlib.Path | None = None,
 ) -> TargetData:
     """What a state learns from for target views.
@@ -63,25 +67,26 @@ def target_data(
       programs: the run's.
       start: the state, and the photographs with its depths.
       cameras: stacked `[Q]`, of the target views.
-      gate: of warped labels, from `weigh`.
+      how: how these are labeled.
+      settings: of warps, after the gate, and of the steps.
       kept: file with the detail of the state, see `find_detail`.
     """
-    preset, photographs = programs.preset, programs.photographs
-    settings = gated(preset.target_labels, gate)
-    labels = label_targets(programs, start, cameras, preset.target_labels, settings, kept)
-    steps = programs.method.target_steps(preset.field, len(labels))
-    coverage = float(jnp.mean(labels.weight))
-    if isinstance(photographs, Windows) and preset.target_labels.label == "residual":
-        render = functools.partial(programs.render, start.state)
-        depths = rendered_depths(render, cameras, programs.scene)
-        seen = cameras, depths, start.sources.views, start.sources.depths
-        key = jax.random.fold_in(start.state.key, start.state.step)
-        photographs = jax.jit(windows_that_see)(key, photographs, *seen)
-        height, width = photographs.size
-        # What is compiled for windows of photographs serves, and a step takes as long.
-        if _is_larger(labels.cameras, height, width):
-            labels = view_windows(labels, height, width)
-    return TargetData(photographs, labels, settings, steps, coverage)
+    method, field, state = programs.method, programs.preset.field, start.state
+    photographs, render = programs.photographs, functools.partial(programs.render, state)
+    labels = label_targets(programs, start, cameras, how, settings, kept)
+    steps, coverage = method.target_steps(field, len(labels)), float(jnp.mean(labels.weight))
+    if how.label == "residual":
+        key_add, key_windows = jax.random.split(jax.random.fold_in(state.key, state.step))
+        state = method.add_for_targets(key_add, field, state, labels, render, programs.scene)
+        if isinstance(photographs, Windows):
+            depths = rendered_depths(render, cameras, programs.scene)
+            seen = cameras, depths, start.sources.views, start.sources.depths
+            photographs = jax.jit(windows_that_see)(key_windows, photographs, *seen)
+            height, width = photographs.size
+            # What is compiled for windows of photographs serves, and a step takes as long.
+            if _is_larger(labels.cameras, height, width):
+                labels = view_windows(labels, height, width)
+    return TargetData(state, photographs, labels, settings, steps, coverage)
 
 
 def _is_larger(cameras, height, width):
@@ -156,19 +161,20 @@ def fine_tune(
     if not lets_in(labels, gate):
         print("nothing is fine-tuned")
         return state
-    data = target_data(programs, start, cameras, gate, kept)
+    data = target_data(programs, start, cameras, labels, gated(labels, gate), kept)
     steps = min(data.steps, most or data.steps)
     print(f"labels on {data.coverage:.0%} of the pixels to be rendered; {steps} steps", flush=True)
     if data.coverage == 0:
         print("nothing is fine-tuned")
         return state
+    state, *learned = data[:4]
     done = skipped = 0
     with progress.part("fine-tuning"):
         progress.count("fine-tuning", done, steps)
         while done < steps:
             tell(done, steps)
             count = min(-(-steps // _REPORTS), steps - done)
-            state, values = programs.run("target_views", state, *data[:3], count=count)
+            state, values = programs.run("target_views", state, *learned, count=count)
             done, skipped = done + count, skipped + values["skipped"]
             progress.count("fine-tuning", done, steps)
     if skipped == steps:

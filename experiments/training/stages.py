@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from experiments.evaluation.audit import audit_labels, left_out_curve
@@ -142,19 +143,21 @@ def train_for_targets(
     """Train and score `test_time`, and its control: as many steps on the same photographs alone."""
     programs, stage, control = training.programs, "test_time", "test_time_control"
     with timed(training.seconds, "test_time_labels"):
-        data = target_data(programs, start, programs.scene.test.cameras, gate, kept)
+        how, cameras = programs.preset.target_labels, programs.scene.test.cameras
+        data = target_data(programs, start, cameras, how, gated(how, gate), kept)
 
-    def train(name, kind, *labels):
-        begin = start.state, data.photographs
-        state = training.train(name, kind, *begin, *labels, steps=data.steps)
+    def train(name, kind, state, *labels):
+        state = training.train(name, kind, state, data.photographs, *labels, steps=data.steps)
         scorer.score(name, state)
         return state
 
-    labeled = lets_in(programs.preset.target_labels, gate)
+    labeled = lets_in(how, gate)
     if controlled or not labeled:
-        without = train(control, "photographs", data.settings.lr_scale)
+        targets = programs.preset.targets
+        rate = data.settings.lr_scale if targets is None else jnp.float32(targets.control_lr_scale)
+        without = train(control, "photographs", start.state, rate)
     if labeled:
-        train(stage, "target_views", data.labels, data.settings)
+        train(stage, "target_views", data.state, data.labels, data.settings)
     else:
         scorer.score(stage, without)
 

@@ -16,6 +16,7 @@ from experiments.evaluation.scores import NO_PERCEPTUAL, Perceptual, Target, eva
 from experiments.methods import Preset
 from experiments.training.arms import Arm, describe, make_arm, why_not
 from experiments.training.ceilings import labels_with_better_depth, true_close_ups
+from experiments.training.fine_tuning import target_data
 from experiments.training.logs import TrainLog
 from experiments.training.loop import TrainingError
 from experiments.training.programs import Programs
@@ -25,7 +26,6 @@ from experiments.training.setup import (
     Training,
     identity_of,
     label_closeups,
-    label_targets,
     rendered_depths,
     say_which_points_fit,
     start_labels,
@@ -241,16 +241,15 @@ def train_in_turn(
     """Train and score one arm on views that are labeled before its first step."""
     name, programs = f"{arm.name}_{seed}", training.programs
     preset, scene = programs.preset, programs.scene
-    labels = label_arm(programs, arm, seed, start, scorer.held_out.exact)
-    steps = preset.closeup_steps
     if arm.kind == "test_time":
-        steps = programs.method.target_steps(preset.field, len(scene.test))
+        data = target_data(programs, start, scene.test.cameras, arm.labels, arm.settings)
+        *learned, steps, _ = data
+    else:
+        labels = label_arm(programs, arm, seed, start, scorer.held_out.exact)
+        learned = [start.state, programs.photographs, labels, arm.settings]
+        steps = preset.closeup_steps
     try:
-        state = training.train(
-            *(name, "target_views", start.state),
-            *(programs.photographs, labels, arm.settings),
-            steps=steps,
-        )
+        state = training.train(name, "target_views", *learned, steps=steps)
     except TrainingError as error:
         print(f"{name} is left out: {error}")
         return
@@ -273,8 +272,6 @@ def label_arm(
             arm.settings,
             share=arm.depth_error,
         )
-    if arm.kind == "test_time":
-        return label_targets(programs, start, scene.test.cameras, arm.labels, arm.settings)
     if arm.labels.label == "residual":
         return label_closeups(programs, start, arm.labels, seed)
     blurred = arm.kind == "resolved"

@@ -102,3 +102,32 @@ def join_surfels(
     surfels, alive = jax.tree.map(lambda *rows: jnp.concatenate(rows), old, new)
     order = jnp.argsort(~alive, stable=True)[:capacity]
     return jax.tree.map(lambda leaf: pad_rows(leaf[order], capacity), (surfels, alive))
+
+
+@jax.jit
+def replace_least(
+    surfels: Surfels, alive: jax.Array, new: Surfels, found: jax.Array
+) -> tuple[Surfels, jax.Array, jax.Array]:
+    """Put new surfels into free rows, then into those of the least opacity times area.
+
+    Args:
+      surfels: `N` surfels.
+      alive: `[N]` bool.
+      new: `M` surfels, at most N.
+      found: `[M]` bool; the others are left out.
+
+    Returns:
+      `N` surfels, their `alive`, and `[N]` bool, True where a surfel is new.
+    """
+    size = jnp.sum(surfels.log_scales, axis=-1)
+    shown = jnp.where(alive, jax.nn.log_sigmoid(surfels.opacity_logits) + size, -jnp.inf)
+    rows = jnp.argsort(shown, stable=True)[: found.shape[0]]
+    # The first rows for those that were found; the others are dropped, out of bounds.
+    rank = jnp.cumsum(found) - 1
+    place = jnp.where(found, rows[rank], alive.shape[0])
+
+    def put(leaf, values):
+        return leaf.at[place].set(values, mode="drop")
+
+    changed = put(jnp.zeros_like(alive), found)
+    return jax.tree.map(put, surfels, new), alive | changed, changed
