@@ -26,9 +26,13 @@ from experiments.training.setup import (
 )
 from jaxcloseup.artifacts.surfel_ply import read_surfels
 from jaxcloseup.field import Rendering
+from jaxcloseup.geometry.cameras import points_to_pixels
+from jaxcloseup.photographs import camera_at
 from jaxcloseup.pyramids import scene_pyramid
 from jaxcloseup.scenes import load_scene
-from jaxcloseup.splats.filters import SMOOTHING_VARIANCE, smoothed
+from jaxcloseup.splats.filters import SMOOTHING_VARIANCE, sampling_intervals, smoothed
+from jaxcloseup.splats.spherical_harmonics import sh_to_rgb
+from jaxcloseup.train import TrainState
 
 
 @pytest.fixture
@@ -108,6 +112,43 @@ def test_refinement_and_exports_keep_the_shapes_that_the_filter_made(capture_fol
     np.testing.assert_allclose(found.log_scales, expected.log_scales, rtol=1e-6)
     np.testing.assert_allclose(found.opacity_logits, expected.opacity_logits, rtol=1e-5)
     assert np.all(found.opacity_logits < finer.opacity_logits)
+
+
+def test_target_views_get_splats_where_their_labels_show_more(scene):
+    """They replace a fifth of all at most, and the optimizer knows nothing of them."""
+    config = dataclasses.replace(TINY_MIP.field, capacity=100, surfels_per_target=30)
+    points = np.random.default_rng(0).uniform([-1, -1, -0.1], [1, 1, 0.1], (100, 3))
+    points = jnp.asarray(points, jnp.float32)
+    params, buffers = make_field(config, scene, 1).init(jax.random.key(0), points, points)
+    moments = jax.tree.map(jnp.ones_like, params)
+    state = TrainState(jnp.int32(3), params, buffers, moments, jax.random.key(1))
+    views = jax.tree.map(lambda leaf: leaf[:2], scene.train)
+    shape = views.weight.shape
+    depth = jnp.full(shape[1:], 4.0)
+    gray = Rendering(jnp.full((*shape[1:], 3), 0.5), depth, jnp.ones_like(depth))
+    red = jnp.full((*shape, 3), 0.5).at[:, 4:9, 6:12].set(jnp.array([0.9, 0.1, 0.2]))
+    labels = views.replace(rgb=red, weight=jnp.ones(shape))
+    data = labels, lambda camera: gray, scene
+    after = METHODS["mip_gaussians"].add_for_targets(jax.random.key(2), config, state, *data)
+    new = np.asarray(after.params.means != params.means).any(axis=1)
+    assert new.sum() == 2 * 10  # a fifth of 100, for two views
+    for view in range(2):
+        pixels, _ = points_to_pixels(camera_at(views.cameras, view), after.params.means)
+        pixels = np.asarray(pixels)
+        inside = np.all((pixels > [6, 4]) & (pixels < [12, 9]), axis=1)
+        assert (inside & new).sum() >= 10
+    colors = np.asarray(sh_to_rgb(after.params.sh[:, :1], after.params.means))[new]
+    np.testing.assert_allclose(colors, np.tile([0.9, 0.1, 0.2], (20, 1)), atol=1e-5)
+    np.testing.assert_array_equal(after.opt_state.means, np.where(new[:, None], 0, moments.means))
+    least = np.sum(np.asarray(params.log_scales), -1) + np.log(
+        jax.nn.sigmoid(params.opacity_logits)
+    )
+    assert least[new].max() <= least[~new].min()
+    near = config.raster.near
+    found = sampling_intervals(after.params.means, scene.train.cameras, near=near)
+    np.testing.assert_allclose(after.buffers.interval, found, rtol=1e-6)
+    none = dataclasses.replace(config, surfels_per_target=0)
+    assert METHODS["surfels"].add_for_targets(jax.random.key(2), none, state, *data) is state
 
 
 def test_few_points_have_random_ones_beside_them(scene):
