@@ -30,6 +30,7 @@ from jaxcloseup.geometry.cameras import points_to_pixels
 from jaxcloseup.photographs import camera_at
 from jaxcloseup.pyramids import scene_pyramid
 from jaxcloseup.scenes import load_scene
+from jaxcloseup.splats.adaptive import with_image_offset
 from jaxcloseup.splats.filters import SMOOTHING_VARIANCE, sampling_intervals, smoothed
 from jaxcloseup.splats.spherical_harmonics import sh_to_rgb
 from jaxcloseup.train import TrainState
@@ -147,6 +148,11 @@ def test_target_views_get_splats_where_their_labels_show_more(scene):
     near = config.raster.near
     found = sampling_intervals(after.params.means, scene.train.cameras, near=near)
     np.testing.assert_allclose(after.buffers.interval, found, rtol=1e-6)
+    # A density control may have given the others a parameter of its own.
+    more = state.replace(params=with_image_offset(params), opt_state=with_image_offset(moments))
+    same = METHODS["mip_gaussians"].add_for_targets(jax.random.key(2), config, more, *data).params
+    np.testing.assert_array_equal(same.means, after.params.means)
+    assert same.image_offset.shape == (100, 2) and not same.image_offset.any()
     none = dataclasses.replace(config, surfels_per_target=0)
     assert METHODS["surfels"].add_for_targets(jax.random.key(2), none, state, *data) is state
 

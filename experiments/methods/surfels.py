@@ -294,12 +294,21 @@ def add_for_targets(
             **{"count": each, "sh_degree": config.sh_degree, "num_scales": config.num_scales},
         )
 
-    new = progress.each(search, range(count), "views searched for more")
-    new = jax.tree.map(lambda *rows: np.concatenate(rows), *new)
-    surfels, alive, changed = replace_least(state.params, state.buffers.alive, *new)
+    found = progress.each(search, range(count), "views searched for more")
+    new, found = jax.tree.map(lambda *rows: np.concatenate(rows), *found)
+    old = state.params, state.buffers.alive
+    surfels, alive, changed = replace_least(*old, _in_kind(new, state.params), found)
     state = replace_surfels(state, surfels, alive, changed)
     interval = _intervals(config, surfels, scene)
     return state.replace(buffers=state.buffers.replace(interval=interval))
+
+
+def _in_kind(new, surfels):
+    """New surfels with the parameters, 0, that a density control gave the others."""
+    own = vars(new)
+    added = {k: v for k, v in vars(surfels).items() if k not in own}
+    zeros = {k: np.zeros((len(new.means), *v.shape[1:]), v.dtype) for k, v in added.items()}
+    return surfels.replace(**own, **zeros)
 
 
 _sample = jax.jit(surfels_where_wrong, static_argnames=("count", "sh_degree", "num_scales"))
