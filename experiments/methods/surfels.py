@@ -254,8 +254,7 @@ def refine(
         data = photograph[..., :3], photograph[..., 3], seen.rgb, label_depth(seen)
         return _sample(jax.random.fold_in(key, view), camera, *data, count=each, **kind)
 
-    new = progress.each(search, range(views), "photographs searched")
-    new = jax.tree.map(lambda *rows: np.concatenate(rows), *new)
+    new = _search_each(search, views, "photographs searched")
     # The filter of finer photographs is smaller, so what the coarse one made stays as it is.
     old = smoothed(surfels, buffers.interval), buffers.alive
     surfels, alive = join_surfels(old, new, config.capacity)
@@ -294,13 +293,18 @@ def add_for_targets(
             **{"count": each, "sh_degree": config.sh_degree, "num_scales": config.num_scales},
         )
 
-    found = progress.each(search, range(count), "views searched for more")
-    new, found = jax.tree.map(lambda *rows: np.concatenate(rows), *found)
+    new, found = _search_each(search, count, "views searched for more")
     old = state.params, state.buffers.alive
     surfels, alive, changed = replace_least(*old, _in_kind(new, state.params), found)
     state = replace_surfels(state, surfels, alive, changed)
     interval = _intervals(config, surfels, scene)
     return state.replace(buffers=state.buffers.replace(interval=interval))
+
+
+def _search_each(search, count, what):
+    """What `search(view)` finds in every view, rows of all together."""
+    found = progress.each(search, range(count), what)
+    return jax.tree.map(lambda *rows: np.concatenate(rows), *found)
 
 
 def _in_kind(new, surfels):

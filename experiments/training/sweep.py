@@ -259,7 +259,7 @@ def train_in_turn(
 def label_arm(
     programs: Programs, arm: Arm, seed: int, start: LabelStart, exact: jax.Array | None
 ) -> Views:
-    """The labeled views of an arm that trains in turn."""
+    """The labeled views of an arm that trains in turn, other than `test_time`."""
     scene, key = programs.scene, jax.random.key(seed)
     if arm.depth_error is not None:
         render = functools.partial(programs.render, start.state)
