@@ -16,7 +16,7 @@ from experiments.evaluation.scores import targets_by_split
 from experiments.methods import TargetConfig
 from experiments.training import detail as training_detail
 from experiments.training import fine_tuning, gate
-from experiments.training.detail import detail_path, detailed, find_detail
+from experiments.training.detail import detail_finder, detail_path, detailed, find_detail
 from experiments.training.fine_tuning import fine_tune, tuned_detail
 from experiments.training.residuals import _enlarge
 from experiments.training.setup import label_closeups, label_targets, start_labels
@@ -150,7 +150,8 @@ def test_target_views_may_be_labeled_by_their_detail(rendered, found, monkeypatc
     monkeypatch.setattr(gate, "weigh_labels", lambda *_: pytest.fail("asked the gate"))
     monkeypatch.setattr(training_detail, "make_detail", lambda *_: pytest.fail("made again"))
     views, start = programs.scene.test, start_labels(programs, state, seed=0)
-    labels = label_targets(programs, start, views.cameras, by_detail, None, path)
+    find = detail_finder(programs, state, path)
+    labels = label_targets(programs, start, views.cameras, by_detail, None, find)
     truth = np.asarray(to_float(views.rgb))
     render = functools.partial(programs.render, state)
 
@@ -160,9 +161,7 @@ def test_target_views_may_be_labeled_by_their_detail(rendered, found, monkeypatc
     seen = [render(camera_at(views.cameras, i)).rgb for i in range(len(views))]
     assert error(labels.rgb) < 0.9 * error(np.stack(seen))
     monkeypatch.setattr(programs, "run", lambda *data, count: (data, {"skipped": 0}))
-    kind, begun, photographs, learned, _ = fine_tune(
-        programs, start, views.cameras, most=1, kept=path
-    )
+    kind, begun, photographs, learned, _ = fine_tune(programs, start, views.cameras, find, most=1)
     assert (kind, begun, photographs) == ("target_views", state, programs.scene.train)
     jax.tree.map(np.testing.assert_array_equal, learned, labels)
 
@@ -170,17 +169,17 @@ def test_target_views_may_be_labeled_by_their_detail(rendered, found, monkeypatc
     train, size = programs.scene.train, (views.cameras.height - 2, views.cameras.width - 3)
     windows = view_windows(train, *size)
     monkeypatch.setitem(vars(programs), "photographs", windows)
-    learned = fine_tune(programs, start, views.cameras, most=1, kept=path)[3]
+    learned = fine_tune(programs, start, views.cameras, find, most=1)[3]
     assert learned.size == size
     np.testing.assert_allclose(
         to_float(learned.pyramid.level(0))[..., 3], labels.weight, atol=0.002
     )
 
-    near = label_closeups(programs, start, by_detail, 0, path)
+    near = label_closeups(programs, start, by_detail, 0, find)
     assert len(near) == gated.closeup_steps and 0.1 < near.weight.mean() < 1
     far = np.asarray(programs.scene.train.cameras.position)
 
-    others = label_closeups(programs, start, by_detail, 1, path)
+    others = label_closeups(programs, start, by_detail, 1, find)
     drawn = [np.asarray(views.cameras.position)[:, None] for views in (near, others)]
     assert all(np.linalg.norm(far - one, axis=-1).min() > 0 for one in drawn)
     assert not np.any(drawn[0] == drawn[1])

@@ -104,7 +104,7 @@ def test_nothing_is_fine_tuned_where_the_gate_lets_no_labels_in(capture_folder, 
     monkeypatch.setattr(fine_tuning, "weigh", lambda *_: {"weight": 0.0})
     programs = Programs(dataclasses.replace(KEPT, gated=True), load_scene(str(capture_folder)))
     start = LabelStart("state", None)
-    assert fine_tuning.fine_tune(programs, start, None, most=None) == "state"
+    assert fine_tuning.fine_tune(programs, start, None, None) == "state"
 
 
 MISTAKES = {

@@ -23,6 +23,7 @@ from experiments.benchmarks import nerf, splats, sweep
 from experiments.benchmarks.timing import interleaved_medians
 from experiments.methods import Preset, surfels
 from experiments.methods.nerf import QUICK as NERF_QUICK
+from experiments.training.detail import detail_finder
 from experiments.training.fine_tuning import fine_tune
 from experiments.training.names import STAGES
 from experiments.training.programs import Programs
@@ -290,7 +291,7 @@ def training(size: Size) -> dict[str, Any]:
     start = start_labels(programs, outcome.start.state, 0)
     wanted = jax.tree.map(lambda leaf: leaf[:1], scene.test.cameras)
     begun = time.perf_counter()
-    tuned = fine_tune(programs, start, wanted, most=None)
+    tuned = fine_tune(programs, start, wanted, detail_finder(programs, start.state))
     jax.block_until_ready(programs.render(tuned, jax.tree.map(lambda leaf: leaf[0], wanted)))
     return {
         "image": [scene.train.cameras.height, scene.train.cameras.width],

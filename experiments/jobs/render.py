@@ -12,7 +12,7 @@ from absl import flags
 
 from experiments import progress
 from experiments.command_line import check_unused, prepare_to_stop, set_up
-from experiments.training.detail import detail_path, find_detail
+from experiments.training.detail import detail_finder, detail_path
 from experiments.training.fine_tuning import fine_tune, tuned_detail
 from experiments.training.loop import TrainingError
 from experiments.training.setup import start_labels
@@ -90,23 +90,22 @@ def _render() -> None:
             )
         )
     fine_tuned = FLAGS.fine_tune or FLAGS.target is not None
-    sources = None
+    sources, kept = None, detail_path(record.folder, stage)
     if FLAGS.support or fine_tuned:
         expected = record.preset.labels.expected_depth
         start = start_labels(programs, state, record.identity["seed"], expected_depth=expected)
         sources = start.sources if FLAGS.support else None
     if fine_tuned:
-        kept = detail_path(record.folder, stage) if start.state is state else None
-        cameras, most = shots.cameras, FLAGS.target_steps
-        state = fine_tune(programs, start, cameras, most=most, kept=kept)
-    detail = None
-    if FLAGS.detail and fine_tuned:
+        kept = kept if start.state is state else None
+        state = start.state
+    find, detail = detail_finder(programs, state, kept), None
+    if fine_tuned:
+        state = fine_tune(programs, start, shots.cameras, find, most=FLAGS.target_steps)
+    if FLAGS.detail:
+        detail, _ = find()
         # What was fine-tuned for these cameras is not kept, and its detail neither.
-        detail, _ = find_detail(programs, start.state, kept)
-        if state is not start.state:
-            detail = tuned_detail(programs, state, cameras, detail)
-    elif FLAGS.detail:
-        detail, _ = find_detail(programs, state, detail_path(record.folder, stage))
+        if fine_tuned and state is not start.state:
+            detail = tuned_detail(programs, state, shots.cameras, detail)
     folders = render_shots(output_dir, programs, state, shots, sources=sources, detail=detail)
     print(f"{len(shots.names)} frames: {', '.join(str(folder) for folder in folders)}")
     if chosen != "views" and len(shots.names) > 1:

@@ -11,7 +11,7 @@ import itertools
 import json
 import pathlib
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -66,6 +66,16 @@ def detailed_views(programs: Programs, state: TrainState, detail: Detail, camera
     found = list(progress.each(label, range(cameras.intrinsics.shape[0]), "views with detail"))
     rgb, weight = (jnp.stack([getattr(one, name) for one in found]) for name in ("rgb", "weight"))
     return Views(cameras, rgb, weight)
+
+
+FindDetail = Callable[[], tuple[Detail, dict[str, Any]]]
+
+
+def detail_finder(
+    programs: Programs, state: TrainState, path: pathlib.Path | None = None
+) -> FindDetail:
+    """`find_detail` of a state, the first time that it is asked for."""
+    return functools.cache(functools.partial(find_detail, programs, state, path))
 
 
 def find_detail(

@@ -1,7 +1,6 @@
 """Fine-tuning for target views: the cameras that somebody wants rendered."""
 
 import functools
-import pathlib
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -11,7 +10,7 @@ import numpy as np
 
 from experiments import progress
 from experiments.methods import LabelConfig
-from experiments.training.detail import refresh_detail
+from experiments.training.detail import FindDetail, refresh_detail
 from experiments.training.gate import gated, lets_in, weigh
 from experiments.training.loop import TrainingError
 from experiments.training.programs import Programs
@@ -59,7 +58,7 @@ def target_data(
     cameras: Camera,
     how: LabelConfig,
     settings: PseudoSettings,
-    kept: pathlib.Path | None = None,
+    find: FindDetail,
 ) -> TargetData:
     """What a state learns from for target views.
 
@@ -69,11 +68,11 @@ def target_data(
       cameras: stacked `[Q]`, of the target views.
       how: how these are labeled.
       settings: of warps, after the gate, and of the steps.
-      kept: file with the detail of the state, see `find_detail`.
+      find: finds the detail of the state, if labels need it.
     """
     method, field, state = programs.method, programs.preset.field, start.state
     photographs, render = programs.photographs, functools.partial(programs.render, state)
-    labels = label_targets(programs, start, cameras, how, settings, kept)
+    labels = label_targets(programs, start, cameras, how, settings, find)
     steps, coverage = method.target_steps(field, len(labels)), float(jnp.mean(labels.weight))
     if how.label == "residual":
         key_add, key_windows = jax.random.split(jax.random.fold_in(state.key, state.step))
@@ -135,9 +134,9 @@ def fine_tune(
     programs: Programs,
     start: LabelStart,
     cameras: Camera,
+    find: FindDetail,
     *,
-    most: int | None,
-    kept: pathlib.Path | None = None,
+    most: int | None = None,
     tell: Callable[[int, int], None] = lambda done, steps: None,
 ) -> TrainState:
     """Train a state for target views, with labels made once for them.
@@ -149,8 +148,8 @@ def fine_tune(
       programs: the run's.
       start: the state, and the photographs with its depths.
       cameras: stacked `[Q]`, of the target views.
+      find: finds the detail of the state, if labels need it.
       most: the largest number of steps in all; by default the method's.
-      kept: file with the detail of the state, see `find_detail`.
       tell: is told ten times how many steps are done, and how many there are.
 
     Raises:
@@ -161,7 +160,7 @@ def fine_tune(
     if not lets_in(labels, gate):
         print("nothing is fine-tuned")
         return state
-    data = target_data(programs, start, cameras, labels, gated(labels, gate), kept)
+    data = target_data(programs, start, cameras, labels, gated(labels, gate), find)
     steps = min(data.steps, most or data.steps)
     print(f"labels on {data.coverage:.0%} of the pixels to be rendered; {steps} steps", flush=True)
     if data.coverage == 0:

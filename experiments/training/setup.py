@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import functools
-import pathlib
 import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
@@ -15,7 +14,7 @@ import numpy as np
 import jaxcloseup
 from experiments import progress
 from experiments.methods import LabelConfig, Preset, pseudo_settings
-from experiments.training.detail import detailed_views, find_detail
+from experiments.training.detail import FindDetail, detailed_views
 from experiments.training.logs import TrainLog
 from experiments.training.loop import TrainingError, run_stage
 from experiments.training.manifest import hash_data, hash_targets
@@ -265,7 +264,7 @@ def label_targets(
     cameras: Camera,
     labels: LabelConfig,
     settings: PseudoSettings,
-    kept: pathlib.Path | None = None,
+    find: FindDetail,
 ) -> Views:
     """Labels of target views.
 
@@ -275,10 +274,10 @@ def label_targets(
       cameras: stacked `[Q]`.
       labels: says what labels are.
       settings: of warps, after the gate.
-      kept: file with the detail of the state that fine-tuning begins with, see `find_detail`.
+      find: finds the detail of the state that fine-tuning begins with, if labels need it.
     """
     if labels.label == "residual":
-        detail, _ = find_detail(programs, start.state, kept)
+        detail, _ = find()
         return detailed_views(programs, start.state, detail, cameras)
     render = functools.partial(programs.render, start.state)
     depths = rendered_depths(render, cameras, programs.scene)
@@ -290,7 +289,7 @@ def label_closeups(
     start: LabelStart,
     labels: LabelConfig,
     seed: int,
-    kept: pathlib.Path | None = None,
+    find: FindDetail,
 ) -> Views:
     """Labels of random close-ups with detail, made before the first step: each costs a render.
 
@@ -299,13 +298,13 @@ def label_closeups(
       start: what fine-tuning begins with.
       labels: says how close-ups are drawn.
       seed: the run's.
-      kept: as in `label_targets`.
+      find: as in `label_targets`.
     """
     settings = pseudo_settings(labels)
     count = min(programs.preset.closeup_steps, _MOST_CLOSEUPS)
     keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), _CLOSEUPS), count)
     draw = jax.vmap(lambda key: sample_virtual_camera(key, start.sources, settings)[0])
-    return label_targets(programs, start, jax.jit(draw)(keys), labels, settings, kept)
+    return label_targets(programs, start, jax.jit(draw)(keys), labels, settings, find)
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ import numpy as np
 from experiments.evaluation.audit import audit_labels, left_out_curve
 from experiments.evaluation.renders import write_truth
 from experiments.evaluation.scores import NO_PERCEPTUAL, Perceptual
-from experiments.training.detail import detail_path, detailed, find_detail
+from experiments.training.detail import FindDetail, detail_finder, detail_path, detailed
 from experiments.training.fine_tuning import target_data
 from experiments.training.gate import gated, lets_in, weigh
 from experiments.training.names import STAGES
@@ -93,8 +93,10 @@ def run_stages(
     with timed(training.seconds, "gate"):
         gate = weigh(programs, start)
     settings = gated(preset.labels, gate)
-    kept = detail_path(output_dir, "baseline")
     latest = "baseline", baseline
+
+    def find(stage, state):
+        return detail_finder(programs, state, detail_path(output_dir, stage))
 
     def continue_from(state, stage, kind, *data):
         steps = preset.closeup_steps
@@ -107,22 +109,23 @@ def run_stages(
     if "control" in to_run or ("closeup" in to_run and not use_labels):
         latest = continue_from(baseline, "control", "photographs")
     if "closeup" in to_run and use_labels:
-        kind, labels = closeup_labels(training, start, seed, kept)
+        kind, labels = closeup_labels(training, start, seed, find("baseline", start.state))
         latest = continue_from(start.state, "closeup", kind, labels, settings)
     elif "closeup" in to_run:
         scorer.score("closeup", latest[1])
     detail, render = None, functools.partial(programs.render, latest[1])
+    find_latest = find(*latest)
     if "detail" in to_run:
-        detail, render = add_detail_stage(training, scorer, output_dir, *latest)
+        detail, render = add_detail_stage(training, scorer, *latest, find_latest)
     if "test_time" in to_run and scene.test is None:
         print(f"no test_time: {scene.name} holds out no close-ups (--split=closest does)")
     elif "test_time" in to_run:
         by_detail = preset.target_labels.label == "residual"
         # The detail of the latest state is there, or made anyway.
-        name, state = latest if by_detail else ("baseline", baseline)
-        begin = start._replace(state=state) if by_detail else start
-        kept = detail_path(output_dir, name)
-        train_for_targets(training, scorer, begin, gate, kept, controlled="control" in to_run)
+        begin = start._replace(state=latest[1]) if by_detail else start
+        train_for_targets(
+            *(training, scorer, begin, gate, find_latest), controlled="control" in to_run
+        )
     with timed(training.seconds, "audit"):
         audit, left_out = audit_all(programs, start, held_out.exact, settings, seed)
     return Outcome(
@@ -136,7 +139,7 @@ def train_for_targets(
     scorer: Scorer,
     start: LabelStart,
     gate: Mapping[str, Any] | None,
-    kept: pathlib.Path,
+    find: FindDetail,
     *,
     controlled: bool,
 ) -> None:
@@ -144,7 +147,7 @@ def train_for_targets(
     programs, stage, control = training.programs, "test_time", "test_time_control"
     with timed(training.seconds, "test_time_labels"):
         how, cameras = programs.preset.target_labels, programs.scene.test.cameras
-        data = target_data(programs, start, cameras, how, gated(how, gate), kept)
+        data = target_data(programs, start, cameras, how, gated(how, gate), find)
 
     def train(name, kind, state, *labels):
         state = training.train(name, kind, state, data.photographs, *labels, steps=data.steps)
@@ -163,12 +166,12 @@ def train_for_targets(
 
 
 def add_detail_stage(
-    training: Training, scorer: Scorer, output_dir: pathlib.Path, stage: str, state: TrainState
+    training: Training, scorer: Scorer, stage: str, state: TrainState, find: FindDetail
 ) -> tuple[dict[str, Any], Callable[[Camera], Rendering]]:
     """Score the renders of a stage again with the photographs' detail; its record, and them."""
     programs = training.programs
     with timed(training.seconds, "detail"):
-        detail, about = find_detail(programs, state, detail_path(output_dir, stage))
+        detail, about = find()
 
     def render(camera):
         rendering = programs.render(state, camera)
@@ -179,14 +182,14 @@ def add_detail_stage(
 
 
 def closeup_labels(
-    training: Training, start: LabelStart, seed: int, kept: pathlib.Path
+    training: Training, start: LabelStart, seed: int, find: FindDetail
 ) -> tuple[str, LabelSources | Views]:
     """The kind of steps of `closeup`, and its labels, or what each step makes them from."""
     programs = training.programs
     if programs.preset.labels.label == "warp":
         return "random_closeups", start.sources
     with timed(training.seconds, "closeup_labels"):
-        labels = label_closeups(programs, start, programs.preset.labels, seed, kept)
+        labels = label_closeups(programs, start, programs.preset.labels, seed, find)
     return "target_views", labels
 
 

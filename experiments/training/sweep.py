@@ -16,6 +16,7 @@ from experiments.evaluation.scores import NO_PERCEPTUAL, Perceptual, Target, eva
 from experiments.methods import Preset
 from experiments.training.arms import Arm, describe, make_arm, why_not
 from experiments.training.ceilings import labels_with_better_depth, true_close_ups
+from experiments.training.detail import FindDetail, detail_finder
 from experiments.training.fine_tuning import target_data
 from experiments.training.logs import TrainLog
 from experiments.training.loop import TrainingError
@@ -241,11 +242,12 @@ def train_in_turn(
     """Train and score one arm on views that are labeled before its first step."""
     name, programs = f"{arm.name}_{seed}", training.programs
     preset, scene = programs.preset, programs.scene
+    find = detail_finder(programs, start.state)
     if arm.kind == "test_time":
-        data = target_data(programs, start, scene.test.cameras, arm.labels, arm.settings)
+        data = target_data(programs, start, scene.test.cameras, arm.labels, arm.settings, find)
         *learned, steps, _ = data
     else:
-        labels = label_arm(programs, arm, seed, start, scorer.held_out.exact)
+        labels = label_arm(programs, arm, seed, start, find, scorer.held_out.exact)
         learned = [start.state, programs.photographs, labels, arm.settings]
         steps = preset.closeup_steps
     try:
@@ -257,7 +259,12 @@ def train_in_turn(
 
 
 def label_arm(
-    programs: Programs, arm: Arm, seed: int, start: LabelStart, exact: jax.Array | None
+    programs: Programs,
+    arm: Arm,
+    seed: int,
+    start: LabelStart,
+    find: FindDetail,
+    exact: jax.Array | None,
 ) -> Views:
     """The labeled views of an arm that trains in turn, other than `test_time`."""
     scene, key = programs.scene, jax.random.key(seed)
@@ -273,7 +280,7 @@ def label_arm(
             share=arm.depth_error,
         )
     if arm.labels.label == "residual":
-        return label_closeups(programs, start, arm.labels, seed)
+        return label_closeups(programs, start, arm.labels, seed, find)
     blurred = arm.kind == "resolved"
     return true_close_ups(key, scene, start.sources, exact, arm.settings, blurred=blurred)
 

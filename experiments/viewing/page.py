@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.training.detail import find_detail
+from experiments.training.detail import detail_finder
 from experiments.training.fine_tuning import fine_tune, tuned_detail
 from experiments.training.loop import TrainingError
 from experiments.training.programs import Programs
@@ -24,7 +24,6 @@ from experiments.viewing.picking import rank_views, ray_camera
 from experiments.viewing.server import Server
 from jaxcloseup.artifacts.gaussians import Gaussians
 from jaxcloseup.artifacts.images import Image, to_uint8
-from jaxcloseup.detail import Detail
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.label_rules import label_depth
 from jaxcloseup.support import count_seen_points
@@ -70,7 +69,7 @@ class Viewer:
         """
         self.programs, self.state, self.scene = programs, state, programs.scene
         self.title = f"{self.scene.name}, {stage}"
-        self._seed, self._kept = seed, kept
+        self._seed, self._find = seed, detail_finder(programs, state, kept)
         self._jobs: queue.Queue = queue.Queue(maxsize=1)
         cameras = self.scene.train.cameras
         positions, rotations = (np.asarray(a) for a in (cameras.position, cameras.rotation))
@@ -173,11 +172,10 @@ class Viewer:
         start, state = self.labels, self.state
         cameras = jax.tree.map(lambda leaf: leaf[None], camera)
         if tuned:
-            kept = self._kept if start.state is self.state else None
-            state = fine_tune(
-                *(self.programs, start, cameras), most=None, kept=kept, tell=say_steps
-            )
-        added = self.detail if detail else None
+            same = start.state is self.state
+            find = self._find if same else detail_finder(self.programs, start.state)
+            state = fine_tune(self.programs, start, cameras, find, tell=say_steps)
+        added = self._find()[0] if detail else None
         if detail and tuned and state is not start.state:
             added = tuned_detail(self.programs, state, cameras, added)
         images = render_pictures(self.programs, state, camera, sources=start.sources, detail=added)
@@ -207,8 +205,3 @@ class Viewer:
         """What fine-tuning and support start from; made once."""
         expected = self.programs.preset.labels.expected_depth
         return start_labels(self.programs, self.state, self._seed, expected_depth=expected)
-
-    @functools.cached_property
-    def detail(self) -> Detail:
-        """The detail of the state; made once."""
-        return find_detail(self.programs, self.state, self._kept)[0]
