@@ -290,6 +290,19 @@ def test_no_surfel_grows_beyond_the_largest_scale(trained):
     unchanged = state.params.replace(log_scales=after.params.log_scales)
     jax.tree.map(np.testing.assert_array_equal, after.params, unchanged)
 
+    # Far from the cameras the bound is an angle.
+    center = np.median(np.asarray(state.params.means), axis=0)
+    distance = np.linalg.norm(np.asarray(state.params.means) - center, axis=-1)
+    extent = float(np.median(distance))
+    config = dataclasses.replace(config, max_scale=float(largest / extent))
+    after = surfel_field(config, extent=extent, center=jnp.asarray(center)).adapt(
+        jax.random.key(1), state
+    )
+    bound = largest * np.maximum(distance / extent, 1)
+    expected = np.minimum(before, np.log(bound)[:, None])
+    assert np.any((expected > np.log(largest)) & (expected < before))
+    np.testing.assert_allclose(after.params.log_scales, expected, rtol=1e-5, atol=1e-6)
+
 
 def test_without_density_control_only_the_schedule_changes(trained):
     state = trained[0].replace(step=jnp.int32(80))

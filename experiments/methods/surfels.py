@@ -7,6 +7,7 @@ import pathlib
 from collections.abc import Callable
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optax
 
@@ -125,7 +126,7 @@ QUICK = dataclasses.replace(
         sh_lr=7.5e-3,
         scale_lr=1.5e-2,
         color_ridge=0.1,
-        max_scale=0.3,
+        max_scale=0.1,
         selective_adam=True,
         steps_per_target=20,
         fewest_target_steps=60,
@@ -191,7 +192,8 @@ def make_field(config: SplatTraining, scene: Scene, growth: int) -> RadianceFiel
     size, capacity = extent(scene), config.raster.capacity * growth
     raster = dataclasses.replace(config.raster, capacity=capacity, near=_near(config, scene))
     config = dataclasses.replace(config, raster=raster)
-    return surfel_field(config, extent=size, photographs=_photographs(config, scene))
+    center = jnp.mean(jnp.asarray(scene.train.cameras.position), axis=0)
+    return surfel_field(config, extent=size, center=center, photographs=_photographs(config, scene))
 
 
 def _near(config, scene):

@@ -43,7 +43,7 @@ from jaxcloseup.train import TrainState
 
 
 LEFT_OUT = 60  # photographs, at most, that teach the weights
-_RECIPE = 6  # a change of how detail is made raises it, so that kept detail is made again
+_RECIPE = 7  # a change of how detail is made raises it, so that kept detail is made again
 _TEXTS = ("key", "about")
 _WEIGHTS = ("center", "scale", "share", "actual")
 _LARGEST = 2**32  # bytes of a file that keeps detail

@@ -23,8 +23,8 @@ FINER = 4
 FINER_RAYS = 1  # the same for fields that render single rays, and so whole images slowly
 MISFIT = 4  # times the median error at which a photograph has a quarter of its trust
 COLOR_RIDGE = 0.01  # resistance to a photograph's change of colors, see `fit_colors`
-WINDOW = 64  # side in pixels of the windows that are kept of left-out photographs
-WINDOWS = 2  # for each of them, level and imitated distance
+WINDOW = 45  # side in pixels of the windows that are kept of left-out photographs
+WINDOWS = 4  # for each of them, level and imitated distance
 
 
 class Window(NamedTuple):

@@ -37,8 +37,8 @@ class SplatConfig:
       opacity_lr: Adam's learning rate of the opacity logits.
       scale_lr: Adam's learning rate of the log scales.
       rotation_lr: Adam's learning rate of the quaternions.
-      max_scale: largest standard deviation of a surfel; None sets no bound. A very large surfel may
-        be hidden from every photograph, and fill a close-up.
+      max_scale: largest standard deviation of a surfel, see `surfel_field`; None sets no bound. A
+        large surfel may be hidden from every photograph, and fill a close-up.
       selective_adam: leave surfels that a step does not see alone, see `scale_by_selective_adam`.
       density: config of a density control, which moves, adds and removes surfels, see
         `density_control`; None has none.

@@ -7,7 +7,6 @@ length.
 """
 
 import functools
-import math
 from typing import Any, NamedTuple
 
 import chex
@@ -19,7 +18,7 @@ from flax import struct
 from jaxcloseup.field import RadianceField, Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.metrics import fit_colors, ssim
-from jaxcloseup.numerics import matmul, safe_divide
+from jaxcloseup.numerics import matmul, safe_divide, safe_norm
 from jaxcloseup.splats.config import GaussianConfig, SplatConfig, SurfelConfig
 from jaxcloseup.splats.density import DensityControl, density_control
 from jaxcloseup.splats.filters import sampling_intervals, smoothed
@@ -72,7 +71,11 @@ class SurfelFieldAux(NamedTuple):
 
 
 def surfel_field(
-    config: SurfelConfig | GaussianConfig, *, extent: float, photographs: Camera | None = None
+    config: SurfelConfig | GaussianConfig,
+    *,
+    extent: float,
+    center: jax.Array | None = None,
+    photographs: Camera | None = None,
 ) -> RadianceField:
     """Splats as a field of whole images, with `render`, `loss` and `adapt` compiled.
 
@@ -90,6 +93,8 @@ def surfel_field(
     Args:
       config: static.
       extent: size of the capture in world units, such as `camera_extent`.
+      center: `[3]` middle of its cameras. Beyond an extent from it, `max_scale` is a share of the
+        distance: a background may be far. Without it the bound is the same everywhere.
       photographs: stacked `[V]` cameras, at the finest size that steps read: surfels are convolved
         in space with the size of their pixels, see `filters`. None has no such filter.
 
@@ -155,7 +160,7 @@ def surfel_field(
         degree, regularize = _schedule(config, state.step)
         buffers = state.buffers.replace(degree=degree, regularize=regularize)
         state = control.adapt(key, state.replace(buffers=buffers))
-        state = state.replace(params=_bound_scales(state.params, config, extent))
+        state = state.replace(params=_bound_scales(state.params, config, extent, center))
         return state if photographs is None else renew_intervals(state)
 
     def renew_intervals(state):
@@ -246,11 +251,15 @@ def _schedule(config, step):
     return degree, (step >= config.regularize_from).astype(jnp.float32)
 
 
-def _bound_scales(surfels, config, extent):
+def _bound_scales(surfels, config, extent, center):
     """Surfels no larger than the config allows."""
     if config.max_scale is None:
         return surfels
-    largest = math.log(config.max_scale * extent)
+    reach = extent
+    if center is not None:
+        distance = safe_norm(surfels.means - center[None], keepdims=True)
+        reach = jnp.maximum(distance, extent)
+    largest = jnp.log(config.max_scale * reach)
     return surfels.replace(log_scales=jnp.minimum(surfels.log_scales, largest))
 
 
