@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import optax
 
-from experiments.methods.method import LabelConfig, Method, Preset
+from experiments.methods.method import LabelConfig, Method, Preset, TargetConfig
 from experiments.methods.sightings import find_sightings
 from jaxcloseup.field import RadianceField
 from jaxcloseup.scene import Scene
@@ -105,6 +105,8 @@ def volumetric(field: Callable[..., RadianceField], **presets: Preset) -> Method
 QUICK_LABELS = LabelConfig(
     rgb_tolerance=0.04, depth_tolerance=0.02, leave_out_source=True, source_tolerance=0.05
 )
+# Wanted views learn from renders with detail instead, which know how far to trust themselves.
+QUICK_TARGETS = TargetConfig("residual", lr_scale=3.0)
 
 
 def unit_cube(scene: Scene) -> tuple[tuple[float, float, float], float]:
