@@ -22,8 +22,8 @@ from jaxcloseup.photographs import camera_at
 from jaxcloseup.pyramids import Pyramid, fractional_level, read_pyramid
 
 
-_CHUNK = 4096  # points that are culled together
-_CHUNKS = 8  # chunks for which one program is compiled, to serve images of many sizes
+_CHUNK = 2048  # points that are culled together; a window that teaches weights fits
+_CHUNKS = 16  # chunks for which one program is compiled, to serve images of many sizes
 _WIDEST = 20  # angles in units of `angle_scale`, beyond which all weigh alike
 _COARSEST = 64  # footprints beyond which all weigh alike
 
