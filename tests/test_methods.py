@@ -70,7 +70,12 @@ def test_the_near_plane_is_small_in_a_small_scene(scene, monkeypatch):
 
 def test_the_smoothing_filter_is_that_of_the_finest_photographs(capture_folder, monkeypatch):
     scene, seen = load_scene(str(capture_folder), downscale=2), []
-    keep = lambda config, *, extent, photographs: seen.append(photographs)  # noqa: E731
+    middle = np.mean(scene.train.cameras.position, axis=0)
+
+    def keep(config, *, extent, center, photographs):
+        np.testing.assert_allclose(center, middle, atol=1e-6)
+        seen.append(photographs)
+
     monkeypatch.setattr(surfels, "surfel_field", keep)
     train, own = scene.train.cameras, plane.WIDTH
     for divisor, width in ((1, own), (2, own / 2), (8, own / 2)):
