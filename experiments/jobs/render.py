@@ -90,21 +90,20 @@ def _render() -> None:
             )
         )
     fine_tuned = FLAGS.fine_tune or FLAGS.target is not None
-    sources, kept = None, detail_path(record.folder, stage)
+    sources = None
     if FLAGS.support or fine_tuned:
         expected = record.preset.labels.expected_depth
         start = start_labels(programs, state, record.identity["seed"], expected_depth=expected)
         sources = start.sources if FLAGS.support else None
-    if fine_tuned:
-        kept = kept if start.state is state else None
-        state = start.state
-    find, detail = detail_finder(programs, state, kept), None
+    begin = start.state if fine_tuned else state
+    kept = detail_path(record.folder, stage) if begin is state else None
+    find, detail = detail_finder(programs, begin, kept), None
     if fine_tuned:
         state = fine_tune(programs, start, shots.cameras, find, most=FLAGS.target_steps)
     if FLAGS.detail:
         detail, _ = find()
         # What was fine-tuned for these cameras is not kept, and its detail neither.
-        if fine_tuned and state is not start.state:
+        if state is not begin:
             detail = tuned_detail(programs, state, shots.cameras, detail)
     folders = render_shots(output_dir, programs, state, shots, sources=sources, detail=detail)
     print(f"{len(shots.names)} frames: {', '.join(str(folder) for folder in folders)}")
