@@ -11,7 +11,7 @@ from absl import flags
 from experiments.command_line import start
 
 
-SUITES = ("nerf", "warp", "labels", "splats", "sweep", "resume", "detail", "scales", "gpu")
+SUITES = ("nerf", "warp", "labels", "splats", "sweep", "resume", "detail", "scales", "teach", "gpu")
 
 _SUITE = flags.DEFINE_list("suite", ["nerf", "warp"], f"suites to run: {', '.join(SUITES)}")
 

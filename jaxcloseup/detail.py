@@ -1,9 +1,9 @@
-"""Detail: what photographs show beyond a model, added to its renders with calibrated weights.
+"""Detail: what photographs show beyond a model, added to its renders as far as it is there.
 
 The residual of a photograph is the photograph minus the model's render of its view. Gathered into
 another view, it adds what the model did not learn, as far as it is really there: where photographs
-disagree or depth is wrong, it is noise. Photographs that are left out tell how much of it is there
-(`detail_weights`).
+disagree or depth is wrong, it is noise. True close-ups of other scenes told how much of it is
+there, and how far colors are off in the end (`detail_weights`).
 """
 
 import functools
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from jaxcloseup.detail_weights import CONTRAST, DetailWeights, Evidence, blend
+from jaxcloseup.detail_weights import CONTRAST, DetailWeights, Evidence, blend, expected_errors
 from jaxcloseup.gather import Gathered, GatherSettings, GatherSources, gather_parts
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.numerics import safe_divide
@@ -55,11 +55,14 @@ class Detailed(NamedTuple):
       weight: `[H, W]` in [0, 1], how far the photographs' detail is trusted.
       footprint: `[H, W]` side of the finest pixel that saw the surface, in pixels of the view;
         infinity where no photograph saw it.
+      error: `[H, W]` the mean absolute error of colors that is expected, but for exposure; NaN
+        where no photograph saw the surface.
     """
 
     rgb: jax.Array
     weight: jax.Array
     footprint: jax.Array
+    error: jax.Array
 
 
 class Candidates(NamedTuple):
@@ -106,12 +109,14 @@ def add_detail(
 @jax.jit
 def _add(weights, found, rgb):
     mixed, weight = blend(weights, found.features, found.residual, found.colors)
-    weight = jnp.where(found.weight > 0, weight, 0)
+    seen = found.weight > 0
+    weight = jnp.where(seen, weight, 0)
     added = weight[..., None] * mixed
     # Photographs and view may differ in exposure, so detail keeps the mean color of the view.
     shift = safe_divide(jnp.sum(added, axis=(0, 1)), jnp.sum(weight))
     added = added - weight[..., None] * shift[None, None]
-    return Detailed(jnp.clip(jnp.clip(rgb, 0, 1) + added, 0, 1), weight, found.footprint)
+    error = jnp.where(seen, expected_errors(weights, found.features)[..., 1], jnp.nan)
+    return Detailed(jnp.clip(jnp.clip(rgb, 0, 1) + added, 0, 1), weight, found.footprint, error)
 
 
 def find_candidates(
@@ -121,9 +126,6 @@ def find_candidates(
     rgb: jax.Array,
     alpha: jax.Array,
     depth: jax.Array,
-    *,
-    exclude: jax.Array | int = -1,
-    finest: jax.Array | int = 0,
 ) -> Candidates:
     """Gather what the photographs show at the surface of a render.
 
@@ -134,21 +136,14 @@ def find_candidates(
       rgb: `[H, W, 3]` rendered colors.
       alpha: `[H, W]` rendered opacity.
       depth: `[H, W]` rendered z-depth; 0 is undefined.
-      exclude: index of a photograph to leave out; -1 leaves out none.
-      finest: the first level to read, as if there were no finer one.
     """
-    gathered = gather_parts(
-        *(camera, pixels, depth, detail.sources, detail.shown, SETTINGS),
-        exclude=exclude,
-        finest=finest,
-    )
-    return _candidates(detail, gathered, rgb, alpha, depth, exclude, finest)
+    gathered = gather_parts(camera, pixels, depth, detail.sources, detail.shown, SETTINGS)
+    return _candidates(detail.finer, gathered, rgb, alpha, depth)
 
 
 @jax.jit
-def _candidates(detail, gathered, rgb, alpha, depth, exclude, finest):
+def _candidates(finer, gathered, rgb, alpha, depth):
     residual, colors = gathered
-    finer = detail.finer - detail.shown.coarseness(exclude)[finest]
     instead = (1 + colors.mean) / 2 - jnp.clip(rgb, 0, 1)
     instead = jnp.where(colors.weight[..., None] > 0, instead, 0)
     features = _features(residual, colors, instead, alpha, depth, finer)
@@ -157,13 +152,14 @@ def _candidates(detail, gathered, rgb, alpha, depth, exclude, finest):
 
 @jax.jit
 def testify(found: Candidates, own: jax.Array, weight: jax.Array) -> Evidence:
-    """What one left-out photograph says of the candidates for its own view.
+    """What the truth says of the candidates for a view.
 
     Args:
-      found: gathered from the other photographs.
-      own: `[H, W, 3]` its own residual.
+      found: gathered from the photographs; pixels that none of them saw say nothing.
+      own: `[H, W, 3]` the truth minus the render.
       weight: `[H, W]` weight of its pixels.
     """
+    weight = jnp.where(found.weight > 0, weight, 0)
     images = found.features, found.residual, found.colors, own, weight[..., None]
     *rows, weight = (image.reshape(-1, image.shape[-1]) for image in images)
     return Evidence(*rows, weight[:, 0])

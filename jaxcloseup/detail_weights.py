@@ -1,15 +1,19 @@
-"""How far gathered detail is really there: small networks that left-out photographs teach.
+"""How far gathered detail is really there: small networks that close-ups of known scenes teach.
 
 Two predictions compete at each pixel: the gathered residual, which keeps the model's own render
 where photographs say nothing, and gathered colors in place of the render, which need exact depth.
 Where they agree with each other, and photographs among themselves, both are sharp; where depth is
 wrong, they differ. A network of a pixel's features mixes them, and says which share of the mixture
-is really there. A monotone curve then makes that share mean what it says.
+is really there. A second one says by how much colors are off in the end.
+
+True close-ups of other scenes teach both: what a scene's own photographs would say of each other
+is too hopeful, because its depth is better in their views than in close-ups.
 """
 
 import functools
 import itertools
-from collections.abc import Sequence
+import pathlib
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -17,31 +21,29 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import struct
-from scipy.optimize import isotonic_regression
 
 from jaxcloseup.numerics import matmul
 
 
-# Interpolation and averaging take contrast: left-out photographs have up to twice the gathered
-# residual where everything else is sure.
+# Interpolation and averaging take contrast: photographs have up to twice the gathered residual
+# where everything else is sure.
 CONTRAST = 2.5
-TENTHS = 10
-FOLDS = 5  # and as many networks, each taught without one fold of the photographs
 WIDTHS = 32, 32, 2  # units of each layer after the features
-KNOTS = 32  # of the monotone curve, each with an equal share of the evidence
-PIXELS = 600_000  # that teach the networks
-_STEPS, _BATCH, _RATE = 600, 4096, 1e-2
+PIXELS = 60_000  # of each scene and kind of view that teach the networks
+KNOWN = pathlib.Path(__file__).with_suffix(".npz")  # what `experiments.teach` learned
+_BATCH = 4096  # pixels
 _UNUSUAL = 2.5  # standard deviations beyond which features count as no more unusual
+_FINEST = 0.5 / 255  # error of a color that is rounded to 8 bits
 
 
 class Evidence(NamedTuple):
-    """What a left-out photograph says about what is gathered from the others, N pixels.
+    """What a true view says about what is gathered for it, N pixels.
 
     Attributes:
       features: `[N, F]`.
       residual: `[N, 3]` gathered residual.
       colors: `[N, 3]` gathered colors minus the render; 0 where no photograph confirms the depth.
-      own: `[N, 3]` the photograph's own residual.
+      own: `[N, 3]` the truth minus the render.
       weight: `[N]` weight of its pixels.
     """
 
@@ -53,24 +55,32 @@ class Evidence(NamedTuple):
 
 
 @struct.dataclass
-class DetailWeights:
-    """How features predict what of a gathered residual and colors is really there, K networks.
+class Networks:
+    """K networks of features.
 
     Attributes:
-      center: `[F]` mean of the features.
-      scale: `[F]` 1 / their standard deviation.
+      center: `[K, F]` mean of the features.
+      scale: `[K, F]` 1 / their standard deviation.
       layers: matrices `[K, A, B]` and offsets `[K, B]`, alternating, from the features to two
         outputs.
-      share: `[P]` shares as the networks predict them, ascending.
-      actual: `[P]` shares that left-out photographs have there, ascending; below 0 where the
-        mixture points away from the truth.
     """
 
     center: jax.Array
     scale: jax.Array
     layers: tuple[jax.Array, ...]
-    share: jax.Array
-    actual: jax.Array
+
+
+@struct.dataclass
+class DetailWeights:
+    """How features predict what of a gathered residual and colors is really there.
+
+    Attributes:
+      mixing: networks that say which share of the mixture is there, and what the mixture is.
+      errors: networks that say how far the render is off, and the render with what is added.
+    """
+
+    mixing: Networks
+    errors: Networks
 
 
 def blend(
@@ -85,105 +95,151 @@ def blend(
       colors: `[..., 3]` gathered colors minus the render.
 
     Returns:
-      `[..., 3]` the mixture, and `[...]` the share of it that is really there, in [0, 1]; 0 too
-      where a share below 0 is predicted.
+      `[..., 3]` the mixture, and `[...]` the share of it that is really there, in [0, 1].
     """
-    outputs = sum(_outputs(weights, features)) / weights.layers[0].shape[0]
-    mixed, share = _mix(outputs, residual, colors)
-    return mixed, jnp.interp(share, weights.share, jnp.maximum(weights.actual, 0))
+    return _mix(_mean_output(weights.mixing, features), residual, colors)
+
+
+def expected_errors(weights: DetailWeights, features: jax.Array) -> jax.Array:
+    """The mean absolute error of colors in [0, 1] that features `[..., F]` let expect, `[..., 2]`.
+
+    The first is that of the render, the second that of the render with its share of the mixture.
+    """
+    return jnp.exp(_mean_output(weights.errors, features))
+
+
+def known_weights(unseen: str | None = None) -> DetailWeights:
+    """The weights that come with the package: as many networks as scenes taught them.
+
+    Args:
+      unseen: name of a scene: if it is one of them, the network that never saw it speaks alone.
+    """
+    names, weights = _read_known()
+    if unseen not in names:
+        return weights
+    index = names.index(unseen)
+    return jax.tree.map(lambda leaf: leaf[index : index + 1], weights)
+
+
+@functools.cache
+def _read_known():
+    with np.load(KNOWN) as kept:
+        arrays = {name: jnp.asarray(kept[name]) for name in kept if name != "names"}
+        names = kept["names"].tolist()
+
+    def networks(kind):
+        layers = (arrays[f"{kind}_layer_{i}"] for i in range(2 * len(WIDTHS)))
+        return Networks(arrays[f"{kind}_center"], arrays[f"{kind}_scale"], tuple(layers))
+
+    return names, DetailWeights(networks("mixing"), networks("errors"))
+
+
+def write_known(path: pathlib.Path, names: Sequence[str], weights: DetailWeights) -> None:
+    """Write weights as `known_weights` reads them, with the names of their scenes."""
+    arrays = {"names": np.array(names)}
+    for kind in ("mixing", "errors"):
+        found = getattr(weights, kind)
+        arrays |= {f"{kind}_center": found.center, f"{kind}_scale": found.scale}
+        arrays |= {f"{kind}_layer_{i}": layer for i, layer in enumerate(found.layers)}
+    np.savez(path, **arrays)
 
 
 def learn_weights(
-    photographs: Sequence[Sequence[Evidence]],
-) -> tuple[DetailWeights, np.ndarray]:
-    """Teach the networks what is really there, then the curve of shares.
+    scenes: Mapping[str, Sequence[Evidence]], *, steps: tuple[int, int] = (600, 1500)
+) -> DetailWeights:
+    """Teach the networks what is really there, and how far colors are off.
 
-    A mixture g and its share s minimize the sum of |own - s g|^2 over all pixels. Each network is
-    taught without one fold of the photographs, and what it says of that fold makes the curve, by
-    isotonic regression: what it says of its teachers would look more certain than it is.
+    A mixture g and its share s minimize |own - s g|^2, and an expected error b minimizes
+    log b + |own - s g| / b, whose least mean is at the mean error. Every view counts alike,
+    whatever its error. Each network is taught without one of the scenes, in their order; a single
+    scene teaches one network.
 
     Args:
-      photographs: the evidence of each left-out photograph.
-
-    Returns:
-      The weights, and sums `[10, 4]` over the pixels of each tenth of the predicted share: of the
-      power |g|^2, of the power times that share, of the product of g with the photograph's own
-      residual (the power times the actual share), and the number of pixels. Each fold is predicted
-      by the network and the curve of the others. The first tenth holds what is below 0, too.
+      scenes: the evidence of each scene's views.
+      steps: of Adam that teach the mixture, and expected errors.
     """
-    found, fold = _sample(photographs)
-    folds = int(fold.max()) + 1
-    center, deviation = found.features.mean(0), found.features.std(0)
-    scale = 1 / (deviation + 1e-3)
-    layers = _first_layers(len(center), folds)
-    weights = DetailWeights(*map(jnp.asarray, (center, scale)), layers, None, None)
-    counts = np.ones((folds, len(fold)), np.float32)
-    if folds > 1:
-        counts = (np.arange(folds)[:, None] != fold).astype(np.float32)
-    weights = weights.replace(layers=_train(weights, found, counts * found.weight))
-
-    columns = []
-    for index, (mixed, share) in enumerate(jax.device_get(_predictions(weights, found))):
-        power = found.weight * np.sum(mixed**2, axis=-1)
-        product = found.weight * np.sum(mixed * found.own, axis=-1)
-        columns.append(np.stack([share, power, product])[:, fold == index].astype(np.float64))
-    sums = np.zeros((TENTHS, 4))
-    for index, own in enumerate(columns):
-        others = [one for i, one in enumerate(columns) if i != index] or columns
-        share = np.interp(own[0], *_monotone(*np.concatenate(others, axis=1)))
-        sums += _by_tenths(share, *own[1:])
-    curve = _monotone(*np.concatenate(columns, axis=1))
-    x, y = (jnp.asarray(array, jnp.float32) for array in curve)
-    return weights.replace(share=x, actual=y), sums
-
-
-def _sample(photographs):
-    """Pixels of all photographs, at most `PIXELS`, as one `Evidence`; and their folds `[N]`."""
-    folds = min(FOLDS, len(photographs))
-    total = sum(one.weight.size for found in photographs for one in found)
-    rng = np.random.default_rng(0)
-    parts, fold = [], []
-    for index, found in enumerate(photographs):
-        for one in found:
-            kept = np.flatnonzero(rng.random(one.weight.size) * total < PIXELS)
-            parts.append(jax.tree.map(lambda array, kept=kept: array[kept], one))
-            fold.append(np.full(len(kept), index % folds))
-    return jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts), np.concatenate(fold)
+    views = [(index, view) for index, views in enumerate(scenes.values()) for view in views]
+    found = jax.tree.map(lambda *arrays: np.concatenate(arrays), *(view for _, view in views))
+    scene = np.concatenate([np.full(view.weight.shape, index) for index, view in views])
+    importance = np.concatenate([_importance(view) for _, view in views])
+    networks, tests = [], []
+    for index in range(len(scenes)):
+        taught = (scene != index) | (len(scenes) == 1)
+        features = found.features[taught]
+        start = _untaught(features.mean(0), 1 / (features.std(0) + 1e-3))
+        rows = found.residual, found.colors, found.own
+        teach = functools.partial(_descend, start, found.features)
+        mixing = teach(importance * taught, rows, loss=_mixing_loss, steps=steps[0], rate=1e-2)
+        mixed, share = _mix(_mean_output(mixing, found.features), *rows[:2])
+        off = jnp.stack([found.own, found.own - share[:, None] * mixed], axis=1)
+        off = jnp.maximum(jnp.mean(jnp.abs(off), axis=-1), _FINEST)
+        errors = teach(found.weight * taught, (off,), loss=_error_loss, steps=steps[1], rate=5e-3)
+        networks.append(DetailWeights(mixing, errors))
+        own = scene == index
+        tests.append((np.asarray(_mean_output(errors, found.features[own])), np.asarray(off[own])))
+    for index, one in enumerate(networks):
+        others = [test for i, test in enumerate(tests) if i != index] or tests
+        networks[index] = one.replace(errors=_calibrated(one.errors, others))
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *networks)
 
 
-def _first_layers(features, count):
+def sample_evidence(evidence: Evidence, count: int, seed: int = 0) -> Evidence:
+    """At most `count` pixels of a view, those with weight."""
+    kept = np.flatnonzero(np.asarray(evidence.weight) > 0)
+    kept = np.random.default_rng(seed).permutation(kept)[:count]
+    return jax.tree.map(lambda rows: np.asarray(rows)[kept], evidence)
+
+
+def _importance(view):
+    """How much each pixel of a view counts, `[N]`: as much as others if the view is as wrong."""
+    power = np.sum(view.weight[:, None] * view.own**2)
+    return (view.weight / max(power, 1e-12) * view.weight.size).astype(np.float32)
+
+
+def _untaught(center, scale):
+    """One network of standardized features; its outputs are small, so shares begin near a half."""
     rng, layers = np.random.default_rng(0), []
-    for before, after in itertools.pairwise((features, *WIDTHS)):
-        # Small outputs, so that shares begin near one half.
-        size = np.sqrt(2 / before) * (0.1 if after == 2 else 1)
-        layers.append(jnp.asarray(rng.normal(0, size, (count, before, after)), jnp.float32))
-        layers.append(jnp.zeros((count, after)))
-    return tuple(layers)
+    for before, after in itertools.pairwise((len(scale), *WIDTHS)):
+        size = np.sqrt(2 / before) * (0.1 if after == WIDTHS[-1] else 1)
+        layers += [rng.normal(0, size, (1, before, after)), np.zeros((1, after))]
+    arrays = Networks(center[None], scale[None], tuple(layers))
+    return jax.tree.map(lambda array: jnp.asarray(array, jnp.float32), arrays)
 
 
-def _outputs(weights, features):
-    """What each network says of features `[..., F]`, one after the other: `[..., 2]`."""
-    shape = features.shape[:-1]
-    usual = _usual(weights, features.reshape(-1, features.shape[-1]))
-    for layers in zip(*weights.layers, strict=True):
-        yield _perceive(layers, usual).reshape(*shape, 2)
+def _calibrated(errors, tests):
+    """Networks with outputs a + b o, where a and b suit what others say of scenes they never saw.
+
+    Networks are too sure: errors that seem very small or very large to them are less so elsewhere.
+    """
+    columns = map(np.concatenate, zip(*tests, strict=True))
+    outputs, off = (column.astype(np.float64) for column in columns)
+    *hidden, matrix, offset = errors.layers
+    for index in range(WIDTHS[-1]):
+        rows = np.stack([np.ones(len(off)), outputs[:, index]])
+        change = np.array([0.0, 1.0])
+        for _ in range(20):  # Newton's steps; the loss is convex
+            actual = off[:, index] * np.exp(-change @ rows)
+            slope, bend = rows @ (1 - actual), (rows * actual) @ rows.T
+            change -= np.linalg.solve(bend + 1e-9 * np.eye(2), slope)
+        a, b = change
+        matrix = matrix.at[..., index].multiply(b)
+        offset = offset.at[..., index].set(a + b * offset[..., index])
+    return errors.replace(layers=(*hidden, matrix, offset))
 
 
-@jax.jit
-def _predictions(weights, found):
-    """The mixture and its share as each network has them, one after the other."""
-    outputs = _outputs(weights, found.features)
-    return tuple(_mix(own, found.residual, found.colors) for own in outputs)
+def _mean_output(networks, features):
+    """What networks say of features `[..., F]` in the mean, `[..., 2]`."""
+    rows = features.reshape(-1, features.shape[-1])
+    count = networks.center.shape[0]
+    each = (jax.tree.map(lambda leaf, i=i: leaf[i], networks) for i in range(count))
+    outputs = sum(_perceive(one, rows) for one in each) / count
+    return outputs.reshape(*features.shape[:-1], 2)
 
 
-@jax.jit
-def _usual(weights, features):
-    usual = (features - weights.center[None]) * weights.scale[None]
-    return jnp.clip(usual, -_UNUSUAL, _UNUSUAL)
-
-
-def _perceive(layers, values):
-    *hidden, last = zip(layers[::2], layers[1::2], strict=True)
+def _perceive(network, features):
+    values = (features - network.center[None]) * network.scale[None]
+    values = jnp.clip(values, -_UNUSUAL, _UNUSUAL)
+    *hidden, last = zip(network.layers[::2], network.layers[1::2], strict=True)
     for matrix, offset in hidden:
         values = jax.nn.relu(matmul(values, matrix) + offset[None])
     return matmul(values, last[0]) + last[1][None]
@@ -194,54 +250,42 @@ def _mix(outputs, residual, colors):
     return (1 - mixture) * CONTRAST * residual + mixture * colors, share
 
 
-def _train(weights, found, counts):
-    """Layers that predict the photographs' own residuals, by Adam; pixels count `[K, N]`."""
-    typical = max(float(np.mean(found.weight[:, None] * found.own**2)), 1e-12)
-    data = *(jnp.asarray(array) for array in (found.residual, found.colors, found.own)), typical
-    return _descend(weights.layers, _usual(weights, found.features), jnp.asarray(counts), data)
+def _mixing_loss(outputs, residual, colors, own):
+    mixed, share = _mix(outputs, residual, colors)
+    return jnp.sum((share[:, None] * mixed - own) ** 2, axis=-1)
 
 
-@jax.jit
-def _descend(layers, features, counts, data):
-    residual, colors, own, typical = data
-    adam = optax.adam(optax.cosine_decay_schedule(_RATE, _STEPS))
+def _error_loss(outputs, off):
+    return jnp.sum(outputs + off * jnp.exp(-outputs), axis=-1)
 
-    def loss(layers, count, chosen):
-        outputs = _perceive(layers, features[chosen])
-        mixed, share = _mix(outputs, residual[chosen], colors[chosen])
-        error = share[:, None] * mixed - own[chosen]
-        return jnp.mean(count[chosen][:, None] * error**2) / typical
+
+@functools.partial(jax.jit, static_argnames=("loss", "steps", "rate"))
+def _descend(
+    networks: Networks,
+    features: jax.Array,
+    counts: jax.Array,
+    rows: Sequence[jax.Array],
+    *,
+    loss: Callable[..., jax.Array],
+    steps: int,
+    rate: float,
+) -> Networks:
+    """Networks whose mean `loss` of outputs and rows `[N, ...]` is small, by Adam."""
+    adam = optax.adam(optax.cosine_decay_schedule(rate, steps))
+    counts = counts / jnp.mean(counts)
+
+    def mean_loss(layers, chosen):
+        outputs = _mean_output(networks.replace(layers=layers), features[chosen])
+        return jnp.mean(counts[chosen] * loss(outputs, *(row[chosen] for row in rows)))
 
     def step(index, so_far):
         layers, moments = so_far
         key = jax.random.fold_in(jax.random.key(0), index)
-        chosen = jax.random.randint(key, (_BATCH,), 0, features.shape[0])
-        slope = jax.vmap(functools.partial(jax.grad(loss), chosen=chosen))(layers, counts)
+        chosen = jax.random.randint(key, (_BATCH,), 0, counts.shape[0])
+        slope = jax.grad(mean_loss)(layers, chosen)
         with jax.numpy_dtype_promotion("standard"):  # optax multiplies by counts of steps
             change, moments = adam.update(slope, moments)
         return optax.apply_updates(layers, change), moments
 
-    return jax.lax.fori_loop(0, _STEPS, step, (layers, adam.init(layers)))[0]
-
-
-def _monotone(regressed, power, product):
-    """Knots `[K]` of the actual share, product / power, as a rising function of the regressed."""
-    order = np.argsort(regressed, kind="stable")
-    regressed, power, product = regressed[order], power[order], product[order]
-    reached = np.cumsum(power)
-    knot = np.minimum((reached / max(reached[-1], 1e-12) * KNOTS).astype(int), KNOTS - 1)
-    mass, x, y = (np.bincount(knot, c, KNOTS) for c in (power, power * regressed, product))
-    known = mass > 0
-    if not known.any():
-        return np.zeros(KNOTS), np.zeros(KNOTS)
-    x, y = x[known] / mass[known], y[known] / mass[known]
-    y = np.clip(isotonic_regression(y, weights=mass[known]).x, -1, 1)
-    # Always as many knots, so that nothing recompiles.
-    at, index = np.linspace(0, len(x) - 1, KNOTS), np.arange(len(x))
-    return np.interp(at, index, x), np.interp(at, index, y)
-
-
-def _by_tenths(share, power, product):
-    tenth = np.clip((share * TENTHS).astype(int), 0, TENTHS - 1)
-    columns = power, power * share, product, power > 0
-    return np.stack([np.bincount(tenth, column, TENTHS) for column in columns], axis=1)
+    start = networks.layers, adam.init(networks.layers)
+    return networks.replace(layers=jax.lax.fori_loop(0, steps, step, start)[0])

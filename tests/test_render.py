@@ -50,7 +50,7 @@ def files(folder):
 
 def test_test_views_are_rendered_with_their_own_cameras(render, capture_folder, capsys):
     out = render(views="test", detail=True)
-    kinds = ("depth", "normals", "rgb", "support", "trust")
+    kinds = ("depth", "error", "normals", "rgb", "support", "trust")
     assert files(out) == [f"{kind}/0.png" for kind in kinds]
     truth = cv2.imread(str(capture_folder / "test" / "0.png"))
     image = cv2.imread(str(out / "rgb" / "0.png"))

@@ -25,7 +25,8 @@ from jaxcloseup.artifacts.images import color_counts, to_uint8
 
 
 HAS = "return document.body.innerText.includes(arguments[0])"
-# Returns the pixels of the picture and of its support once the picture differs from the argument.
+# Returns the pixels of the picture, of its support and of what follows, once the picture differs
+# from the argument.
 PICTURES = """
 const shown = [...document.images].filter(image => image.complete && image.naturalWidth > 300);
 const pixels = shown.map(image => {
@@ -34,7 +35,7 @@ const pixels = shown.map(image => {
     canvas.getContext('2d').drawImage(image, 0, 0);
     return canvas.toDataURL();
 });
-return pixels.length == 2 && pixels[0] != arguments[0] ? pixels : null;
+return pixels.length > 1 && pixels[0] != arguments[0] ? pixels : null;
 """
 
 # Whether the picture is seen at the top of the panel, which pressing a button has scrolled.

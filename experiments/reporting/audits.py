@@ -105,20 +105,20 @@ def gate_table(gate: Mapping[str, Any]) -> str:
 
 
 def detail_table(detail: Mapping[str, Any]) -> str:
-    """Return the table of predicted against actual shares of detail."""
-    header = ["predicted share", "actual share", "share of pixels"]
+    """Return the table of expected against actual errors of renders with detail."""
+    header = ["tenth of the pixels", "expected error", "actual error"]
     body = [
-        [f"{row['predicted']:.2f}", f"{row['actual']:.2f}", f"{row['pixels']:.1%}"]
-        for row in detail["reliability"]
+        [str(number), *(f"{255 * row[key]:.1f}" for key in ("expected", "actual"))]
+        for number, row in enumerate(detail["errors"], 1)
     ]
     (height, width), *_ = detail["sizes"]
     return (
         "<h2>Detail of the photographs</h2><p>The stage <i>detail</i> shows the renders of "
         f"<i>{html.escape(detail['stage'])}</i> with what photographs of {width} x {height} pixels "
         "show beyond them. How much of it is added at a pixel is predicted from how well the "
-        "photographs agree, how sharply and from which angles they see the surface. The table "
-        "compares the prediction with left-out photographs: of the detail that the other "
-        "photographs show, the share that is predicted and that is really there. Below 0 it points "
-        "away from the truth, and nothing is added.</p>"
-        f"{table(header, body)}"
+        "photographs agree, how sharply and from which angles they see the surface. Close-ups of "
+        "other scenes taught the prediction, and how far colors are off in the end. The table "
+        "compares that expected error with the actual one on the held-out views of this run, in "
+        "gray levels of 255, once colors are corrected: from the tenth of the pixels where the "
+        f"least is expected to that where the most is.</p>{table(header, body)}"
     )

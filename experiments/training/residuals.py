@@ -1,7 +1,6 @@
 """Residuals of a trained state: photographs, at several sizes, minus renders of their views."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import cv2
 import jax
@@ -23,43 +22,14 @@ FINER = 4
 FINER_RAYS = 1  # the same for fields that render single rays, and so whole images slowly
 MISFIT = 4  # times the median error at which a photograph has a quarter of its trust
 COLOR_RIDGE = 0.01  # resistance to a photograph's change of colors, see `fit_colors`
-WINDOW = 45  # side in pixels of the windows that are kept of left-out photographs
-WINDOWS = 4  # for each of them, level and imitated distance
-
-
-class Window(NamedTuple):
-    """A window of a left-out photograph, as the state renders it, S x S pixels.
-
-    Attributes:
-      view: its index.
-      level: level of the pyramid.
-      finest: the finest level that other photographs may show there.
-      corner: `[2]` x, y of its first pixel.
-      rgb: `[S, S, 3]` rendered colors.
-      residual: `[S, S, 3]` in [-1, 1].
-      weight: `[S, S]` weight of its pixels.
-      depth: `[S, S]` rendered z-depth.
-      alpha: `[S, S]` rendered opacity.
-    """
-
-    view: int
-    level: int
-    finest: int
-    corner: np.ndarray
-    rgb: np.ndarray
-    residual: np.ndarray
-    weight: np.ndarray
-    depth: np.ndarray
-    alpha: np.ndarray
 
 
 def render_residuals(
     programs: Programs,
     state: TrainState,
     pyramid: Pyramid,
-    left_out: Sequence[int] = (),
     views: Sequence[int] | None = None,
-) -> tuple[Pyramid, list[Window], jax.Array]:
+) -> tuple[Pyramid, jax.Array]:
     """Render photographs' own views, and subtract them from the photographs at every level.
 
     The state is rendered at levels up to `FINER` (or `FINER_RAYS`) times the reduced photographs'
@@ -70,12 +40,11 @@ def render_residuals(
       programs: the run's.
       state: the state to render.
       pyramid: photographs with their weights.
-      left_out: views of which windows are kept.
       views: the photographs; all by default.
 
     Returns:
-      What these V photographs show, int8 `[V, P, 6]`, see `Detail`; windows of `left_out`; and the
-      depths `[V, H, W]` at their training size.
+      What these V photographs show, int8 `[V, P, 6]`, see `Detail`, and the depths `[V, H, W]` at
+      their training size.
     """
     scene = programs.scene
     cameras, last = scene.train.cameras, len(pyramid.sizes) - 1
@@ -85,59 +54,40 @@ def render_residuals(
     values = np.empty((len(views), pyramid.values.shape[1], 6), np.int8)
 
     def compare(view):
-        """Level, what is shown, weight, colors, opacity and depth, the coarsest first."""
+        """What is shown at each level, the coarsest first, and the depth at the coarsest."""
         found = []
         for level in range(last, -1, -1):
             camera = pyramid.camera(camera_at(cameras, view), view, level)
             photograph = pyramid.image(view, level)
             if level >= rendered:
                 seen = programs.render(state, camera)
-                depth = label_depth(seen, near=scene.near, far=scene.far)
-                shown, shown_by = (seen.rgb, seen.alpha, depth), camera
+                rgb, shown_by = seen.rgb, camera
             else:
-                shown, shown_by = _enlarge(shown, shown_by, camera), camera
+                rgb, shown_by = _enlarge(rgb, shown_by, camera), camera
             if level == last:
                 # The size that the model learned from shows the exposure.
-                colors = _match(photograph, *shown[:2])
-            found.append((level, *_subtract(photograph, shown[0], colors), *shown))
-        return [(level, *map(np.asarray, images)) for level, *images in found]
+                colors = _match(photograph, seen.rgb, seen.alpha)
+                depth = label_depth(seen, near=scene.near, far=scene.far)
+            found.append((level, np.asarray(_subtract(photograph, rgb, colors))))
+        return found, depth
 
-    windows, depths, rng = [], [], np.random.default_rng(0)
+    depths = []
     compared = progress.each(compare, views, "residuals of photographs")
-    for view, own, found in zip(views, values, compared, strict=True):
-        depths.append(found[0][-1])
-        for level, both, weight, rgb, alpha, depth in found:
+    for own, (found, depth) in zip(values, compared, strict=True):
+        depths.append(depth)
+        for level, both in found:
             own[pyramid.pixels_of(level)] = both.reshape(-1, 6)
-            if view in left_out:
-                images = [rgb, both[..., :3] / np.float32(127), weight, depth, alpha]
-                windows += _cut(rng, view, level, pyramid.sizes, images)
     found = Pyramid(jnp.asarray(values), pyramid.intrinsics[np.asarray(views)], pyramid.sizes)
-    return found, windows, jnp.stack(depths)
+    return found, jnp.stack(depths)
 
 
-def _enlarge(shown, camera, finer):
-    """Colors, opacity and depth of a render as a camera with the same pose and finer pixels."""
+def _enlarge(rgb, camera, finer):
+    """Colors of a render as a camera with the same pose and finer pixels shows them."""
     (fx, fy, cx, cy), (gx, gy, dx, dy) = map(np.asarray, (camera.intrinsics, finer.intrinsics))
     x = (np.arange(finer.width) + 0.5 - dx) / gx * fx + cx - 0.5
     y = (np.arange(finer.height) + 0.5 - dy) / gy * fy + cy - 0.5
     where = [axis.astype(np.float32) for axis in np.meshgrid(x, y)]
-    ways = cv2.INTER_CUBIC, cv2.INTER_NEAREST, cv2.INTER_NEAREST
-    return tuple(
-        cv2.remap(np.asarray(image), *where, way, borderMode=cv2.BORDER_REPLICATE)
-        for image, way in zip(shown, ways, strict=True)
-    )
-
-
-def _cut(rng, view, level, sizes, shown):
-    """Windows of a photograph, for each finest level that others may show there."""
-    side = min(WINDOW, *sizes[-1])
-    height, width = sizes[level]
-    for finest in (0, *range(level + 1, len(sizes))):
-        for _ in range(WINDOWS):
-            y, x = rng.integers(height - side + 1), rng.integers(width - side + 1)
-            inside = np.s_[y : y + side, x : x + side]
-            corner = np.array([x, y], np.float32)
-            yield Window(view, level, finest, corner, *(image[inside] for image in shown))
+    return cv2.remap(np.asarray(rgb), *where, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 
 def reproduced(shown: Pyramid) -> jax.Array:
@@ -179,10 +129,9 @@ def _match(photograph, rgb, alpha):
 
 @jax.jit
 def _subtract(photograph, rgb, colors):
-    """Residual and matched colors of a photograph, int8 `[H, W, 6]`, and its weight."""
+    """Residual and matched colors of a photograph, int8 `[H, W, 6]`."""
     values, (matrix, offset) = to_float(photograph), colors
-    weight = values[..., 3]
     matched = matmul(values[..., :3], matrix[None]) + offset[None, None]
     both = jnp.concatenate([matched - jnp.clip(rgb, 0, 1), 2 * matched - 1], axis=-1)
-    both = jnp.where(weight[..., None] > 0, both, 0)
-    return jnp.round(127 * jnp.clip(both, -1, 1)).astype(jnp.int8), weight
+    both = jnp.where(values[..., 3:] > 0, both, 0)
+    return jnp.round(127 * jnp.clip(both, -1, 1)).astype(jnp.int8)

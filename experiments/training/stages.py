@@ -1,6 +1,7 @@
 """The stages of a run on one scene: baseline, control, closeup, test_time, detail."""
 
 import functools
+import itertools
 import pathlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.evaluation.audit import audit_labels, left_out_curve
+from experiments.evaluation.expected_errors import compare_errors
 from experiments.evaluation.renders import write_truth
 from experiments.evaluation.scores import NO_PERCEPTUAL, Perceptual
 from experiments.training.detail import FindDetail, detail_finder, detail_path, detailed
@@ -116,7 +118,7 @@ def run_stages(
     detail, render = None, functools.partial(programs.render, latest[1])
     find_latest = find(*latest)
     if "detail" in to_run:
-        detail, render = add_detail_stage(training, scorer, *latest, find_latest)
+        detail, render = add_detail_stage(training, scorer, held_out, *latest, find_latest)
     if "test_time" in to_run and scene.test is None:
         print(f"no test_time: {scene.name} holds out no close-ups (--split=closest does)")
     elif "test_time" in to_run:
@@ -166,9 +168,17 @@ def train_for_targets(
 
 
 def add_detail_stage(
-    training: Training, scorer: Scorer, stage: str, state: TrainState, find: FindDetail
+    training: Training,
+    scorer: Scorer,
+    held_out: HeldOut,
+    stage: str,
+    state: TrainState,
+    find: FindDetail,
 ) -> tuple[dict[str, Any], Callable[[Camera], Rendering]]:
-    """Score the renders of a stage again with the photographs' detail; its record, and them."""
+    """Score the renders of a stage again with the photographs' detail; its record, and them.
+
+    The record has what `find_detail` says, and `errors`, expected and actual ones.
+    """
     programs = training.programs
     with timed(training.seconds, "detail"):
         detail, about = find()
@@ -177,8 +187,14 @@ def add_detail_stage(
         rendering = programs.render(state, camera)
         return rendering._replace(rgb=detailed(programs, detail, camera, rendering).rgb)
 
+    def detail_of(camera):
+        return detailed(programs, detail, camera, programs.render(state, camera))
+
     scorer.score("detail", state, render)
-    return {"stage": stage, **about}, render
+    with timed(training.seconds, "expected_errors"):
+        targets = (held_out.targets[name] for name in programs.scene.names if name != "train")
+        errors = compare_errors(detail_of, list(itertools.chain(*targets)))
+    return {"stage": stage, **about, "errors": errors}, render
 
 
 def closeup_labels(

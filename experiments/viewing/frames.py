@@ -13,6 +13,7 @@ from experiments.viewing.camera_paths import Shots, named_cameras
 from jaxcloseup.artifacts.images import (
     Image,
     colorize_depth,
+    colorize_expected_error,
     colorize_normals,
     colorize_support,
     write_png,
@@ -43,8 +44,8 @@ def render_shots(
     """Write `<kind>/<name>.png` for every camera, and return the folders.
 
     Args:
-      output_dir: folder for `rgb`, `depth`, `normals` (from fields that render them), `support`
-        and `trust`.
+      output_dir: folder for `rgb`, `depth`, `normals` (from fields that render them), `support`,
+        `trust` and `error`.
       programs: the run's compiled programs.
       state: the state to render.
       shots: the cameras.
@@ -60,16 +61,18 @@ def render_shots(
     images: dict[str, Image] = {}
     empty = 0
 
-    def draw(named):
-        seen = programs.render(state, named[1])
-        given = {"sources": sources, "detail": detail, "limits": limits}
-        return draw_pictures(programs, seen, named[1], **given), np.asarray(seen.alpha)
+    def draw(one):
+        (name, camera), size = one
+        seen = programs.render(state, camera)
+        given = {"sources": sources, "detail": detail, "limits": limits, "size": size}
+        images = draw_pictures(programs, seen, camera, **given)
+        return name, images, np.asarray(seen.alpha)[: size[1], : size[0]]
 
-    drawn = progress.each(draw, cameras, "rendering frames")
-    for (name, _), (width, height), (images, alpha) in zip(cameras, sizes, drawn, strict=True):
-        empty += not bool(np.any(alpha[:height, :width] >= SOLID))
+    frames = list(zip(cameras, sizes, strict=True))
+    for name, images, alpha in progress.each(draw, frames, "rendering frames"):
+        empty += not bool(np.any(alpha >= SOLID))
         for kind, image in images.items():
-            write_png(output_dir / kind / f"{name}.png", image[:height, :width])
+            write_png(output_dir / kind / f"{name}.png", image)
     if empty:
         which = f"{empty} of {len(cameras)}" if empty < len(cameras) else "all"
         print(
@@ -87,10 +90,11 @@ def render_pictures(
     sources: LabelSources | None,
     detail: Detail | None = None,
 ) -> dict[str, Image]:
-    """Render one camera's images by kind: `rgb`, `depth`, `normals`, `support` and `trust`.
+    """Render one camera's images by kind: `rgb`, `depth`, `normals`, `support`, `trust`, `error`.
 
-    `normals` is missing for fields that render none, `support` without `sources`, and `trust`, how
-    much of the photographs' detail was added from black to white, without `detail`.
+    `normals` is missing for fields that render none, and `support` without `sources`. Without
+    `detail` there is neither `trust`, how much of the photographs' detail was added, from black to
+    white, nor `error`, the error that is expected.
 
     Args:
       programs: the run's compiled programs.
@@ -111,6 +115,7 @@ def draw_pictures(
     sources: LabelSources | None,
     detail: Detail | None = None,
     limits: tuple[float, float] | None = None,
+    size: tuple[int, int] | None = None,
 ) -> dict[str, Image]:
     """The images of `render_pictures` from a rendering.
 
@@ -121,22 +126,30 @@ def draw_pictures(
       sources: as `render_pictures` takes it.
       detail: likewise.
       limits: nearest and farthest depth of the color scale; default: `depth_range` of the image.
+      size: width and height of the images, without the camera's padding at the right and the
+        bottom; default: the camera's.
     """
+    width, height = size or (camera.width, camera.height)
+
+    def crop(image):
+        return np.asarray(image)[:height, :width]
+
     scene = programs.scene
     depth = label_depth(seen, near=0, far=scene.far)
     near, far = limits or depth_range([depth], scene)
-    solid = np.asarray(seen.alpha) >= SOLID
-    depth_colors = colorize_depth(seen.depth, near=near, far=far, valid=solid)
-    images = {"rgb": seen.rgb, "depth": depth_colors}
+    solid = crop(seen.alpha) >= SOLID
+    depth_colors = colorize_depth(crop(seen.depth), near=near, far=far, valid=solid)
+    images = {"rgb": crop(seen.rgb), "depth": depth_colors}
     if seen.normal is not None:
-        images["normals"] = colorize_normals(np.where(solid[..., None], seen.normal, 0))
+        images["normals"] = colorize_normals(np.where(solid[..., None], crop(seen.normal), 0))
     if sources is not None:
         pixels = pixel_grid(camera.height, camera.width)
         support = _support(camera, pixels, depth, sources.views, sources.depths)
-        images["support"] = colorize_support(*support)
+        images["support"] = colorize_support(*map(crop, support))
     if detail is not None:
         sharper = detailed(programs, detail, camera, seen)
-        images |= {"rgb": sharper.rgb, "trust": sharper.weight}
+        images |= {"rgb": crop(sharper.rgb), "trust": crop(sharper.weight)}
+        images["error"] = colorize_expected_error(crop(sharper.error))
     return images
 
 

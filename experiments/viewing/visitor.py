@@ -170,6 +170,9 @@ class Visitor:
         for name, call in buttons.items():
             gui.add_button(name).on_click(call)
         self._support = gui.add_image(black, label="support", format="png", visible=False)
+        self._error = gui.add_image(
+            black, label="expected error, in gray levels of 255", format="png", visible=False
+        )
         gui.add_markdown(_HELP)
 
     def _visit(self, index):
@@ -248,6 +251,9 @@ class Visitor:
         self._image.image = picture.repeat(factor, axis=0).repeat(factor, axis=1)
         self._support.image = images["support"]
         self._image.visible = self._support.visible = True
+        self._error.visible = "error" in images
+        if self._error.visible:
+            self._error.image = images["error"]
         return said
 
     def _own_camera(self):

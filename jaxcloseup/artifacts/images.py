@@ -20,6 +20,7 @@ _LABEL_HEIGHT = 24
 _LEGEND_WIDTH = 360
 _UNSEEN = (230, 0, 126)  # magenta
 _FOOTPRINTS, _COUNTS = (1, 2, 4, 8), (-9, -5, -3, -2)  # where colors of support change
+_ERRORS = 2, 4, 8, 16, 32  # the same of expected errors, in gray levels
 
 
 def to_uint8(image: Image) -> np.ndarray:
@@ -116,6 +117,23 @@ def colorize_error(error: Image, *, highest: float = 0.25) -> np.ndarray:
     return _map((error.mean(-1) if error.ndim == 3 else error) / highest, cv2.COLORMAP_INFERNO)
 
 
+def colorize_expected_error(error: Image) -> np.ndarray:
+    """Draw the error that is expected at each pixel, with a legend in gray levels of 255.
+
+    Args:
+      error: `[H, W]` errors of colors in [0, 1]; NaN, drawn in magenta, where no photograph saw the
+        surface.
+
+    Returns:
+      uint8 `[H', W', 3]`; small images are enlarged so that their legend is readable.
+    """
+    error = np.asarray(error)
+    image, legend = _in_steps(255 * np.nan_to_num(error), np.isnan(error), _ERRORS, "more")
+    factor = -(-_LEGEND_WIDTH // image.shape[1])
+    image = image.repeat(factor, axis=0).repeat(factor, axis=1)
+    return np.concatenate([image, legend(image.shape[1])])
+
+
 def colorize_normals(normal: Image) -> np.ndarray:
     """Map normals to colors (n + 1) / 2, uint8 `[H, W, 3]`; pixels without a normal are black.
 
@@ -142,8 +160,11 @@ def colorize_support(count: Image, footprint: Image) -> np.ndarray:
       uint8 `[H', W', 3]`; small images are enlarged so that their legends are readable.
     """
     unseen, panels = np.asarray(count) < 1, []
-    for values, steps in ((np.asarray(footprint), _FOOTPRINTS), (-np.asarray(count), _COUNTS)):
-        image, legend = _in_steps(values, unseen, steps)
+    for values, steps, last in (
+        (np.asarray(footprint), _FOOTPRINTS, "coarser"),
+        (-np.asarray(count), _COUNTS, "1"),
+    ):
+        image, legend = _in_steps(values, unseen, steps, last)
         factor = -(-_LEGEND_WIDTH // image.shape[1])
         image = image.repeat(factor, axis=0).repeat(factor, axis=1)
         panels.append(np.concatenate([image, legend(image.shape[1])]))
@@ -157,17 +178,20 @@ def color_counts(count: Image) -> tuple[np.ndarray, np.ndarray]:
     The second array is their legend, an image.
     """
     count = np.asarray(count)
-    colors, legend = _in_steps(-count, count < 1, _COUNTS)
+    colors, legend = _in_steps(-count, count < 1, _COUNTS, "1")
     return colors, legend(_LEGEND_WIDTH)
 
 
-def _in_steps(values, unseen, steps):
-    """Colors of values, and a function that draws their legend with a given width."""
+def _in_steps(values, unseen, steps, last):
+    """Colors of values, and a function that draws their legend with a given width.
+
+    `last` says what lies beyond all steps.
+    """
     step = np.searchsorted(np.array(steps) * (1 + 1e-4 * np.sign(steps)), values)
     colors = _map(np.linspace(0.95, 0.1, len(steps) + 1), cv2.COLORMAP_VIRIDIS)
     colors = np.concatenate([colors.reshape(-1, 3), [_UNSEEN]]).astype(np.uint8)
     texts = [f"<={s}" if s > 0 else f">={-s}" for s in steps]
-    texts += ["coarser" if steps[0] > 0 else "1", "unseen"]
+    texts += [last, "unseen"]
     return (
         colors[np.where(unseen, len(steps) + 1, step)],
         lambda width: _legend(colors, texts, width),

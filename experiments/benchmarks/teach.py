@@ -1,0 +1,96 @@
+"""How far to trust the detail of photographs, learned from the true close-ups of runs.
+
+The suite reads the stage `control` of every run in `outputs/teach`, of two scenes or more, and
+writes `outputs/teach/detail_weights.npz`; the package's own `jaxcloseup/detail_weights.npz` is made
+so. What is gathered from the photographs for each held-out view is compared with what is there.
+Small networks learn how much of it to add, and how far colors are off in the end, one without each
+scene. That scene is its test: printed are the PSNR of its held-out views before and after, and
+actual / expected error for every tenth of the pixels.
+"""
+
+import pathlib
+import sys
+from collections.abc import Iterator, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.evaluation.expected_errors import error_tenths
+from experiments.training.detail import detail_path, find_detail
+from experiments.training.stored_run import choose_stage, load_run_scene, read_run, restore
+from jaxcloseup.detail import find_candidates, testify
+from jaxcloseup.detail_weights import (
+    PIXELS,
+    DetailWeights,
+    Evidence,
+    blend,
+    expected_errors,
+    learn_weights,
+    sample_evidence,
+    write_known,
+)
+from jaxcloseup.geometry.cameras import pixel_grid
+from jaxcloseup.label_rules import label_depth
+from jaxcloseup.photographs import Views, camera_at, to_float
+from jaxcloseup.scene import Scene
+
+
+FOLDER, STAGE = pathlib.Path("outputs/teach"), "control"
+
+
+def run(folder: pathlib.Path = FOLDER) -> None:
+    """Learn from the runs in a folder, write the weights, and print what they are worth."""
+    scenes: dict[str, list[Evidence]] = {}
+    for path in sorted(folder.glob("*/manifest.json")):
+        name, found = run_evidence(path.parent)
+        scenes.setdefault(name, []).extend(found)
+    if len(scenes) < 2:
+        sys.exit(f"experiments.bench: {folder} must hold runs of two scenes or more")
+    weights = learn_weights(scenes)
+    write_known(folder / "detail_weights.npz", list(scenes), weights)
+    for index, (name, views) in enumerate(scenes.items()):
+        unseen = jax.tree.map(lambda leaf, i=index: leaf[i : i + 1], weights)
+        print(f"{name:>8}, which its network never saw: {_describe(unseen, views)}", flush=True)
+
+
+def run_evidence(folder: pathlib.Path) -> tuple[str, list[Evidence]]:
+    """The scene of a run, and what its held-out views say of the detail of its photographs."""
+    record = read_run(folder)
+    scene = load_run_scene(record)
+    stage = choose_stage(record, STAGE)
+    programs, state = restore(record, scene, stage)
+    detail, _ = find_detail(programs, state, detail_path(record.folder, stage))
+
+    def evidence(views, index):
+        camera = camera_at(views.cameras, index)
+        seen = programs.render(state, camera)
+        depth = label_depth(seen, near=0, far=scene.far)
+        pixels = pixel_grid(camera.height, camera.width)
+        found = find_candidates(detail, camera, pixels, seen.rgb, seen.alpha, depth)
+        own = to_float(views.rgb[index]) - jnp.clip(seen.rgb, 0, 1)
+        told = testify(found, own, jnp.asarray(views.weight[index]))
+        return sample_evidence(told, PIXELS // len(views), seed=index)
+
+    kinds = _held_out(scene, programs.preset.score_downscale)
+    return scene.name, [evidence(views, i) for views in kinds for i in range(len(views))]
+
+
+def _held_out(scene: Scene, finer: int | None) -> Iterator[Views]:
+    for split in ("test", "test_far"):
+        if getattr(scene, split) is not None:
+            yield getattr(scene, split)
+            if finer is not None and scene.photographs_at:
+                yield scene.photographs_at(finer, split)[0]
+
+
+def _describe(weights: DetailWeights, views: Sequence[Evidence]) -> str:
+    """PSNR of all pixels before and after, and how right the expected errors are."""
+    found = jax.tree.map(lambda *rows: np.concatenate(rows), *views)
+    mixed, share = blend(weights, *map(jnp.asarray, found[:3]))
+    errors = [np.abs(own) for own in (found.own, found.own - np.asarray(share[:, None] * mixed))]
+    before, after = (-10 * np.log10(np.mean(error**2)) for error in errors)
+    expected = np.asarray(expected_errors(weights, jnp.asarray(found.features)))[:, 1]
+    tenths = error_tenths(expected, errors[1].mean(-1), found.weight)
+    ratios = ", ".join(f"{row['actual'] / row['expected']:.2f}" for row in tenths)
+    return f"{before:.2f} to {after:.2f} dB; actual / expected error {ratios}"
