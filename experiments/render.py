@@ -8,9 +8,10 @@
 The program writes a folder of images for each of `rgb`, `depth`, `normals` (surfels only),
 `support`, which shows how many training photographs saw each pixel and how sharply, `trust`, how
 much of their detail was added to `rgb`, and `error`, by how much colors are expected to be off;
-`--nodetail` shows the field alone. Except for `--views`, it also writes each folder as a video. A dolly moves from a training view straight
-towards the surface at a pixel. `--fine_tune` first trains for exactly the rendered cameras, on
-pseudo-labels made for them; `--target=FILE` is short for `--camera_path=FILE --fine_tune`.
+`--nodetail` shows the field alone. Except for `--views`, it also writes each folder as a video. A
+dolly moves from a training view straight towards the surface at a pixel. `--fine_tune` first trains
+for exactly the rendered cameras, on pseudo-labels made for them; `--target=FILE` is short for
+`--camera_path=FILE --fine_tune`.
 """
 
 from absl import flags

@@ -149,10 +149,10 @@ def learn_weights(
 ) -> DetailWeights:
     """Teach the networks what is really there, and how far colors are off.
 
-    A mixture g and its share s minimize |own - s g|^2, and an expected error b minimizes
-    log b + |own - s g| / b, whose least mean is at the mean error. Every view counts alike,
-    whatever its error. Each network is taught without one of the scenes, in their order; a single
-    scene teaches one network.
+    A mixture g and its share s minimize |own - s g|^2, where every view counts alike, whatever its
+    error. An expected error b minimizes log b + |own - s g| / b, whose least mean is at the mean
+    error; its logarithm then suits what others say of scenes that they never saw. Each network is
+    taught without one of the scenes, in their order; a single scene teaches one network.
 
     Args:
       scenes: the evidence of each scene's views.
