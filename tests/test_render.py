@@ -55,6 +55,10 @@ def test_test_views_are_rendered_with_their_own_cameras(render, capture_folder, 
     truth = cv2.imread(str(capture_folder / "test" / "0.png"))
     image = cv2.imread(str(out / "rgb" / "0.png"))
     assert image.shape == truth.shape
+    # Pictures with legends are as large as these need.
+    panels = {kind: cv2.imread(str(out / kind / "0.png")) for kind in ("support", "error")}
+    assert panels["support"].shape[1] > 720 and panels["error"].shape[1] >= 360
+    assert min(panel.shape[0] for panel in panels.values()) > truth.shape[0] * 360 // truth.shape[1]
     assert np.abs(image.astype(float) - truth).mean() < 25
     # The plane's normal, towards the camera, is +z.
     red_last = cv2.imread(str(out / "normals" / "0.png"))[plane.HEIGHT // 2, plane.WIDTH // 2]
