@@ -22,7 +22,7 @@ def compare_errors(
     """Compare the error that is expected at each pixel of held-out views with the actual one.
 
     An affine map first brings each view's colors to the photograph's, because no photograph knows
-    the exposure of another one.
+    the exposure of another one. Pixels tell it by how little error they expect.
 
     Args:
       render: `camera -> Detailed`.
@@ -35,10 +35,10 @@ def compare_errors(
     def compare(target):
         found, (height, width) = render(target.camera), target.weight.shape
         rgb, error = found.rgb[:height, :width], found.error[:height, :width]
-        matrix, offset = fit_colors(rgb, target.rgb, target.weight)
+        weight = jnp.where(jnp.isfinite(error), target.weight, 0)
+        matrix, offset = fit_colors(rgb, target.rgb, jnp.where(weight > 0, weight / error**2, 0))
         corrected = jnp.clip(matmul(rgb, matrix[None]) + offset[None, None], 0, 1)
         actual = jnp.mean(jnp.abs(corrected - target.rgb), axis=-1)
-        weight = jnp.where(jnp.isfinite(error), target.weight, 0)
         return [np.asarray(one).ravel() for one in (error, actual, weight)]
 
     found = list(progress.each(compare, targets, "expected errors"))
