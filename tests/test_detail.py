@@ -40,7 +40,7 @@ from jaxcloseup.windows import view_windows
 
 
 # Made-up evidence is simple, so few steps teach it.
-learn_quickly = functools.partial(learn_weights, steps=(300, 500))
+learn_quickly = functools.partial(learn_weights, steps=(250, 300))
 
 
 def made_up(share, count=20_000, seed=0):
