@@ -115,9 +115,11 @@ def known_weights(unseen: str | None = None) -> DetailWeights:
       unseen: name of a scene: if it is one of them, the network that never saw it speaks alone.
     """
     names, weights = _read_known()
-    if unseen not in names:
-        return weights
-    index = names.index(unseen)
+    return one_network(weights, names.index(unseen)) if unseen in names else weights
+
+
+def one_network(weights: DetailWeights, index: int) -> DetailWeights:
+    """The weights of a single network: the one that never saw the scene of that index."""
     return jax.tree.map(lambda leaf: leaf[index : index + 1], weights)
 
 
@@ -157,14 +159,19 @@ def learn_weights(
     Args:
       scenes: the evidence of each scene's views.
       steps: of Adam that teach the mixture, and expected errors.
+
+    Raises:
+      ValueError: nothing teaches one of the networks.
     """
     views = [(index, view) for index, views in enumerate(scenes.values()) for view in views]
     found = jax.tree.map(lambda *arrays: np.concatenate(arrays), *(view for _, view in views))
     scene = np.concatenate([np.full(view.weight.shape, index) for index, view in views])
     importance = np.concatenate([_importance(view) for _, view in views])
     networks, tests = [], []
-    for index in range(len(scenes)):
+    for index, name in enumerate(scenes):
         taught = (scene != index) | (len(scenes) == 1)
+        if not np.any(found.weight[taught]):
+            raise ValueError(f"no photograph shows anything of the scenes other than {name}.")
         features = found.features[taught]
         start = _untaught(features.mean(0), 1 / (features.std(0) + 1e-3))
         rows = found.residual, found.colors, found.own

@@ -89,10 +89,13 @@ def test_colors_are_taken_where_they_are_right_and_the_residual_elsewhere():
     assert float(share.min()) > 0.9
 
 
-def test_weights_stay_in_their_range():
+def test_weights_stay_in_their_range_and_need_evidence():
     found, _ = made_up(lambda x: 3 * x - 1)
     _, predicted = blend(learn_quickly({"scene": [found]}), *found[:3])
     assert 0 <= float(predicted.min()) < 0.05 and 0.95 < float(predicted.max()) <= 1
+    none = found._replace(weight=0 * found.weight)
+    with pytest.raises(ValueError, match="no photograph shows anything of the scenes other than b"):
+        learn_quickly({"a": [none], "b": [found]})
 
 
 def test_what_points_away_from_the_truth_is_not_added():
@@ -164,7 +167,7 @@ def found(rendered):
 def test_renders_with_detail_come_nearer_to_the_truth(rendered, found):
     programs, state, _ = rendered
     detail, about = found
-    assert about == {"divisor": 1, "sizes": about["sizes"]}
+    assert about == {"divisor": 1, "sizes": list(map(list, detail.shown.sizes))}
     for views in (programs.scene.test, programs.scene.test_far):
         camera, truth = camera_at(views.cameras, 0), to_float(views.rgb[0])
         seen = programs.render(state, camera)

@@ -25,8 +25,8 @@ from jaxcloseup.artifacts.images import color_counts, to_uint8
 
 
 HAS = "return document.body.innerText.includes(arguments[0])"
-# Returns the pixels of the picture, of its support and of what follows, once the picture differs
-# from the argument.
+# Returns the pixels of the picture, of its support and of its expected error, once the picture
+# differs from the argument.
 PICTURES = """
 const shown = [...document.images].filter(image => image.complete && image.naturalWidth > 300);
 const pixels = shown.map(image => {
@@ -35,7 +35,7 @@ const pixels = shown.map(image => {
     canvas.getContext('2d').drawImage(image, 0, 0);
     return canvas.toDataURL();
 });
-return pixels.length > 1 && pixels[0] != arguments[0] ? pixels : null;
+return pixels.length == 3 && pixels[0] != arguments[0] ? pixels : null;
 """
 
 # Whether the picture is seen at the top of the panel, which pressing a button has scrolled.
@@ -77,7 +77,7 @@ def serve(viser):
 def test_a_closeup_is_chosen_and_rendered_in_a_browser(serve, kept, monkeypatch):
     told = []
 
-    def darker(programs, start, cameras, *, most, kept, tell):
+    def darker(programs, start, cameras, find, *, tell):
         state = start.state
         tell(3, 10)
         told.extend(visitor._status.content for visitor in serve.visitors.values())

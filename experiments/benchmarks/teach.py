@@ -27,6 +27,7 @@ from jaxcloseup.detail_weights import (
     blend,
     expected_errors,
     learn_weights,
+    one_network,
     sample_evidence,
     write_known,
 )
@@ -47,11 +48,14 @@ def run(folder: pathlib.Path = FOLDER) -> None:
         scenes.setdefault(name, []).extend(found)
     if len(scenes) < 2:
         sys.exit(f"experiments.bench: {folder} must hold runs of two scenes or more")
-    weights = learn_weights(scenes)
+    try:
+        weights = learn_weights(scenes)
+    except ValueError as error:
+        sys.exit(f"experiments.bench: {folder}: {error}")
     write_known(folder / "detail_weights.npz", list(scenes), weights)
     for index, (name, views) in enumerate(scenes.items()):
-        unseen = jax.tree.map(lambda leaf, i=index: leaf[i : i + 1], weights)
-        print(f"{name:>8}, which its network never saw: {_describe(unseen, views)}", flush=True)
+        found = _describe(one_network(weights, index), views)
+        print(f"{name:>8}, which its network never saw: {found}", flush=True)
 
 
 def run_evidence(folder: pathlib.Path) -> tuple[str, list[Evidence]]:

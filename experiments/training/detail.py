@@ -112,7 +112,7 @@ def make_detail(programs: Programs, state: TrainState) -> tuple[Detail, dict[str
 
 
 def _weights(scene):
-    # Of a built-in scene, its own held-out views say nothing.
+    # A built-in scene is judged without its own held-out views.
     return known_weights(scene.name if scene.surface else None)
 
 

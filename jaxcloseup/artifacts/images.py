@@ -128,10 +128,7 @@ def colorize_expected_error(error: Image) -> np.ndarray:
       uint8 `[H', W', 3]`; small images are enlarged so that their legend is readable.
     """
     error = np.asarray(error)
-    image, legend = _in_steps(255 * np.nan_to_num(error), np.isnan(error), _ERRORS, "more")
-    factor = -(-_LEGEND_WIDTH // image.shape[1])
-    image = image.repeat(factor, axis=0).repeat(factor, axis=1)
-    return np.concatenate([image, legend(image.shape[1])])
+    return _panel(255 * np.nan_to_num(error), np.isnan(error), _ERRORS, "more")
 
 
 def colorize_normals(normal: Image) -> np.ndarray:
@@ -159,15 +156,11 @@ def colorize_support(count: Image, footprint: Image) -> np.ndarray:
     Returns:
       uint8 `[H', W', 3]`; small images are enlarged so that their legends are readable.
     """
-    unseen, panels = np.asarray(count) < 1, []
-    for values, steps, last in (
-        (np.asarray(footprint), _FOOTPRINTS, "coarser"),
-        (-np.asarray(count), _COUNTS, "1"),
-    ):
-        image, legend = _in_steps(values, unseen, steps, last)
-        factor = -(-_LEGEND_WIDTH // image.shape[1])
-        image = image.repeat(factor, axis=0).repeat(factor, axis=1)
-        panels.append(np.concatenate([image, legend(image.shape[1])]))
+    count = np.asarray(count)
+    panels = [
+        _panel(np.asarray(footprint), count < 1, _FOOTPRINTS, "coarser"),
+        _panel(-count, count < 1, _COUNTS, "1"),
+    ]
     titles = ["finest photograph's pixel, in pixels here", "photographs that saw it"]
     return side_by_side(panels, labels=titles)
 
@@ -180,6 +173,14 @@ def color_counts(count: Image) -> tuple[np.ndarray, np.ndarray]:
     count = np.asarray(count)
     colors, legend = _in_steps(-count, count < 1, _COUNTS, "1")
     return colors, legend(_LEGEND_WIDTH)
+
+
+def _panel(values, unseen, steps, last):
+    """An image of values in steps above its legend; small images are enlarged to fit it."""
+    image, legend = _in_steps(values, unseen, steps, last)
+    factor = -(-_LEGEND_WIDTH // image.shape[1])
+    image = image.repeat(factor, axis=0).repeat(factor, axis=1)
+    return np.concatenate([image, legend(image.shape[1])])
 
 
 def _in_steps(values, unseen, steps, last):
