@@ -12,8 +12,7 @@ from experiments.methods import METHODS
 
 
 TOY = gpu.Size(
-    counts=(300,),
-    images=((16, 24),),
+    cases=((300, (16, 24)),),
     side=64,
     nerf=dataclasses.replace(SMALL, depth=2, width=16, num_coarse=4, num_fine=4),
     rays=16,
