@@ -14,6 +14,7 @@ from experiments.methods import METHODS
 TOY = gpu.Size(
     cases=((300, (16, 24)),),
     side=64,
+    numbers=256,
     nerf=dataclasses.replace(SMALL, depth=2, width=16, num_coarse=4, num_fine=4),
     rays=16,
     preset=constant_color.QUICK,

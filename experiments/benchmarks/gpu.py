@@ -46,6 +46,7 @@ class Size:
     Attributes:
       cases: numbers of splats, and the heights and widths of their images; smallest first.
       side: of the matrices whose product is a ceiling.
+      numbers: that are added and copied; so many that starting a program costs little beside it.
       nerf: the NeRF whose step is timed.
       rays: in such a step.
       scene: name or folder of what is trained on.
@@ -62,7 +63,8 @@ class Size:
         (100_000, (540, 960)),
         (500_000, (1080, 1920)),
     )
-    side: int = 8192
+    side: int = 16_384
+    numbers: int = 2**28
     nerf: NerfConfig = nerf.FULL
     rays: int = 4096
     scene: str = "table"
@@ -121,7 +123,7 @@ def peak_bytes() -> int | None:
 
 def ceilings(size: Size) -> dict[str, float]:
     """Operations and bytes a second: of matrix products, of sums, and of copies."""
-    many, steps = 2**24, 256
+    many, steps = size.numbers, 256
     calls, work = {}, {}
     for dtype in nerf.DTYPES:
         matrix = jnp.ones((size.side, size.side), dtype)

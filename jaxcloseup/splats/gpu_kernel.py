@@ -201,7 +201,8 @@ def _add_pairs(pairs_bar, lists, count, interpret):
     listed = jnp.cumsum(changes[:-1]) > 0
     place = jnp.arange(capacity, dtype=jnp.int32)
     owner, pair = lax.sort((jnp.where(listed, lists.splats, count), place), num_keys=1)
-    bounds = jnp.searchsorted(owner, jnp.arange(count + 1, dtype=jnp.int32)).astype(jnp.int32)
+    of_splat = jnp.arange(count + 1, dtype=jnp.int32)
+    bounds = jnp.searchsorted(owner, of_splat, method="scan_unrolled").astype(jnp.int32)
 
     def add(pairs_bar, pair, bounds, out):
         i = pl.program_id(0)

@@ -157,7 +157,9 @@ def _sorted_pairs(tile_of, rank, by_depth, total, tiles):
 
     def sort(room):
         found, ranks = _sort_pairs(tile_of[:room], rank[:room], tiles + 1, len(by_depth))
-        starts = jnp.searchsorted(found, jnp.arange(tiles + 1, dtype=found.dtype))
+        of_tile = jnp.arange(tiles + 1, dtype=found.dtype)
+        # Unrolled, for a GPU starts each step of a loop anew.
+        starts = jnp.searchsorted(found, of_tile, method="scan_unrolled")
         return starts.astype(jnp.int32), jnp.pad(by_depth[ranks], (0, capacity - room))
 
     smallest = jnp.argmax(jnp.stack([total <= room for room in rooms[:-1]] + [jnp.array(True)]))
