@@ -3,7 +3,8 @@
 The residual of a photograph is the photograph minus the model's render of its view. Gathered into
 another view, it adds what the model did not learn, as far as it is really there: where photographs
 disagree or depth is wrong, it is noise. True close-ups of other scenes told how much of it is
-there, and how far colors are off in the end (`detail_weights`).
+there, and how far colors are off in the end (`detail_weights`). What no photograph shows is filled
+(`holes`).
 """
 
 import functools
@@ -17,6 +18,7 @@ from flax import struct
 from jaxcloseup.detail_weights import CONTRAST, DetailWeights, Evidence, blend, expected_errors
 from jaxcloseup.gather import Gathered, GatherSettings, GatherSources, gather_parts
 from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.holes import OPAQUE, fill_holes, find_empty
 from jaxcloseup.numerics import safe_divide
 from jaxcloseup.pyramids import Pyramid
 
@@ -51,7 +53,7 @@ class Detailed(NamedTuple):
     """An image with detail.
 
     Attributes:
-      rgb: `[H, W, 3]` in [0, 1].
+      rgb: `[H, W, 3]` in [0, 1]; what no photograph shows has the colors around it.
       weight: `[H, W]` in [0, 1], how far the photographs' detail is trusted.
       footprint: `[H, W]` side of the finest pixel that saw the surface, in pixels of the view;
         infinity where no photograph saw it.
@@ -92,18 +94,20 @@ def add_detail(
     alpha: jax.Array,
     depth: jax.Array,
 ) -> Detailed:
-    """Add what the photographs show beyond a render to its colors.
+    """Add what the photographs show beyond a render to its colors, and fill its holes.
 
     Args:
       detail: of the state that was rendered.
       camera: camera of the render.
       pixels: `[H, W, 2]` its pixel centers, neighbors in the image.
-      rgb: `[H, W, 3]` rendered colors.
+      rgb: `[H, W, 3]` rendered colors, over black.
       alpha: `[H, W]` rendered opacity.
       depth: `[H, W]` rendered z-depth; 0 is undefined and gets no detail.
     """
     found = find_candidates(detail, camera, pixels, rgb, alpha, depth)
-    return _add(detail.weights, found, rgb)
+    sharper = _add(detail.weights, found, rgb)
+    filled = _fill(camera, pixels, sharper.rgb, alpha, found.weight > 0, detail.sources)
+    return sharper._replace(rgb=filled)
 
 
 @jax.jit
@@ -117,6 +121,15 @@ def _add(weights, found, rgb):
     added = added - weight[..., None] * shift[None, None]
     error = jnp.where(seen, expected_errors(weights, found.features)[..., 1], jnp.nan)
     return Detailed(jnp.clip(jnp.clip(rgb, 0, 1) + added, 0, 1), weight, found.footprint, error)
+
+
+@jax.jit
+def _fill(camera, pixels, rgb, alpha, seen, sources):
+    def fill():
+        return fill_holes(rgb, alpha, seen, find_empty(camera, pixels, sources))
+
+    # Most views have no holes.
+    return jax.lax.cond(jnp.any(~seen & (alpha < OPAQUE)), fill, lambda: rgb)
 
 
 def find_candidates(

@@ -183,11 +183,23 @@ def test_renders_with_detail_come_nearer_to_the_truth(rendered, found):
         error, seen_by = np.asarray(sharper.error), np.isfinite(sharper.footprint)
         np.testing.assert_array_equal(np.isfinite(error), seen_by)
         assert error[seen_by].min() > 0 and error[seen_by].max() < 1
-        # Nothing is added where nothing was rendered.
-        hole = seen._replace(alpha=jnp.zeros_like(seen.alpha), depth=jnp.zeros_like(seen.depth))
-        alone = detailed(programs, detail, camera, hole)
-        np.testing.assert_array_equal(alone.rgb, jnp.clip(seen.rgb, 0, 1))
-        assert not np.asarray(alone.weight).any()
+        # Nothing is added where nothing was rendered, not even trust; colors around it fill it.
+        for missing in (np.ones(solid.shape, bool), np.arange(solid.shape[1])[None] >= 20):
+            there = jnp.asarray(~np.broadcast_to(missing, solid.shape))
+            hole = seen._replace(
+                rgb=jnp.where(there[..., None], seen.rgb, 0),
+                alpha=jnp.where(there, seen.alpha, 0),
+                depth=jnp.where(there, seen.depth, 0),
+            )
+            alone = detailed(programs, detail, camera, hole)
+            unseen = ~np.asarray(there)
+            assert not np.asarray(alone.weight)[unseen].any()
+            assert np.isnan(np.asarray(alone.error)[unseen]).all()
+            if unseen.all():
+                np.testing.assert_array_equal(alone.rgb, 0)
+            else:
+                column = np.asarray(alone.rgb).mean(0)
+                assert np.abs(column[20] - column[19]).max() < 0.3 * column[19].max()
 
 
 def test_target_views_may_be_labeled_by_their_detail(rendered, found, monkeypatch):

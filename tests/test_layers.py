@@ -35,7 +35,8 @@ MAY_IMPORT = {
     "windows": {"geometry", "photographs", "pyramids"},
     "gather": {"numerics", "geometry", "photographs", "pyramids"},
     "detail_weights": {"numerics"},
-    "detail": {"numerics", "geometry", "gather", "pyramids", "detail_weights"},
+    "holes": {"numerics", "geometry", "gather"},
+    "detail": {"numerics", "geometry", "gather", "pyramids", "detail_weights", "holes"},
     "tsdf": {"numerics", "geometry", "gather", "photographs"},
     "draws": {"geometry", "photographs", "pseudo", "pyramids", "windows"},
     "train": {
