@@ -7,6 +7,7 @@ import optax
 from experiments.methods.method import LabelConfig, Method, Preset, WindowConfig
 from experiments.methods.volumes import (
     QUICK_LABELS,
+    QUICK_TARGETS,
     AdamConfig,
     DepthConfig,
     depth_supervision,
@@ -68,6 +69,7 @@ QUICK = Preset(
     ),
     train=TrainConfig(num_rays=512, num_label_rays=512, label_rule="pooled"),
     labels=QUICK_LABELS,
+    targets=QUICK_TARGETS,
     baseline_steps=1000,
     closeup_steps=200,
     downscale=8,

@@ -3,7 +3,13 @@
 import dataclasses
 
 from experiments.methods.method import LabelConfig, Preset, WindowConfig
-from experiments.methods.volumes import QUICK_LABELS, AdamConfig, DepthConfig, volumetric
+from experiments.methods.volumes import (
+    QUICK_LABELS,
+    QUICK_TARGETS,
+    AdamConfig,
+    DepthConfig,
+    volumetric,
+)
 from jaxcloseup.train import TrainConfig
 from jaxcloseup.volume.tensorf import TensorfConfig, tensorf
 
@@ -47,6 +53,7 @@ QUICK = Preset(
     ),
     train=TrainConfig(num_rays=512, num_label_rays=512, label_rule="pooled"),
     labels=QUICK_LABELS,
+    targets=QUICK_TARGETS,
     baseline_steps=4000,
     closeup_steps=200,
     downscale=8,
