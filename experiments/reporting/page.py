@@ -28,7 +28,8 @@ _READABLE = 0.7  # of the width of a row of panels, whose titles are smaller oth
 _SMALL = 70  # quality of pictures that are many
 _COMPARISON_NOTE = (
     "Each picture shows the true image, renders in the order trained, and the error of the last "
-    "one: black is none, and bright yellow is a quarter of the range of colors, or more."
+    "one: black is none, and bright yellow is a quarter of the range of colors, or more. Detail "
+    "gives what no photograph shows the colors around it."
 )
 _PICTURE_NOTES = {
     **dict.fromkeys(SPLIT_TITLES.values(), _COMPARISON_NOTE),
