@@ -11,6 +11,7 @@ is too hopeful, because its depth is better in their views than in close-ups.
 """
 
 import functools
+import io
 import itertools
 import pathlib
 from collections.abc import Callable, Mapping, Sequence
@@ -22,6 +23,7 @@ import numpy as np
 import optax
 from flax import struct
 
+from jaxcloseup.files import write_file
 from jaxcloseup.numerics import matmul
 
 
@@ -143,7 +145,9 @@ def write_known(path: pathlib.Path, names: Sequence[str], weights: DetailWeights
         found = getattr(weights, kind)
         arrays |= {f"{kind}_center": found.center, f"{kind}_scale": found.scale}
         arrays |= {f"{kind}_layer_{i}": layer for i, layer in enumerate(found.layers)}
-    np.savez(path, **arrays)
+    file = io.BytesIO()
+    np.savez(file, **arrays)
+    write_file(path, file.getvalue())
 
 
 def learn_weights(

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxcloseup.gather import GatherSources
 from jaxcloseup.geometry.cameras import Camera, pixels_to_points, points_to_pixels
-from jaxcloseup.numerics import safe_divide
+from jaxcloseup.numerics import mix_pixels, safe_divide
 
 
 OPAQUE = 0.9  # opacity from which a render is whole
@@ -96,9 +96,7 @@ def _spread(colors, weight):
 def _resized(image, height, width):
     """An image `[H, W, C]` at another size, linear between its pixels' centers."""
     rows, columns = _taps(image.shape[0], height), _taps(image.shape[1], width)
-    rows, columns = (jnp.asarray(taps, image.dtype) for taps in (rows, columns))
-    image = jnp.einsum("ih,hwc->iwc", rows, image, precision=jax.lax.Precision.HIGHEST)
-    return jnp.einsum("jw,iwc->ijc", columns, image, precision=jax.lax.Precision.HIGHEST)
+    return mix_pixels(*(jnp.asarray(taps, image.dtype) for taps in (rows, columns)), image)
 
 
 def _taps(before, after):

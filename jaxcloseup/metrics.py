@@ -10,9 +10,8 @@ import dm_pix
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
-from jaxcloseup.numerics import matmul, safe_divide
+from jaxcloseup.numerics import matmul, mix_pixels, safe_divide
 
 
 SSIM_TAPS, SSIM_SIGMA = 11, 1.5
@@ -63,8 +62,7 @@ def ssim(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = None
 def _blur(image: jax.Array) -> jax.Array:
     """Gaussian windows of `ssim`, as matrices: XLA's CPU backend convolves ten times slower."""
     rows, columns = (jnp.asarray(_window_sums(size), image.dtype) for size in image.shape[:2])
-    image = jnp.einsum("ih,hwc->iwc", rows, image, precision=lax.Precision.HIGHEST)
-    return jnp.einsum("jw,iwc->ijc", columns, image, precision=lax.Precision.HIGHEST)
+    return mix_pixels(rows, columns, image)
 
 
 def _window_sums(size: int) -> np.ndarray:
@@ -84,8 +82,7 @@ def cc_psnr(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = N
     dimensions, as in a gray image, the change of least norm applies. Arguments as in `psnr`.
     """
     weight = _check(image, target, weight)
-    matrix, offset = fit_colors(image, target, weight)
-    fitted = matmul(image, matrix[None]) + offset[None, None]
+    fitted = change_colors(image, *fit_colors(image, target, weight))
     return psnr(jnp.clip(fitted, 0, 1), target, weight=weight)
 
 
@@ -101,8 +98,8 @@ def fit_colors(
       ridge: weight of the squared distance from the identity, against the mean squared error.
 
     Returns:
-      Matrix `[3, 3]` and offset `[3]`; the changed colors are `image @ matrix + offset`. Both are
-      NaN if the weights sum to 0, and have the least norm if the colors do not determine them.
+      Matrix `[3, 3]` and offset `[3]` for `change_colors`. Both are NaN if the weights sum to 0,
+      and have the least norm if the colors do not determine them.
     """
     share = safe_divide(weight, jnp.sum(weight), fill=jnp.nan)[..., None]
     mean = jnp.sum(share * image, axis=(0, 1), keepdims=True)
@@ -116,6 +113,11 @@ def fit_colors(
     mean, target_mean = mean[0, 0], target_mean[0, 0]
     reached = mean + (target_mean - mean) / (1 + ridge)
     return matrix, reached - matmul(mean[None], matrix)[0]
+
+
+def change_colors(image: jax.Array, matrix: jax.Array, offset: jax.Array) -> jax.Array:
+    """Colors `image @ matrix + offset` of an image `[H, W, 3]`."""
+    return matmul(image, matrix[None]) + offset[None, None]
 
 
 def _check(image: jax.Array, target: jax.Array, weight: jax.Array | None) -> jax.Array:

@@ -34,7 +34,7 @@ MAY_IMPORT = {
     "pyramids": {"geometry", "photographs", "scene"},
     "windows": {"geometry", "photographs", "pyramids"},
     "gather": {"numerics", "geometry", "photographs", "pyramids"},
-    "detail_weights": {"numerics"},
+    "detail_weights": {"files", "numerics"},
     "holes": {"numerics", "geometry", "gather"},
     "detail": {"numerics", "geometry", "gather", "pyramids", "detail_weights", "holes"},
     "tsdf": {"numerics", "geometry", "gather", "photographs"},

@@ -9,8 +9,7 @@ from experiments import progress
 from experiments.evaluation.scores import Target
 from jaxcloseup.detail import Detailed
 from jaxcloseup.geometry.cameras import Camera
-from jaxcloseup.metrics import fit_colors
-from jaxcloseup.numerics import matmul
+from jaxcloseup.metrics import change_colors, fit_colors
 
 
 TENTHS = 10
@@ -36,8 +35,8 @@ def compare_errors(
         found, (height, width) = render(target.camera), target.weight.shape
         rgb, error = found.rgb[:height, :width], found.error[:height, :width]
         weight = jnp.where(jnp.isfinite(error), target.weight, 0)
-        matrix, offset = fit_colors(rgb, target.rgb, jnp.where(weight > 0, weight / error**2, 0))
-        corrected = jnp.clip(matmul(rgb, matrix[None]) + offset[None, None], 0, 1)
+        change = fit_colors(rgb, target.rgb, jnp.where(weight > 0, weight / error**2, 0))
+        corrected = jnp.clip(change_colors(rgb, *change), 0, 1)
         actual = jnp.mean(jnp.abs(corrected - target.rgb), axis=-1)
         return [np.asarray(one).ravel() for one in (error, actual, weight)]
 

@@ -10,7 +10,7 @@ import numpy as np
 from experiments import progress
 from experiments.training.programs import Programs
 from jaxcloseup.label_rules import label_depth
-from jaxcloseup.metrics import fit_colors
+from jaxcloseup.metrics import change_colors, fit_colors
 from jaxcloseup.numerics import matmul
 from jaxcloseup.photographs import camera_at, to_float
 from jaxcloseup.pyramids import Pyramid
@@ -131,7 +131,7 @@ def _match(photograph, rgb, alpha):
 def _subtract(photograph, rgb, colors):
     """Residual and matched colors of a photograph, int8 `[H, W, 6]`."""
     values, (matrix, offset) = to_float(photograph), colors
-    matched = matmul(values[..., :3], matrix[None]) + offset[None, None]
+    matched = change_colors(values[..., :3], matrix, offset)
     both = jnp.concatenate([matched - jnp.clip(rgb, 0, 1), 2 * matched - 1], axis=-1)
     both = jnp.where(values[..., 3:] > 0, both, 0)
     return jnp.round(127 * jnp.clip(both, -1, 1)).astype(jnp.int8)

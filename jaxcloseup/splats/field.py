@@ -17,8 +17,8 @@ from flax import struct
 
 from jaxcloseup.field import RadianceField, Rendering
 from jaxcloseup.geometry.cameras import Camera
-from jaxcloseup.metrics import fit_colors, ssim
-from jaxcloseup.numerics import matmul, safe_divide, safe_norm
+from jaxcloseup.metrics import change_colors, fit_colors, ssim
+from jaxcloseup.numerics import safe_divide, safe_norm
 from jaxcloseup.splats.config import GaussianConfig, SplatConfig, SurfelConfig
 from jaxcloseup.splats.density import DensityControl, density_control
 from jaxcloseup.splats.filters import sampling_intervals, smoothed
@@ -336,4 +336,4 @@ def _match_colors(seen, target_rgb, weight, ridge):
     matrix, offset = fit_colors(jax.lax.stop_gradient(seen), target_rgb, weight, ridge=ridge)
     any_weight = jnp.sum(weight) > 0
     matrix = jnp.where(any_weight, matrix, jnp.eye(3, dtype=matrix.dtype))
-    return matmul(seen, matrix[None]) + jnp.where(any_weight, offset, 0)[None, None]
+    return change_colors(seen, matrix, jnp.where(any_weight, offset, 0))
