@@ -70,7 +70,7 @@ class Size:
     scene: str = "table"
     preset: Preset = surfels.PAPER
     stages: tuple[str, ...] = STAGES
-    training_seconds: float = 120
+    training_seconds: float = 60
     arms: tuple[Preset, ...] = (surfels.REDUCED, NERF_QUICK)
     warmup: int = 100
     most_seconds: float = 600
