@@ -6,11 +6,11 @@ smooth continuation of what is around is nearer to the truth, and to what people
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jaxcloseup.gather import GatherSources
 from jaxcloseup.geometry.cameras import Camera, pixels_to_points, points_to_pixels
-from jaxcloseup.numerics import mix_pixels, safe_divide
+from jaxcloseup.geometry.warp import backward_warp
+from jaxcloseup.numerics import safe_divide
 
 
 OPAQUE = 0.9  # opacity from which a render is whole
@@ -33,6 +33,7 @@ def find_empty(camera: Camera, pixels: jax.Array, sources: GatherSources) -> jax
     """
     (height, width), step = pixels.shape[:2], max(1, round(pixels.shape[1] / _RAYS))
     pixels, known = pixels[::step, ::step], sources.inverse_depth > 0
+    nothing = jnp.where(known, 0.0, 1.0)[..., None]
     log_depth = -jnp.log2(jnp.where(known, sources.inverse_depth, 1))
     typical = safe_divide(jnp.sum(log_depth), jnp.sum(known, dtype=log_depth.dtype))
 
@@ -40,15 +41,12 @@ def find_empty(camera: Camera, pixels: jax.Array, sources: GatherSources) -> jax
         points = pixels_to_points(camera, pixels, jnp.full(pixels.shape[:2], depth))
 
         def add(through, photograph):
-            view, known = photograph
-            places, z = points_to_pixels(view, points)
-            x, y = jnp.moveaxis(jnp.floor(places), -1, 0)
-            inside = (z > 0) & (x >= 0) & (x < view.width) & (y >= 0) & (y < view.height)
-            x, y = (jnp.where(inside, axis, 0).astype(jnp.int32) for axis in (x, y))
-            return through + (inside & ~known[y, x]).astype(jnp.int32), None
+            view, nothing = photograph
+            landed, z = points_to_pixels(view, points)
+            sees_nothing = backward_warp(nothing, landed, order=0)[..., 0]
+            return through + jnp.where(z > 0, sees_nothing, 0), None
 
-        none = jnp.zeros(pixels.shape[:2], jnp.int32)
-        return jax.lax.scan(add, none, (sources.cameras, known))[0]
+        return jax.lax.scan(add, jnp.zeros(pixels.shape[:2]), (sources.cameras, nothing))[0]
 
     depths = 2 ** (typical + jnp.linspace(-_REACH, _REACH, _DEPTHS))
     empty = jnp.max(jax.lax.map(at_depth, depths), axis=0) >= _PHOTOGRAPHS
@@ -71,8 +69,8 @@ def fill_holes(rgb: jax.Array, alpha: jax.Array, seen: jax.Array, empty: jax.Arr
     """
     hole, (height, width) = ~seen & ~empty, seen.shape
     few = max(1, round(_ACROSS * height / width)), _ACROSS
-    near = _resized(_resized(hole[..., None].astype(rgb.dtype), *few), height, width)[..., 0]
-    near = jnp.clip(2 * near, 0, 1)
+    near = jax.image.resize(hole.astype(rgb.dtype), few, "linear")
+    near = jnp.clip(2 * jax.image.resize(near, hole.shape, "linear"), 0, 1)
     missing = near * (1 - jnp.clip(alpha / OPAQUE, 0, 1))
     opacity = jnp.where(seen, jnp.maximum(alpha, 0.05), 1)
     colors = jnp.clip(rgb / opacity[..., None], 0, 1)
@@ -88,20 +86,6 @@ def _spread(colors, weight):
         coarse = safe_divide(jnp.sum(weight * colors, (0, 1)), jnp.sum(weight))
         return weight * colors + (1 - weight) * coarse[None, None]
     both = jnp.concatenate([weight * colors, weight], axis=-1)
-    both = _resized(both, (height + 1) // 2, (width + 1) // 2)
+    both = jax.image.resize(both, ((height + 1) // 2, (width + 1) // 2, 4), "linear")
     coarse = _spread(safe_divide(both[..., :3], both[..., 3:]), both[..., 3:])
-    return weight * colors + (1 - weight) * _resized(coarse, height, width)
-
-
-def _resized(image, height, width):
-    """An image `[H, W, C]` at another size, linear between its pixels' centers."""
-    rows, columns = _taps(image.shape[0], height), _taps(image.shape[1], width)
-    return mix_pixels(*(jnp.asarray(taps, image.dtype) for taps in (rows, columns)), image)
-
-
-def _taps(before, after):
-    """Weights `[after, before]` of pixels; a smaller image averages what its pixels cover."""
-    scale = before / after
-    distance = (np.arange(after) + 0.5)[:, None] * scale - (np.arange(before) + 0.5)
-    taps = np.maximum(1 - np.abs(distance) / max(scale, 1), 0)
-    return taps / taps.sum(1, keepdims=True)
+    return weight * colors + (1 - weight) * jax.image.resize(coarse, colors.shape, "linear")

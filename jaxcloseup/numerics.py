@@ -26,12 +26,6 @@ def matmul(a: jax.Array, b: jax.Array) -> jax.Array:
     return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)
 
 
-def mix_pixels(rows: jax.Array, columns: jax.Array, image: jax.Array) -> jax.Array:
-    """Sums `[I, J, C]` of an image's pixels `[H, W, C]`, by `[I, H]` down and `[J, W]` across."""
-    image = jnp.einsum("ih,hwc->iwc", rows, image, precision=jax.lax.Precision.HIGHEST)
-    return jnp.einsum("jw,iwc->ijc", columns, image, precision=jax.lax.Precision.HIGHEST)
-
-
 def take_turns(function: Callable[..., Any]) -> Callable[..., Any]:
     """Make `jax.vmap` of a function compute its batch one member after another on a CPU.
 

@@ -7,7 +7,7 @@ import pytest
 
 from jaxcloseup.gather import GatherSources
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
-from jaxcloseup.holes import _resized, fill_holes, find_empty
+from jaxcloseup.holes import fill_holes, find_empty
 
 
 HEIGHT, WIDTH = 24, 40
@@ -100,10 +100,3 @@ def test_an_image_without_anything_stays_black():
     nothing = jnp.zeros((HEIGHT, WIDTH))
     filled = fill_holes(jnp.zeros((HEIGHT, WIDTH, 3)), nothing, nothing > 0, nothing > 0)
     np.testing.assert_array_equal(filled, np.zeros((HEIGHT, WIDTH, 3)))
-
-
-@pytest.mark.parametrize("size", [(12, 20), (13, 20), (3, 5), (48, 80), (7, 11)])
-def test_sizes_change_as_elsewhere(size):
-    image = jax.random.uniform(jax.random.key(0), (HEIGHT, WIDTH, 3))
-    expected = jax.image.resize(image, (*size, 3), "linear")
-    np.testing.assert_allclose(_resized(image, *size), expected, atol=1e-5)

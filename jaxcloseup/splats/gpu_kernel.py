@@ -28,7 +28,7 @@ from jaxcloseup.splats.kernel import (
     shade,
     worth,
 )
-from jaxcloseup.splats.tiling import TileLists, longest_first
+from jaxcloseup.splats.tiling import TileLists, longest_first, starts_of
 
 
 _TILE = plgpu.CompilerParams(num_warps=2)
@@ -201,8 +201,7 @@ def _add_pairs(pairs_bar, lists, count, interpret):
     listed = jnp.cumsum(changes[:-1]) > 0
     place = jnp.arange(capacity, dtype=jnp.int32)
     owner, pair = lax.sort((jnp.where(listed, lists.splats, count), place), num_keys=1)
-    of_splat = jnp.arange(count + 1, dtype=jnp.int32)
-    bounds = jnp.searchsorted(owner, of_splat, method="scan_unrolled").astype(jnp.int32)
+    bounds = starts_of(owner, count)
 
     def add(pairs_bar, pair, bounds, out):
         i = pl.program_id(0)

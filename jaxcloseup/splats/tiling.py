@@ -91,6 +91,13 @@ def longest_first(counts: jax.Array) -> jax.Array:
     return jnp.argsort(-counts, stable=True).astype(jnp.int32)
 
 
+def starts_of(ordered: jax.Array, count: int) -> jax.Array:
+    """Where each of the numbers 0 to `count` begins, `[count + 1]`, in ascending int32 `[P]`."""
+    # Unrolled, for a GPU starts each step of a loop anew.
+    numbers = jnp.arange(count + 1, dtype=jnp.int32)
+    return jnp.searchsorted(ordered, numbers, method="scan_unrolled").astype(jnp.int32)
+
+
 def _nearest_first_shown(order, pairs):
     """Indices `[N]` of splats, the nearest first as far as splats have any pairs `[N]`."""
     count = order.shape[0]
@@ -157,10 +164,7 @@ def _sorted_pairs(tile_of, rank, by_depth, total, tiles):
 
     def sort(room):
         found, ranks = _sort_pairs(tile_of[:room], rank[:room], tiles + 1, len(by_depth))
-        of_tile = jnp.arange(tiles + 1, dtype=found.dtype)
-        # Unrolled, for a GPU starts each step of a loop anew.
-        starts = jnp.searchsorted(found, of_tile, method="scan_unrolled")
-        return starts.astype(jnp.int32), jnp.pad(by_depth[ranks], (0, capacity - room))
+        return starts_of(found, tiles), jnp.pad(by_depth[ranks], (0, capacity - room))
 
     smallest = jnp.argmax(jnp.stack([total <= room for room in rooms[:-1]] + [jnp.array(True)]))
     return lax.switch(smallest, [functools.partial(sort, room) for room in rooms])
