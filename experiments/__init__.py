@@ -1,59 +1,10 @@
-"""Scripts driven by absl flags.
+"""Scripts of the programs, benchmarks and studies; `python -m experiments.run --scene=table`."""
 
-Ctrl-C ends a program at once, also while it imports or compiles: files are written under other
-names first, so nothing is half-written, and `--resume` goes on from the last checkpoint. Python
-itself would wait until a step or a compilation ends, and raise an exception wherever it is then.
-"""
-
-import os
-import signal
-import socket
 import sys
-import threading
-from collections.abc import Callable
+
+from jaxcloseup.app.cli.interrupt import end_at_ctrl_c
 
 
-STOPPED = 130  # exit code after Ctrl-C
-_say: Callable[[], str] = lambda: "stopped"  # noqa: E731
-
-
-def when_stopped(say: Callable[[], str]) -> None:
-    """Set what Ctrl-C does before it ends the program: return the rest of its last sentence."""
-    global _say
-    _say = say
-
-
-def _watch(wakeups: socket.socket, program: str) -> None:
-    """End the program at the first SIGINT; other signals wake the thread too."""
-    while wakeups.recv(1) != bytes([signal.SIGINT]):
-        pass
-    try:
-        sentence = _say()
-    except Exception:
-        sentence = "stopped"
-    # What was printed before comes first, unless nobody reads it.
-    flush = threading.Thread(target=sys.stdout.flush, daemon=True)
-    flush.start()
-    flush.join(timeout=1)
-    shown = "\033[?25h\n" if sys.stderr.isatty() else ""  # progress bars hide the cursor
-    os.write(2, f"{shown}{program}: {sentence}\n".encode())
-    os._exit(STOPPED)
-
-
-def end_at_ctrl_c(program: str) -> None:
-    """End the program at Ctrl-C from now on, with a sentence that begins with its name.
-
-    A shell that starts programs in the background lets them ignore Ctrl-C, and so does this.
-    """
-    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-        return
-    wakeups, wakes = socket.socketpair()
-    wakes.setblocking(False)
-    signal.signal(signal.SIGINT, lambda *_: None)
-    signal.set_wakeup_fd(wakes.detach(), warn_on_full_buffer=False)
-    threading.Thread(target=_watch, args=(wakeups, program), daemon=True).start()
-
-
-# So `python -m` calls a program while it imports this package.
+# `python -m` imports this package before the program itself: Ctrl-C ends both.
 if sys.argv[:1] == ["-m"]:
     end_at_ctrl_c(sys.orig_argv[-len(sys.argv)])  # what is between -m and the program's arguments

@@ -5,10 +5,11 @@ and ratios. Absolute times depend on the machine and its load; ratios carry over
 """
 
 import importlib
+import sys
 
 from absl import flags
 
-from experiments.command_line import start
+from jaxcloseup.app.cli.start import start
 
 
 SUITES = ("nerf", "warp", "labels", "splats", "sweep", "resume", "detail", "scales", "teach", "gpu")
@@ -28,4 +29,4 @@ def _known(values: dict[str, list[str]]) -> bool:
 
 
 if __name__ == "__main__":
-    start(main)
+    start(sys.modules[__name__])

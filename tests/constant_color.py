@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from experiments.methods import LabelConfig, Method, Preset
-from jaxcloseup.field import RadianceField, Rendering
-from jaxcloseup.train import TrainConfig
+from jaxcloseup.app.methods import LabelConfig, Method, Preset
+from jaxcloseup.fields.contract import RadianceField, Rendering
+from jaxcloseup.training.steps import TrainConfig
 
 
 @dataclasses.dataclass(frozen=True)

@@ -34,16 +34,16 @@ from tiny_capture import (
 )
 from tiny_models import colmap_capture, llff_capture
 
-from experiments.training.logs import TrainLog
-from experiments.training.programs import Programs
-from experiments.training.setup import state_shapes
-from experiments.training.stored_run import RunError, load_run_scene, read_run
-from experiments.viewing.camera_paths import CameraError, read_camera_path, read_camera_transform
+from jaxcloseup.app.run.logs import TrainLog
+from jaxcloseup.app.run.programs import Programs
+from jaxcloseup.app.run.setup import state_shapes
+from jaxcloseup.app.store.stored_run import RunError, load_run_scene, read_run
+from jaxcloseup.app.view.camera_paths import CameraError, read_camera_path, read_camera_transform
 from jaxcloseup.artifacts.checkpoints import CheckpointError, Checkpoints
-from jaxcloseup.captures.images import read_image, read_mask
-from jaxcloseup.ply import PlyError, read_vertices
-from jaxcloseup.scenes import SceneError, load_scene
-from jaxcloseup.torch_file import TorchFileError, read_tensors
+from jaxcloseup.captures.load import SceneError, load_scene
+from jaxcloseup.captures.photo_files import read_image, read_mask
+from jaxcloseup.io.ply import PlyError, read_vertices
+from jaxcloseup.io.torch_file import TorchFileError, read_tensors
 
 
 DATA = pathlib.Path(__file__).parent / "data"

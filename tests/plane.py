@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcloseup.geometry.cameras import Camera
-from jaxcloseup.photographs import Views
+from jaxcloseup.photos.views import Views
 
 
 HEIGHT, WIDTH, FOCAL = 24, 32, 30.0

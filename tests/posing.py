@@ -8,11 +8,12 @@ import PIL.Image
 from absl import flags
 from absl.testing import flagsaver
 
-from experiments import process as program
-from jaxcloseup.photographs import camera_at
-from jaxcloseup.procedural import loading, modeling, planning
-from jaxcloseup.procedural.builtin import SCENES
-from jaxcloseup.scenes import load_scene
+from jaxcloseup.app.cli import process as program
+from jaxcloseup.captures.load import load_scene
+from jaxcloseup.drawn_scenes import drawn as loading
+from jaxcloseup.drawn_scenes import modeling, planning
+from jaxcloseup.drawn_scenes.builtin import SCENES
+from jaxcloseup.photos.views import camera_at
 
 
 WIDTH, HEIGHT, FRAMES, OTHERS = 480, 270, 20, 3

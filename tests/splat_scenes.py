@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import reference_splats as reference
 
+from jaxcloseup.fields.splats import RasterizeConfig, Surfels, render_surfels
 from jaxcloseup.geometry.cameras import Camera
-from jaxcloseup.splats import RasterizeConfig, Surfels, render_surfels
 
 
 COUNT, HEIGHT, WIDTH, NEAR = 16, 24, 32, 0.2

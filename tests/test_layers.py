@@ -10,72 +10,40 @@ import pytest
 ROOT = pathlib.Path(__file__).parents[1]
 PACKAGE, EXPERIMENTS = ROOT / "jaxcloseup", ROOT / "experiments"
 MODULES = sorted([*PACKAGE.rglob("*.py"), *EXPERIMENTS.rglob("*.py")])
+# The rooms of the library, and which others each may use.
 MAY_IMPORT = {
-    "version": set(),
-    "choices": set(),
-    "messages": set(),
-    "files": set(),
-    "memory": set(),
-    "ply": {"files", "messages"},
-    "torch_file": {"files", "messages"},
-    "numerics": set(),
-    "geometry": {"numerics"},
-    "field": set(),
-    "photographs": {"geometry"},
-    "scene": {"geometry", "messages", "photographs"},
-    "rendered_loss": {"numerics", "field", "photographs"},
-    "label_rules": {"field", "photographs"},
-    "metrics": {"numerics"},
-    "lpips": {"numerics", "torch_file"},
-    "volume": {"numerics", "geometry", "field"},
-    "splats": {"numerics", "geometry", "field", "metrics"},
-    "pseudo": {"numerics", "geometry", "field", "photographs"},
-    "support": {"numerics", "geometry", "photographs"},
-    "pyramids": {"geometry", "photographs", "scene"},
-    "windows": {"geometry", "photographs", "pyramids"},
-    "gather": {"numerics", "geometry", "photographs", "pyramids"},
-    "detail_weights": {"files", "numerics"},
-    "holes": {"numerics", "geometry", "gather"},
-    "detail": {"numerics", "geometry", "gather", "pyramids", "detail_weights", "holes"},
-    "tsdf": {"numerics", "geometry", "gather", "photographs"},
-    "draws": {"geometry", "photographs", "pseudo", "pyramids", "windows"},
-    "train": {
-        *("numerics", "geometry", "field", "photographs"),
-        *("draws", "pseudo", "label_rules", "rendered_loss", "pyramids", "windows"),
-    },
-    "captures": {
-        "choices",
-        "files",
-        "memory",
-        "messages",
-        "ply",
-        "numerics",
-        "geometry",
-        "photographs",
-        "scene",
-    },
-    "procedural": {"files", "numerics", "geometry", "photographs", "scene"},
-    "scenes": {"captures", "procedural", "scene"},
-    "artifacts": {"files", "messages", "ply", "numerics", "geometry", "photographs", "splats"},
+    "io": set(),
+    "geometry": set(),
+    "photos": {"geometry", "io"},
+    "metrics": {"geometry", "io"},
+    "fields": {"geometry", "metrics", "photos"},
+    "labels": {"geometry", "photos", "fields"},
+    "detail": {"geometry", "io", "metrics", "photos", "fields", "labels"},
+    "training": {"geometry", "photos", "fields", "labels"},
+    "drawn_scenes": {"geometry", "io", "photos"},
+    "captures": {"geometry", "io", "photos", "drawn_scenes"},
+    "artifacts": {"geometry", "io", "fields"},
 }
-# The rooms of `experiments`, and which others each may use; programs at the top may use all.
+FREE = {"lazy", "version"}  # modules that every room may use
+# The rooms of `jaxcloseup.app`, and which others each may use.
 ROOMS = {
     "progress": set(),
     "methods": {"progress"},
-    "evaluation": {"methods", "progress"},
-    "training": {"methods", "evaluation", "progress", "command_line"},
-    "reporting": {"methods", "evaluation", "training"},
-    "viewing": {"methods", "evaluation", "progress", "training"},
-    "benchmarks": {"methods", "evaluation", "training", "reporting", "viewing"},
-    "processing": {"progress"},
+    "score": {"methods", "progress"},
+    "store": {"methods", "run"},
+    "run": {"methods", "score", "progress", "store", "cli"},
+    "sweep": {"methods", "score", "progress", "run"},
+    "report": {"methods", "score", "run", "store"},
+    "view": {"methods", "score", "progress", "run", "store"},
+    "process": {"progress"},
+    "cli": {"methods", "process", "progress", "run", "jobs"},
     "jobs": {
-        *("methods", "evaluation", "progress", "training", "reporting", "viewing", "processing"),
-        "command_line",
+        *("methods", "score", "progress", "run", "report", "view", "process", "store", "sweep"),
+        "cli",
     },
-    "command_line": {"progress"},
 }
-LIBRARIES_OF_GEOMETRY = {"jax", "chex", "flax", "typing", "jaxcloseup"}
-LONGEST_MODULE, LONGEST_FUNCTION, MOST_PROGRAMS = 400, 80, 10
+LIBRARIES_OF_GEOMETRY = {"jax", "chex", "flax", "typing", "collections", "jaxcloseup"}
+LONGEST_MODULE, LONGEST_FUNCTION, MOST_PROGRAMS, MOST_ROOMS = 400, 80, 10, 14
 # What tells one type of field from another.
 FIELD_TYPES = re.compile(
     r"isinstance\([^)]*(Surfel|Nerf|Mcmc|Adaptive|Buffers|Aux)"
@@ -94,44 +62,42 @@ def imported(path):
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-def modules_of(package, layer):
-    return [package / f"{layer}.py"] * (package / f"{layer}.py").exists() + sorted(
-        (package / layer).rglob("*.py")
-    )
+def test_every_room_has_its_line():
+    rooms = {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
+    assert rooms == {*MAY_IMPORT, "app"}
+    assert {path.parent.name for path in PACKAGE.glob("app/*/__init__.py")} == set(ROOMS)
+    modules = {path.stem for path in PACKAGE.glob("*.py")}
+    assert modules == {*FREE, "__init__", "__main__"}
+    assert len(rooms) <= MOST_ROOMS
 
 
-def test_every_layer_has_its_line():
-    assert {p.stem for p in PACKAGE.glob("*") if modules_of(PACKAGE, p.stem)} - {"__init__"} == set(
-        MAY_IMPORT
-    )
-
-
-@pytest.mark.parametrize("layer", MAY_IMPORT)
-def test_imports_of_the_library_point_one_way(layer):
-    for path in modules_of(PACKAGE, layer):
+@pytest.mark.parametrize("room", MAY_IMPORT)
+def test_imports_of_the_library_point_one_way(room):
+    for path in (PACKAGE / room).rglob("*.py"):
         for name in imported(path):
             first, *rest = name.split(".")
             assert first not in ("absl", "experiments"), f"{path} imports {name}"
             if first == "jaxcloseup" and rest:
-                assert rest[0] in MAY_IMPORT[layer] | {layer}, f"{path} imports {name}"
-            if layer == "geometry":
+                assert rest[0] in MAY_IMPORT[room] | {room} | FREE, f"{path} imports {name}"
+            if room == "geometry":
                 assert first in LIBRARIES_OF_GEOMETRY, f"{path} imports {name}"
 
 
 @pytest.mark.parametrize("room", ROOMS)
-def test_imports_of_the_experiments_point_one_way(room):
-    for path in modules_of(EXPERIMENTS, room):
+def test_imports_of_the_app_point_one_way(room):
+    for path in (PACKAGE / "app" / room).rglob("*.py"):
         for name in imported(path):
-            first, *rest = name.split(".")
-            if first == "experiments" and rest:
+            first, second, *rest = [*name.split("."), "", ""][:3]
+            assert first != "experiments", f"{path} imports {name}"
+            if (first, second) == ("jaxcloseup", "app") and rest[0] and rest[0] in ROOMS:
                 assert rest[0] in ROOMS[room] | {room}, f"{path} imports {name}"
-            if room == "training":
+            if room == "run":
                 assert first != "matplotlib", f"{path} plots"
 
 
 def test_only_methods_and_their_fields_know_types_of_fields():
     for path in MODULES:
-        if path.relative_to(ROOT).parts[1] not in ("volume", "splats", "methods", "benchmarks"):
+        if not {"fields", "methods", "benchmarks"} & set(path.parts):
             found = FIELD_TYPES.findall(path.read_text(encoding="utf-8"))
             assert not found, f"{path} asks what type a field is: {found}"
 
@@ -140,7 +106,7 @@ def test_modules_and_functions_stay_short():
     for path in MODULES:
         text = path.read_text(encoding="utf-8")
         assert len(text.splitlines()) <= LONGEST_MODULE, f"{path} is too long"
-        if path.is_relative_to(EXPERIMENTS):
+        if "app" in path.parts or path.is_relative_to(EXPERIMENTS):
             for node in ast.walk(ast.parse(text)):
                 if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                     lines = node.end_lineno - node.lineno + 1

@@ -9,16 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 import plane
 
-from experiments.methods import gaussians, mip_gaussians
-from experiments.methods.nerf import QUICK
-from experiments.methods.surfels import REDUCED
-from experiments.training.manifest import about_scene, write_manifest
-from experiments.training.programs import Programs
-from experiments.training.settings import plain_config
+from jaxcloseup.app.methods import gaussians, mip_gaussians
+from jaxcloseup.app.methods.nerf import QUICK
+from jaxcloseup.app.methods.surfels import REDUCED
+from jaxcloseup.app.run.programs import Programs
+from jaxcloseup.app.run.settings import plain_config
+from jaxcloseup.app.store.manifest import about_scene, write_manifest
 from jaxcloseup.artifacts.checkpoints import Checkpoints
-from jaxcloseup.scenes import load_scene
-from jaxcloseup.splats import RasterizeConfig
-from jaxcloseup.train import TrainConfig, init_state
+from jaxcloseup.captures.load import load_scene
+from jaxcloseup.fields.splats import RasterizeConfig
+from jaxcloseup.training.steps import TrainConfig, init_state
 
 
 TINY = dataclasses.replace(

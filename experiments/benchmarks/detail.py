@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.benchmarks.newest_run import newest_run
-from experiments.training.detail import detail_path, detailed, find_detail
-from experiments.viewing.camera_paths import dolly, resized
+from jaxcloseup.app.run.kept_detail import detail_path, detailed, find_detail
+from jaxcloseup.app.view.camera_paths import dolly, resized
 from jaxcloseup.geometry import warp_to
-from jaxcloseup.label_rules import label_depth
-from jaxcloseup.photographs import camera_at
+from jaxcloseup.labels.rules import label_depth
+from jaxcloseup.photos.views import camera_at
 
 
 FRAMES, WIDTH, REPEATS = 60, 240, 5

@@ -21,18 +21,18 @@ import numpy as np
 import jaxcloseup
 from experiments.benchmarks import nerf, splats, sweep
 from experiments.benchmarks.timing import interleaved_medians
-from experiments.methods import Preset, surfels
-from experiments.methods.nerf import QUICK as NERF_QUICK
-from experiments.training.detail import detail_finder
-from experiments.training.fine_tuning import fine_tune
-from experiments.training.names import STAGES
-from experiments.training.programs import Programs
-from experiments.training.setup import Training, identity_of, initial_state, start_labels
-from experiments.training.stages import run_stages
+from jaxcloseup.app.cli.names import STAGES
+from jaxcloseup.app.methods import Preset, surfels
+from jaxcloseup.app.methods.nerf import QUICK as NERF_QUICK
+from jaxcloseup.app.run.fine_tuning import fine_tune
+from jaxcloseup.app.run.kept_detail import detail_finder
+from jaxcloseup.app.run.programs import Programs
+from jaxcloseup.app.run.setup import Training, identity_of, initial_state, start_labels
+from jaxcloseup.app.run.stages import run_stages
 from jaxcloseup.artifacts.checkpoints import Checkpoints
-from jaxcloseup.scenes import load_scene
-from jaxcloseup.splats import RasterizeConfig
-from jaxcloseup.volume.nerf import NerfConfig
+from jaxcloseup.captures.load import load_scene
+from jaxcloseup.fields.splats import RasterizeConfig
+from jaxcloseup.fields.volume.nerf import NerfConfig
 
 
 REPEATS = 5

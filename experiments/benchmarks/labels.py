@@ -14,16 +14,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.evaluation.audit import audit_labels, resolved_by_photographs
-from experiments.evaluation.scores import exact_depths
-from experiments.methods import LabelConfig, pseudo_settings
-from experiments.reporting.pictures import label_pictures
-from jaxcloseup.metrics import psnr
-from jaxcloseup.photographs import camera_at, to_float
-from jaxcloseup.procedural.loading import PROCEDURAL_SCENES
-from jaxcloseup.pseudo import label_sources
-from jaxcloseup.scene import Scene
-from jaxcloseup.scenes import load_scene
+from jaxcloseup.app.methods import LabelConfig, pseudo_settings
+from jaxcloseup.app.report.pictures import label_pictures
+from jaxcloseup.app.score.audit import audit_labels, resolved_by_photographs
+from jaxcloseup.app.score.scores import exact_depths
+from jaxcloseup.captures.load import load_scene
+from jaxcloseup.drawn_scenes.drawn import PROCEDURAL_SCENES
+from jaxcloseup.labels.make import label_sources
+from jaxcloseup.metrics.image_metrics import psnr
+from jaxcloseup.photos.scene import Scene
+from jaxcloseup.photos.views import camera_at, to_float
 
 
 DOWNSCALE = 4

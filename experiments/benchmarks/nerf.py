@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import optax
 
 from experiments.benchmarks.timing import interleaved_medians
+from jaxcloseup.fields.volume.nerf import NerfConfig, nerf
 from jaxcloseup.geometry.cameras import Camera
-from jaxcloseup.photographs import Batch
-from jaxcloseup.rendered_loss import rendered_loss
-from jaxcloseup.volume.nerf import NerfConfig, nerf
+from jaxcloseup.photos.views import Batch
+from jaxcloseup.training.loss import rendered_loss
 
 
 FULL = NerfConfig()

@@ -4,10 +4,10 @@ import pathlib
 import sys
 from typing import NamedTuple
 
-from experiments.training.programs import Programs
-from experiments.training.stored_run import choose_stage, load_run_scene, read_run, restore
-from jaxcloseup.scene import Scene
-from jaxcloseup.train import TrainState
+from jaxcloseup.app.run.programs import Programs
+from jaxcloseup.app.store.stored_run import choose_stage, load_run_scene, read_run, restore
+from jaxcloseup.photos.scene import Scene
+from jaxcloseup.training.steps import TrainState
 
 
 class NewestRun(NamedTuple):

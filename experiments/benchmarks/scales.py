@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.benchmarks.newest_run import newest_run
-from experiments.viewing.camera_paths import resized
-from jaxcloseup.metrics import psnr
-from jaxcloseup.photographs import camera_at, to_float
+from jaxcloseup.app.view.camera_paths import resized
+from jaxcloseup.metrics.image_metrics import psnr
+from jaxcloseup.photos.views import camera_at, to_float
 
 
 TIMES = 4

@@ -18,18 +18,18 @@ import jax.numpy as jnp
 from jax import lax
 
 from experiments.benchmarks.timing import interleaved_medians
-from experiments.evaluation.scores import exact_depths
+from jaxcloseup.app.score.scores import exact_depths
+from jaxcloseup.captures.load import load_scene
+from jaxcloseup.fields.splats import RasterizeConfig, render_surfels, surfels_from_points
+from jaxcloseup.fields.splats.projection import project_discs, surfel_columns, to_camera
+from jaxcloseup.fields.splats.rasterize import for_image
+from jaxcloseup.fields.splats.spherical_harmonics import sh_to_rgb
+from jaxcloseup.fields.splats.splat_math import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, pack
+from jaxcloseup.fields.splats.tile_test import reaches
+from jaxcloseup.fields.splats.tiling import tile_lists
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points
-from jaxcloseup.numerics import safe_divide, safe_norm
-from jaxcloseup.photographs import to_float
-from jaxcloseup.scenes import load_scene
-from jaxcloseup.splats import RasterizeConfig, render_surfels, surfels_from_points
-from jaxcloseup.splats.kernel import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, pack
-from jaxcloseup.splats.projection import project_discs, surfel_columns, to_camera
-from jaxcloseup.splats.rasterize import for_image
-from jaxcloseup.splats.reach import reaches
-from jaxcloseup.splats.spherical_harmonics import sh_to_rgb
-from jaxcloseup.splats.tiling import tile_lists
+from jaxcloseup.geometry.numerics import safe_divide, safe_norm
+from jaxcloseup.photos.views import to_float
 
 
 CASES = (  # discs, and the image's size

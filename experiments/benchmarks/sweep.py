@@ -3,12 +3,12 @@
 import jax
 
 from experiments.benchmarks.timing import interleaved_medians
-from experiments.methods import METHODS, Preset, pseudo_settings
-from experiments.training.arms import make_arm
-from experiments.training.programs import Programs
-from experiments.training.setup import initial_state, start_labels
-from experiments.training.sweep import stack_arms
-from jaxcloseup.scenes import load_scene
+from jaxcloseup.app.methods import METHODS, Preset, pseudo_settings
+from jaxcloseup.app.run.programs import Programs
+from jaxcloseup.app.run.setup import initial_state, start_labels
+from jaxcloseup.app.sweep.arm_training import stack_arms
+from jaxcloseup.app.sweep.arms import make_arm
+from jaxcloseup.captures.load import load_scene
 
 
 ARMS = ("control", "labels", "mask", "diverse")

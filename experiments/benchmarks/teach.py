@@ -16,11 +16,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.evaluation.expected_errors import error_tenths
-from experiments.training.detail import detail_path, find_detail
-from experiments.training.stored_run import choose_stage, load_run_scene, read_run, restore
-from jaxcloseup.detail import find_candidates, testify
-from jaxcloseup.detail_weights import (
+from jaxcloseup.app.run.kept_detail import detail_path, find_detail
+from jaxcloseup.app.score.expected_errors import error_tenths
+from jaxcloseup.app.store.stored_run import choose_stage, load_run_scene, read_run, restore
+from jaxcloseup.detail.add import find_candidates, testify
+from jaxcloseup.detail.weights import (
     PIXELS,
     DetailWeights,
     Evidence,
@@ -32,9 +32,9 @@ from jaxcloseup.detail_weights import (
     write_known,
 )
 from jaxcloseup.geometry.cameras import pixel_grid
-from jaxcloseup.label_rules import label_depth
-from jaxcloseup.photographs import Views, camera_at, to_float
-from jaxcloseup.scene import Scene
+from jaxcloseup.labels.rules import label_depth
+from jaxcloseup.photos.scene import Scene
+from jaxcloseup.photos.views import Views, camera_at, to_float
 
 
 FOLDER, STAGE = pathlib.Path("outputs/teach"), "control"

@@ -3,45 +3,20 @@
 `checkpoints` is not re-exported, because Orbax is slow to import.
 """
 
-from jaxcloseup.artifacts.gaussians import Gaussians, as_gaussians
-from jaxcloseup.artifacts.images import (
-    Image,
-    color_counts,
-    colorize_depth,
-    colorize_error,
-    colorize_normals,
-    colorize_support,
-    encode_png,
-    encode_webp_animation,
-    side_by_side,
-    to_uint8,
-    webp_data_uri,
-    write_png,
+from jaxcloseup.lazy import lazy_names
+
+
+__all__, __getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "images": (
+            "Image color_counts colorize_depth colorize_error colorize_normals "
+            "colorize_support encode_png encode_webp_animation side_by_side to_uint8 "
+            "webp_data_uri write_png"
+        ),
+        "mesh_files": "Mesh surface_mesh write_mesh",
+        "surfel_ply": "read_surfels write_surfels",
+        "video": "write_video",
+        "viewer_gaussians": "Gaussians as_gaussians",
+    },
 )
-from jaxcloseup.artifacts.mesh import Mesh, surface_mesh, write_mesh
-from jaxcloseup.artifacts.surfel_ply import read_surfels, write_surfels
-from jaxcloseup.artifacts.video import write_video
-
-
-__all__ = [
-    "Gaussians",
-    "Image",
-    "Mesh",
-    "as_gaussians",
-    "color_counts",
-    "colorize_depth",
-    "colorize_error",
-    "colorize_normals",
-    "colorize_support",
-    "encode_png",
-    "encode_webp_animation",
-    "read_surfels",
-    "side_by_side",
-    "surface_mesh",
-    "to_uint8",
-    "webp_data_uri",
-    "write_mesh",
-    "write_png",
-    "write_surfels",
-    "write_video",
-]

@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
-from jaxcloseup.files import check_file, read_object, write_file
-from jaxcloseup.messages import printable, reason
+from jaxcloseup.io.files import check_file, read_object, write_file
+from jaxcloseup.io.messages import printable, reason
 
 
 _CHECKSUM = "crc32"  # entry of the progress item

@@ -11,7 +11,7 @@ import cv2
 import jax
 import numpy as np
 
-from jaxcloseup.files import write_file
+from jaxcloseup.io.files import write_file
 
 
 Image = np.ndarray | jax.Array

@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcloseup.artifacts.gaussians import thickened
+from jaxcloseup.artifacts.viewer_gaussians import thickened
+from jaxcloseup.fields.splats.surfels import Surfels
 from jaxcloseup.geometry.rotations import quaternion_to_matrix
-from jaxcloseup.ply import PlyError, read_vertices, write_vertices
-from jaxcloseup.splats.surfels import Surfels
+from jaxcloseup.io.ply import PlyError, read_vertices, write_vertices
 
 
 _matrices = jax.jit(quaternion_to_matrix)

@@ -1,21 +1,16 @@
 """Load captures from disk: formats, lenses, masks, splits, and a cache of shrunk photographs."""
 
-from jaxcloseup.captures.images import read_image, read_mask
-from jaxcloseup.captures.json_fields import number, read_object, rigid_transform
-from jaxcloseup.captures.loading import load_capture
-from jaxcloseup.captures.photo_reading import Reading
-from jaxcloseup.choices import ALPHA_MODES, FORMATS, SPLITS
+from jaxcloseup.lazy import lazy_names
 
 
-__all__ = [
-    "ALPHA_MODES",
-    "FORMATS",
-    "SPLITS",
-    "Reading",
-    "load_capture",
-    "number",
-    "read_image",
-    "read_mask",
-    "read_object",
-    "rigid_transform",
-]
+__all__, __getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "choices": "ALPHA_MODES FORMATS SPLITS",
+        "folder": "load_capture",
+        "json_fields": "number read_object rigid_transform",
+        "load": "load_scene",
+        "photo_files": "read_image read_mask",
+        "photo_reading": "Reading",
+    },
+)

@@ -12,10 +12,10 @@ import numpy as np
 
 from jaxcloseup.captures.colmap_checks import check_files
 from jaxcloseup.captures.distortion import read_distortion
-from jaxcloseup.captures.frames import Frame, check_photographs
 from jaxcloseup.captures.json_fields import number
 from jaxcloseup.captures.scale import plausible
-from jaxcloseup.scene import SceneError
+from jaxcloseup.captures.world_frames import Frame, check_photographs
+from jaxcloseup.photos.scene import SceneError
 
 
 _FIELDS = {"f": "fl_x", "fx": "fl_x", "fy": "fl_y", "k": "k1"}  # other names are the same

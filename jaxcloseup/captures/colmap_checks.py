@@ -9,8 +9,8 @@ import pathlib
 import struct
 from collections.abc import Callable
 
-from jaxcloseup.files import read_bytes
-from jaxcloseup.scene import SceneError
+from jaxcloseup.io.files import read_bytes
+from jaxcloseup.photos.scene import SceneError
 
 
 LARGEST_FILE = 2**32  # bytes

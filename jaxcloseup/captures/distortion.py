@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from jaxcloseup.captures.json_fields import number
-from jaxcloseup.scene import SceneError
+from jaxcloseup.photos.scene import SceneError
 
 
 # The coefficients that each model reads, by their names in files; any other must be 0.

@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxcloseup.captures.colmap import holds_model, read_colmap
-from jaxcloseup.captures.frames import Frame
-from jaxcloseup.captures.images import ENDINGS
 from jaxcloseup.captures.llff import read_llff
-from jaxcloseup.captures.masks import attach_masks
+from jaxcloseup.captures.photo_files import ENDINGS
+from jaxcloseup.captures.photo_masks import attach_masks
 from jaxcloseup.captures.points import read_ply_points
 from jaxcloseup.captures.reduced_photos import attach_reduced
 from jaxcloseup.captures.scale import check_positions, plausible
@@ -24,8 +23,9 @@ from jaxcloseup.captures.splits import (
     warn_duplicates,
 )
 from jaxcloseup.captures.transforms import read_transforms
-from jaxcloseup.messages import printable
-from jaxcloseup.scene import SceneError
+from jaxcloseup.captures.world_frames import Frame
+from jaxcloseup.io.messages import printable
+from jaxcloseup.photos.scene import SceneError
 
 
 _FILES = {

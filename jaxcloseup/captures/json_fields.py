@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxcloseup.files import read_bytes
-from jaxcloseup.scene import SceneError
+from jaxcloseup.io.files import read_bytes
+from jaxcloseup.photos.scene import SceneError
 
 
 LARGEST_JSON = 2**26  # bytes; ten thousand frames take about 10 MiB

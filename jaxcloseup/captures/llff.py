@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from jaxcloseup.captures.frames import Frame
 from jaxcloseup.captures.json_fields import image_side, number, rigid_transform
-from jaxcloseup.captures.masks import list_photographs
-from jaxcloseup.files import check_file
-from jaxcloseup.scene import SceneError
+from jaxcloseup.captures.photo_masks import list_photographs
+from jaxcloseup.captures.world_frames import Frame
+from jaxcloseup.io.files import check_file
+from jaxcloseup.photos.scene import SceneError
 
 
 def read_llff(file: pathlib.Path, photographs: pathlib.Path) -> tuple[dict[str, Any], list[Frame]]:

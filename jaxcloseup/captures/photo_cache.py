@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from jaxcloseup.files import cache_folder, read_bytes, write_file
+from jaxcloseup.io.files import cache_folder, read_bytes, write_file
 
 
 _DIGEST = 32  # bytes of SHA-256 in front of the content

@@ -4,9 +4,9 @@ import pathlib
 import warnings
 from collections.abc import Mapping, Sequence
 
-from jaxcloseup.captures.frames import Frame
 from jaxcloseup.captures.photo_reading import Photo, Reading
-from jaxcloseup.scene import ImageSizeWarning, SceneError
+from jaxcloseup.captures.world_frames import Frame
+from jaxcloseup.photos.scene import ImageSizeWarning, SceneError
 
 
 def check_weights(

@@ -13,16 +13,16 @@ import cv2
 import numpy as np
 
 from jaxcloseup.captures.distortion import Remap, undistort, undistortion_map
-from jaxcloseup.captures.frames import Frame, frame_intrinsics
-from jaxcloseup.captures.images import downscale_image, read_file, read_image, read_mask
 from jaxcloseup.captures.photo_cache import cached, content_hash
+from jaxcloseup.captures.photo_files import downscale_image, read_file, read_image, read_mask
 from jaxcloseup.captures.scale import check_lens
-from jaxcloseup.memory import installed_memory
-from jaxcloseup.scene import SceneError
+from jaxcloseup.captures.world_frames import Frame, frame_intrinsics
+from jaxcloseup.io.memory import installed_memory
+from jaxcloseup.photos.scene import SceneError
 
 
 _MAX_CONCURRENT = 4  # each needs a few times its own size: 12 megapixels take about 100 MB
-_SOURCES = ("photo_reading.py", "images.py", "distortion.py")
+_SOURCES = ("photo_reading.py", "photo_files.py", "distortion.py")
 _BYTES_PER_PIXEL = 12  # peak of what stays: as read, padded, and weights in float32
 
 

@@ -5,8 +5,8 @@ import warnings
 
 import numpy as np
 
-from jaxcloseup.ply import PlyError, read_vertices
-from jaxcloseup.scene import PointsWarning, SceneError
+from jaxcloseup.io.ply import PlyError, read_vertices
+from jaxcloseup.photos.scene import PointsWarning, SceneError
 
 
 def read_ply_points(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:

@@ -3,8 +3,8 @@
 import collections
 import pathlib
 
-from jaxcloseup.captures.frames import Frame
-from jaxcloseup.captures.masks import list_pictures
+from jaxcloseup.captures.photo_masks import list_pictures
+from jaxcloseup.captures.world_frames import Frame
 
 
 _FOLDER = "images"

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxcloseup.captures.frames import Frame
-from jaxcloseup.scene import PointsWarning, SceneError
+from jaxcloseup.captures.world_frames import Frame
+from jaxcloseup.photos.scene import PointsWarning, SceneError
 
 
 FOCAL = (0.01, 1e4)  # focal length in multiples of the photograph's longer side

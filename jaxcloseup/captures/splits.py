@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxcloseup.captures.depth_range import depths_in_view
-from jaxcloseup.captures.frames import Frame, frame_intrinsics
-from jaxcloseup.captures.images import read_image
 from jaxcloseup.captures.json_fields import read_json
-from jaxcloseup.messages import is_control
-from jaxcloseup.scene import DuplicateFileWarning, SceneError, UnknownKeyWarning
+from jaxcloseup.captures.photo_files import read_image
+from jaxcloseup.captures.world_frames import Frame, frame_intrinsics
+from jaxcloseup.io.messages import is_control
+from jaxcloseup.photos.scene import DuplicateFileWarning, SceneError, UnknownKeyWarning
 
 
 TEST_EVERY = 8

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from jaxcloseup.captures.distortion import COEFFICIENTS, read_distortion
-from jaxcloseup.captures.frames import Frame, check_photographs, frame_intrinsics
 from jaxcloseup.captures.json_fields import image_side, read_object, rigid_transform
-from jaxcloseup.scene import SceneError, UnknownKeyWarning
+from jaxcloseup.captures.world_frames import Frame, check_photographs, frame_intrinsics
+from jaxcloseup.photos.scene import SceneError, UnknownKeyWarning
 
 
 _LENS_KEYS = {

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxcloseup.numerics import matmul
+from jaxcloseup.geometry.numerics import matmul
 
 
 @struct.dataclass

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxcloseup.geometry.cameras import Camera, pixels_to_points
+from jaxcloseup.geometry.numerics import matmul
 from jaxcloseup.geometry.rotations import euler_to_matrix, matrix_to_euler
-from jaxcloseup.numerics import matmul
 
 
 @struct.dataclass

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points
+from jaxcloseup.geometry.numerics import matmul
 from jaxcloseup.geometry.warp import NO_SOURCE, ForwardWarp, draw_nearest
-from jaxcloseup.numerics import matmul
 
 
 # Fastest sizes on two CPU cores; the result does not depend on them.

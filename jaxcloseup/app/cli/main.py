@@ -1,0 +1,43 @@
+"""The command `jaxcloseup`: its first word names a program, and the rest are the program's flags.
+
+    jaxcloseup run --scene=table
+
+works from any folder.
+"""
+
+import importlib
+import sys
+
+from jaxcloseup.app.cli.interrupt import end_at_ctrl_c
+
+
+PROGRAMS = {
+    "run": "train on one scene, fine-tune on pseudo-labeled close-ups, evaluate, report",
+    "sweep": "the same for several arms, seeds and scenes, and compare them",
+    "render": "render a camera path of a run, or fine-tune for target cameras",
+    "mesh": "write the surface of a run as a colored mesh",
+    "view": "look at a run in a browser, and choose close-ups there",
+    "compare": "compare several finished runs on one scene",
+    "evaluate": "score a folder of images against another",
+    "process": "make a capture with poses from photographs or a video",
+}
+
+
+def main() -> None:
+    """Run the program that the command line names."""
+    name, *rest = sys.argv[1:] or ["--help"]
+    if name in ("-h", "--help", "help"):
+        width = max(map(len, PROGRAMS))
+        print(
+            "usage: jaxcloseup PROGRAM [--flag=value ...]; `jaxcloseup PROGRAM --help` has flags\n"
+        )
+        print("\n".join(f"  {program:{width}}  {what}" for program, what in PROGRAMS.items()))
+        return
+    if name not in PROGRAMS:
+        sys.exit(f"jaxcloseup: {name} is not a program: choose {', '.join(PROGRAMS)}")
+    end_at_ctrl_c(f"experiments.{name}")
+    from jaxcloseup.app.cli.start import start
+
+    program = importlib.import_module(f"jaxcloseup.app.cli.{name}")
+    sys.argv = [f"jaxcloseup {name}", *rest]
+    start(program)

@@ -1,0 +1,26 @@
+"""Mip-Splatting (Yu et al. 2024): volumetric Gaussians with a filter in space and one in images."""
+
+import dataclasses
+
+from jaxcloseup.app.methods import gaussians
+from jaxcloseup.app.methods.method import Preset
+
+
+def with_filters(preset: Preset) -> Preset:
+    """The preset with both filters, the one in space for photographs as large as steps read."""
+    finest = preset.downscale if preset.windows is None else preset.windows.finest
+    coarse = preset.coarse
+    if coarse is not None:
+        coarse = dataclasses.replace(coarse, field=_filtered(coarse.field, preset.downscale))
+    field = _filtered(preset.field, finest)
+    return dataclasses.replace(preset, method="mip_gaussians", field=field, coarse=coarse)
+
+
+def _filtered(config, finest):
+    raster = dataclasses.replace(config.raster, antialias=True)
+    return dataclasses.replace(config, smoothed_at=finest, raster=raster)
+
+
+METHOD = gaussians.METHOD._replace(
+    presets={name: with_filters(preset) for name, preset in gaussians.METHOD.presets.items()}
+)

@@ -1,0 +1,109 @@
+"""NeRF, coarse and fine: presets, field and optimizer."""
+
+import dataclasses
+
+import optax
+
+from jaxcloseup.app.methods.method import LabelConfig, Method, Preset, WindowConfig
+from jaxcloseup.app.methods.volumes import (
+    QUICK_LABELS,
+    QUICK_TARGETS,
+    AdamConfig,
+    DepthConfig,
+    depth_supervision,
+    unit_cube,
+)
+from jaxcloseup.fields.contract import RadianceField
+from jaxcloseup.fields.volume.nerf import NerfConfig, nerf
+from jaxcloseup.photos.scene import Scene
+from jaxcloseup.training.steps import TrainConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class NerfTrainingConfig(NerfConfig, DepthConfig, AdamConfig):
+    """A NeRF and its training.
+
+    Attributes:
+      normalize: scale the scene to the unit cube around what the cameras look at.
+    """
+
+    initial_lr: float = 5e-4
+    lr_decay_steps: int = 250_000
+    normalize: bool = False
+
+
+PAPER = Preset(
+    method="nerf",
+    field=NerfTrainingConfig(),
+    train=TrainConfig(),
+    labels=LabelConfig(),
+    baseline_steps=200_000,
+    closeup_steps=10_000,
+)
+
+# The authors' public script where it differs from the text.
+RELEASED = dataclasses.replace(
+    PAPER,
+    train=TrainConfig(num_rays=1536, num_label_rays=563, label_rule="released"),
+    labels=LabelConfig(
+        magnification=(4.0, 4.0),
+        anchor_tolerance=0.2,
+        rgb_tolerance=0.1,
+        depth_tolerance=0.05,
+        forward_label=True,
+    ),
+)
+
+QUICK = Preset(
+    method="nerf",
+    field=NerfTrainingConfig(
+        depth=4,
+        width=64,
+        skip_after=2,
+        direction_width=64,
+        num_coarse=24,
+        num_fine=24,
+        initial_lr=5e-3,
+        lr_decay_steps=1600,
+        normalize=True,
+    ),
+    train=TrainConfig(num_rays=512, num_label_rays=512, label_rule="pooled"),
+    labels=QUICK_LABELS,
+    targets=QUICK_TARGETS,
+    baseline_steps=1000,
+    closeup_steps=200,
+    downscale=8,
+    # The network is too small for the detail of larger photographs: windows.finest=1 wins nothing.
+    windows=WindowConfig(finest=8),
+)
+
+
+def make_field(config: NerfTrainingConfig, scene: Scene, growth: int) -> RadianceField:
+    """A NeRF between the scene's near and far; nothing overflows, so `growth` says nothing."""
+    del growth
+    center, scale = unit_cube(scene) if config.normalize else ((0.0, 0.0, 0.0), 1.0)
+    return nerf(
+        config,
+        near=scene.near,
+        far=scene.far,
+        center=center,
+        scale=scale,
+        supervision=depth_supervision(config, scene),
+    )
+
+
+def make_optimizer(config: NerfTrainingConfig, scene: Scene) -> optax.GradientTransformation:
+    """Adam with an exponentially decaying learning rate."""
+    del scene
+    return optax.adam(
+        optax.exponential_decay(config.initial_lr, config.lr_decay_steps, config.lr_decay)
+    )
+
+
+METHOD = Method(
+    presets={"quick": QUICK, "paper": PAPER, "released": RELEASED},
+    make_field=make_field,
+    make_optimizer=make_optimizer,
+    renders_pixels=True,
+    target_steps=lambda config, count: config.target_steps,
+)

@@ -1,0 +1,58 @@
+"""Instant-NGP with proposals: presets and field."""
+
+import dataclasses
+
+from jaxcloseup.app.methods.method import LabelConfig, Preset, WindowConfig
+from jaxcloseup.app.methods.volumes import (
+    QUICK_LABELS,
+    QUICK_TARGETS,
+    AdamConfig,
+    DepthConfig,
+    volumetric,
+)
+from jaxcloseup.fields.volume.hash_grid import HashGridConfig
+from jaxcloseup.fields.volume.ngp import NgpConfig, ngp
+from jaxcloseup.training.steps import TrainConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class NgpTrainingConfig(NgpConfig, DepthConfig, AdamConfig):
+    """Instant-NGP and its training."""
+
+
+PAPER = Preset(
+    method="ngp",
+    field=NgpTrainingConfig(),
+    train=TrainConfig(num_rays=2**13, num_label_rays=2**13),
+    labels=LabelConfig(),
+    baseline_steps=30_000,
+    closeup_steps=500,
+)
+
+QUICK = Preset(
+    method="ngp",
+    field=NgpTrainingConfig(
+        grid=HashGridConfig(levels=8, features=2, log2_entries=17, coarsest=16, finest=1024),
+        proposal=HashGridConfig(levels=4, features=2, log2_entries=14, coarsest=8, finest=128),
+        width=32,
+        color_layers=1,
+        direction_octaves=2,
+        num_coarse=48,
+        num_middle=0,
+        num_fine=16,
+        spacing=0.0,
+        distortion_weight=1e-3,
+        initial_lr=1e-2,
+        lr_decay_steps=2700,
+        chunk=2048,
+    ),
+    train=TrainConfig(num_rays=1024, num_label_rays=1024, label_rule="pooled"),
+    labels=QUICK_LABELS,
+    targets=QUICK_TARGETS,
+    baseline_steps=2500,
+    closeup_steps=200,
+    downscale=8,
+    windows=WindowConfig(),
+)
+
+METHOD = volumetric(ngp, quick=QUICK, paper=PAPER)

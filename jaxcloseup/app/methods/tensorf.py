@@ -1,0 +1,63 @@
+"""TensoRF: presets and field."""
+
+import dataclasses
+
+from jaxcloseup.app.methods.method import LabelConfig, Preset, WindowConfig
+from jaxcloseup.app.methods.volumes import (
+    QUICK_LABELS,
+    QUICK_TARGETS,
+    AdamConfig,
+    DepthConfig,
+    volumetric,
+)
+from jaxcloseup.fields.volume.tensorf import TensorfConfig, tensorf
+from jaxcloseup.training.steps import TrainConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class TensorfTrainingConfig(TensorfConfig, DepthConfig, AdamConfig):
+    """A TensoRF and its training."""
+
+    initial_lr: float = 2e-2
+
+
+PAPER = Preset(
+    method="tensorf",
+    field=TensorfTrainingConfig(lr_decay_steps=30_000),
+    train=TrainConfig(num_rays=4096, num_label_rays=4096),
+    labels=LabelConfig(),
+    baseline_steps=30_000,
+    closeup_steps=500,
+)
+
+QUICK = Preset(
+    method="tensorf",
+    field=TensorfTrainingConfig(
+        coarsest=32,
+        finest=128,
+        growths=3,
+        grow_every=100,
+        density_components=4,
+        color_components=8,
+        appearance=16,
+        width=32,
+        density_shift=-2.0,
+        sparsity_weight=1e-3,
+        smoothness_weight=0.05,
+        num_coarse=48,
+        num_fine=20,
+        spacing=0.0,
+        initial_lr=1e-2,
+        lr_decay_steps=4200,
+        chunk=1024,
+    ),
+    train=TrainConfig(num_rays=512, num_label_rays=512, label_rule="pooled"),
+    labels=QUICK_LABELS,
+    targets=QUICK_TARGETS,
+    baseline_steps=4000,
+    closeup_steps=200,
+    downscale=8,
+    windows=WindowConfig(),
+)
+
+METHOD = volumetric(tensorf, quick=QUICK, paper=PAPER)

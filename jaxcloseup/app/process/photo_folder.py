@@ -1,0 +1,189 @@
+"""Copy photographs into a capture: upright, each once, under names that every format holds."""
+
+import concurrent.futures
+import hashlib
+import io
+import os
+import pathlib
+import re
+import warnings
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import PIL.Image
+import PIL.ImageOps
+from PIL.ExifTags import IFD, Base
+
+from jaxcloseup.app.process.choices import FEWEST
+from jaxcloseup.app.process.counting import progress
+from jaxcloseup.app.process.solver_jobs import ProcessingError
+from jaxcloseup.artifacts.images import encode_png
+from jaxcloseup.captures.photo_files import ENDINGS, read_file, read_image
+from jaxcloseup.io.files import write_file
+from jaxcloseup.io.messages import printable
+from jaxcloseup.photos.scene import SceneError
+
+
+_AT_ONCE = 4  # in memory
+_LONGEST_STEM = 60  # characters
+_QUALITY = 95  # of a JPEG that was turned
+_KEPT = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}  # formats that COLMAP reads everywhere
+_NEEDS_CONVERSION = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"}
+
+
+class Copied(NamedTuple):
+    """A photograph in the capture.
+
+    Attributes:
+      name: its name in the folder `images`.
+      source: name of the file that it was made from.
+      lens: what tells lenses apart: size in pixels and, if EXIF has them, camera and focal length.
+    """
+
+    name: str
+    source: str
+    lens: list[Any]
+
+
+def list_files(folder: pathlib.Path) -> tuple[list[pathlib.Path], dict[str, str]]:
+    """List the photographs of a folder by name, and why its other files are left out.
+
+    Raises:
+      ProcessingError: it is not a folder, or has fewer than 3 photographs.
+    """
+    if not folder.is_dir():
+        raise ProcessingError(f"--images={folder} is not a folder: name a folder of photographs")
+    files = sorted(path for path in folder.iterdir() if path.is_file() and path.name[0] != ".")
+    photographs = [path for path in files if path.suffix.lower() in ENDINGS]
+    left_out = {}
+    for path in files:
+        if path.suffix.lower() in _NEEDS_CONVERSION:
+            left_out[printable(path.name)] = "has a format that is not read: export it as JPEG"
+        elif path.suffix.lower() not in ENDINGS:
+            left_out[printable(path.name)] = "is not a photograph"
+    if len(photographs) < FEWEST:
+        others = f" beside {len(left_out)} files that are not" if left_out else ""
+        raise ProcessingError(
+            f"--images={folder} holds {len(photographs)} photographs "
+            f"({', '.join(sorted(ENDINGS))}){others}: poses need at least {FEWEST}"
+        )
+    return photographs, left_out
+
+
+def copy_photographs(
+    photographs: Sequence[pathlib.Path], folder: pathlib.Path
+) -> tuple[list[Copied], dict[str, str]]:
+    """Copy photographs into a folder.
+
+    JPEG and PNG files are copied as they are, unless their EXIF orientation turns them: then the
+    pixels are turned and the orientation is removed, so that COLMAP and `run` see the same. Other
+    formats become PNG. EXIF's focal lengths stay.
+
+    Returns:
+      The copies, in the order of the photographs, and why others are left out, by name: what cannot
+      be read, and files that are equal to one before.
+
+    Raises:
+      ProcessingError: fewer than 3 photographs remain.
+      OSError: a copy cannot be written.
+    """
+    copied, left_out, taken, first = [], {}, set(), {}
+    workers = min(_AT_ONCE, os.cpu_count() or 1)
+    with (
+        warnings.catch_warnings(),
+        concurrent.futures.ThreadPoolExecutor(workers) as pool,
+        progress("copying photographs", "photographs") as report,
+    ):
+        warnings.simplefilter("ignore")  # Pillow's, of damaged EXIF and of many pixels
+        # Not all at once: what waits in a queue is in memory.
+        for start in range(0, len(photographs), workers):
+            part = photographs[start : start + workers]
+            for path, made in zip(part, pool.map(_read, part), strict=True):
+                source = printable(path.name)
+                if isinstance(made, str):
+                    left_out[source] = made
+                elif made.digest in first:
+                    left_out[source] = f"is the same file as {first[made.digest]}"
+                else:
+                    first[made.digest] = source
+                    name = _new_name(path.stem, made.ending, taken)
+                    write_file(folder / name, made.data)
+                    copied.append(Copied(name, source, made.lens))
+            report(start + len(part), len(photographs))
+    if len(copied) < FEWEST:
+        reasons = "; ".join(f"{name} {why}" for name, why in list(left_out.items())[:3])
+        raise ProcessingError(
+            f"only {len(copied)} different photographs can be read, and poses need at least "
+            f"{FEWEST} ({reasons})"
+        )
+    return copied, left_out
+
+
+class _Made(NamedTuple):
+    """The file of a copy: its bytes and ending, the lens, and a hash of the original."""
+
+    data: bytes
+    ending: str
+    lens: list[Any]
+    digest: bytes
+
+
+def _read(path: pathlib.Path) -> _Made | str:
+    """Read a photograph, or say why it cannot be."""
+    try:
+        held = read_file(path)
+        rgb = read_image(path, data=held)
+    except SceneError as error:
+        reason = str(error).removeprefix(str(path)).strip()
+        return printable(reason.rstrip(".").split(": ")[0])
+    data = held.tobytes()
+    digest = hashlib.sha256(data).digest()
+    ending, lens, turn = _about(data)
+    if turn:
+        try:
+            data, ending = _turned(data)
+            rgb = read_image(path, data=np.frombuffer(data, np.uint8))
+        except Exception as error:  # Pillow reads less than OpenCV, and raises various types
+            return f"cannot be turned as its EXIF says ({type(error).__name__}): export it upright"
+    elif ending is None:
+        data, ending = encode_png(rgb), ".png"
+    return _Made(data, ending, [rgb.shape[1], rgb.shape[0], *lens], digest)
+
+
+def _about(data: bytes) -> tuple[str | None, list[Any], bool]:
+    """The ending of a file that needs no conversion, EXIF's lens, and whether EXIF turns it."""
+    try:
+        with PIL.Image.open(io.BytesIO(data)) as image:
+            exif = image.getexif()
+            detail = exif.get_ifd(IFD.Exif)
+            focal = [detail.get(tag) for tag in (Base.FocalLength, Base.FocalLengthIn35mmFilm)]
+            lens = [str(exif.get(tag)) for tag in (Base.Make, Base.Model)] + list(map(str, focal))
+            turn = exif.get(Base.Orientation, 1) in range(2, 9)
+            return _KEPT.get(image.format), lens if any(focal) else [], turn
+    except Exception:  # not known to Pillow, or damaged EXIF: OpenCV has read the pixels
+        return None, [], False
+
+
+def _turned(data: bytes) -> tuple[bytes, str]:
+    """Turn a photograph upright; returns the bytes and the ending of its new file."""
+    with PIL.Image.open(io.BytesIO(data)) as image:
+        upright = PIL.ImageOps.exif_transpose(image)
+        kept = {"exif": upright.getexif(), "icc_profile": image.info.get("icc_profile")}
+        file = io.BytesIO()
+        if _KEPT.get(image.format) == ".jpg":
+            upright.save(file, "JPEG", quality=_QUALITY, subsampling=0, **kept)
+            return file.getvalue(), ".jpg"
+        upright.save(file, "PNG", **kept)
+        return file.getvalue(), ".png"
+
+
+def _new_name(stem: str, ending: str, taken: set[str]) -> str:
+    """A new name for a file; COLMAP's lists of names are divided by spaces."""
+    stem = re.sub(r"[^\w.+-]+", "_", stem)[:_LONGEST_STEM].lstrip(".-") or "photograph"
+    name, count = stem + ending, 1
+    while name.lower() in taken:
+        count += 1
+        name = f"{stem}_{count}{ending}"
+    taken.add(name.lower())
+    return name

@@ -1,0 +1,159 @@
+"""Make a capture in four stages: photographs, features, matches, mapping."""
+
+import hashlib
+import importlib.metadata
+import pathlib
+import shutil
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from jaxcloseup.app.process.choices import LENSES
+from jaxcloseup.app.process.pairs import choose_pairing
+from jaxcloseup.app.process.photo_folder import Copied, copy_photographs, list_files
+from jaxcloseup.app.process.solver_jobs import ProcessingError, do
+from jaxcloseup.app.process.stages import Stages
+from jaxcloseup.app.process.summary import draw_from_above, other_models, why_left_out
+from jaxcloseup.app.process.video_frames import extract_frames
+from jaxcloseup.app.progress import saying
+from jaxcloseup.version import __version__
+
+
+IMAGES, MODEL, PICTURE = "images", "sparse/0", "cameras.png"  # in the capture's folder
+_WORK, _DATABASE = "colmap", "colmap/database.db"
+
+
+class Request(NamedTuple):
+    """What a capture is made from.
+
+    Attributes:
+      images: folder of photographs, or None.
+      video: a video file where `images` is None.
+      count: largest number of frames of the video.
+      lens: a key of `names.LENSES`.
+      pairs: which photographs are matched: `auto` or one of `names.PAIRINGS`.
+    """
+
+    images: pathlib.Path | None
+    video: pathlib.Path | None
+    count: int
+    lens: str
+    pairs: str
+
+    def identity(self) -> dict[str, Any]:
+        """All that determines the capture, as JSON holds it.
+
+        Raises:
+          ProcessingError: the folder or the video cannot be read, or holds too little.
+          OSError: likewise.
+        """
+        files = [self.video] if self.images is None else list_files(self.images)[0]
+        held = [[path.name, path.stat().st_size] for path in files]
+        return {
+            "images": None if self.images is None else str(self.images.resolve()),
+            "video": None if self.video is None else str(self.video.resolve()),
+            "files": hashlib.sha256(repr(held).encode()).hexdigest(),
+            "count": None if self.video is None else self.count,
+            "lens": self.lens,
+            "pairs": self.pairs,
+            "versions": {
+                "jaxcloseup": __version__,
+                "pycolmap": importlib.metadata.version("pycolmap"),
+            },
+        }
+
+
+def make_capture(request: Request, folder: pathlib.Path, stages: Stages) -> dict[str, Any]:
+    """Make a capture, or continue one, and return the summary that `process.json` keeps.
+
+    Args:
+      request: what it is made from.
+      folder: folder of the capture.
+      stages: the stages of the capture that are finished.
+
+    Raises:
+      ProcessingError: no model comes out; the message says why.
+      SceneError: the model cannot be read again.
+      OSError: a file cannot be written.
+    """
+    (folder / _WORK).mkdir(exist_ok=True)
+    images, database = str(folder / IMAGES), str(folder / _DATABASE)
+    log = folder / _WORK / "log.txt"
+
+    gathered = stages.run("photographs", IMAGES, lambda: _gather(request, folder / IMAGES))
+    copied = [Copied(**each) for each in gathered["copied"]]
+    names = [each.name for each in copied]
+    if request.video is not None:
+        print(f"took {len(names)} of the video's {gathered['frames']} frames")
+
+    def find_features() -> dict[str, int]:
+        lenses, model = _by_lens(copied), LENSES[request.lens]
+        given = {"database": database, "images": images, "lenses": lenses, "model": model}
+        return do("features", "finding features", "photographs", log, **given)
+
+    features = stages.run("features", _DATABASE, find_features)
+    pairing = choose_pairing(request.pairs, len(names), video=request.video is not None)
+
+    def match() -> dict[str, int]:
+        given = {"database": database, "pairing": pairing, "names": names}
+        return do("matches", f"matching ({pairing})", "pairs", log, **given)
+
+    partners = stages.run("matches", _DATABASE, match)
+
+    def solve() -> list[dict[str, Any]]:
+        shutil.rmtree(part := folder / _WORK / "model", ignore_errors=True)
+        part.mkdir()
+        given = {"database": database, "images": images, "folder": str(part)}
+        models = do("mapping", "finding poses", "photographs", log, **given)
+        if models:
+            shutil.rmtree(model := folder / MODEL, ignore_errors=True)
+            model.parent.mkdir(exist_ok=True)
+            part.rename(model)
+        return models
+
+    models = stages.run("mapping", MODEL, solve)
+    if not models:
+        raise ProcessingError(_why_no_model(features, partners))
+    source = {each.name: each.source for each in copied}
+    reasons = why_left_out(names, features, partners, models)
+    summary = {
+        "photographs": len(names),
+        "registered": len(models[0]["photographs"]),
+        **{key: value for key, value in models[0].items() if key != "photographs"},
+        "other_models": other_models(models),
+        "left_out": {source[name]: why for name, why in reasons.items()} | gathered["left_out"],
+    }
+    stages.keep("summary", summary)
+    with saying("drawing cameras and points from above"):
+        draw_from_above(folder / MODEL, folder / IMAGES, folder / PICTURE)
+    return summary
+
+
+def _gather(request: Request, folder: pathlib.Path) -> dict[str, Any]:
+    """Write the photographs of the capture, instead of what an interrupted process wrote."""
+    shutil.rmtree(folder, ignore_errors=True)
+    if request.images is None:
+        copied, frames = extract_frames(request.video, request.count, folder)
+        return {"copied": [each._asdict() for each in copied], "left_out": {}, "frames": frames}
+    photographs, left_out = list_files(request.images)
+    copied, unread = copy_photographs(photographs, folder)
+    return {"copied": [each._asdict() for each in copied], "left_out": left_out | unread}
+
+
+def _by_lens(copied: Sequence[Copied]) -> list[list[str]]:
+    lenses: dict[str, list[str]] = {}
+    for each in copied:
+        lenses.setdefault(str(each.lens), []).append(each.name)
+    return list(lenses.values())
+
+
+def _why_no_model(features: dict[str, int], partners: dict[str, int]) -> str:
+    overlapping = sum(map(bool, partners.values()))
+    if not overlapping:
+        return (
+            f"no two photographs show the same (the richest has {max(features.values())} "
+            "features): take sharp photographs that overlap by more than half"
+        )
+    return (
+        f"{overlapping} of {len(partners)} photographs overlap, but no poses fit them: move the "
+        "camera between photographs instead of turning it, and show each place in three or more"
+    )

@@ -1,0 +1,166 @@
+"""Choose frames of a video: sharp ones, spread evenly over what the camera's motion shows."""
+
+import os
+import pathlib
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+
+from jaxcloseup.app.process.choices import FEWEST
+from jaxcloseup.app.process.counting import progress
+from jaxcloseup.app.process.photo_folder import Copied
+from jaxcloseup.app.process.solver_jobs import ProcessingError
+from jaxcloseup.io.files import check_file, write_file
+
+
+LARGEST = 2**42  # bytes of a video
+_SHARP_WIDTH, _MOTION_WIDTH = 960, 160  # pixels of the reduced frames
+_LEAST_MOTION = 0.1  # widths of a frame in the whole video; a tripod has less
+_ENOUGH = 3  # frames to compare in the middle of a part
+_BLURRED = 0.5  # of the sharpness of frames nearby
+_QUALITY = 95  # of the frames' JPEG files
+
+
+def choose_frames(sharpness: np.ndarray, motion: np.ndarray, count: int) -> list[int]:
+    """Choose frames of a video.
+
+    The video is divided into `count` parts of equal motion, so a camera that stands still for a
+    while adds no frames. Each part gives its sharpest frame, unless frames near it are more than
+    twice as sharp. Sharpness depends on what a frame shows, so frames far apart are not compared.
+    Where the middle half of a part has at least three frames, only these are compared, which
+    spreads the chosen ones more evenly.
+
+    Args:
+      sharpness: `[F]` sharpness of each frame, in any unit.
+      motion: `[F]` how far the picture moved since the frame before; 0 for the first.
+      count: largest number of frames to choose.
+
+    Returns:
+      The indices in order; fewer than `count` where the video jumps or is blurred.
+    """
+    if len(sharpness) <= count:
+        return list(range(len(sharpness)))
+    path = np.cumsum(motion)
+    part = path[-1] / count
+    chosen = set()
+    for i in range(count):
+        away = np.abs(path - (i + 0.5) * part)
+        reach = part / 4 if np.sum(away <= part / 4) >= _ENOUGH else part / 2
+        near = np.flatnonzero(away <= reach)
+        if len(near):
+            best = near[np.argmax(sharpness[near])]
+            if sharpness[best] >= _BLURRED * sharpness[away <= 1.5 * part].max():
+                chosen.add(int(best))
+    return sorted(chosen)
+
+
+def extract_frames(
+    video: pathlib.Path, count: int, folder: pathlib.Path
+) -> tuple[list[Copied], int]:
+    """Write the best frames of a video into a folder, upright, as JPEG files.
+
+    Args:
+      video: the file.
+      count: largest number of frames.
+      folder: folder for the frames, which are named by their index in the video.
+
+    Returns:
+      The frames, and how many the video has.
+
+    Raises:
+      ProcessingError: the video cannot be read, has fewer than 3 frames, or shows no motion.
+      OSError: a frame cannot be written.
+    """
+    sharpness, motion = _survey(video)
+    total = float(motion.sum())
+    if total < _LEAST_MOTION:
+        raise ProcessingError(
+            f"--video={video} hardly moves ({total:.2f} of its width in all): poses need a camera "
+            "that moves around the scene"
+        )
+    chosen = choose_frames(sharpness, motion, count)
+    wanted, copied = set(chosen), []
+    with progress("writing frames", "frames") as report:
+        for index, frame in enumerate(_frames(video, wanted)):
+            if index in wanted:
+                name = f"frame_{index:06d}.jpg"
+                write_file(folder / name, _jpeg(frame))
+                copied.append(Copied(name, f"frame {index}", [frame.shape[1], frame.shape[0]]))
+                report(len(copied), len(chosen))
+            if index == chosen[-1]:
+                break
+    return copied, len(sharpness)
+
+
+def _survey(video: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
+    """Sharpness `[F]`, and motion `[F]` in widths of a frame, of all frames of a video."""
+    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+    before, sharpness, motion = None, [], []
+    with progress("looking for sharp frames", "frames") as report:
+        claimed = int(_open(video).get(cv2.CAP_PROP_FRAME_COUNT))
+        for frame in _frames(video):
+            gray = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+            sharpness.append(cv2.Laplacian(_reduced(gray, _SHARP_WIDTH), cv2.CV_32F).var())
+            small = _reduced(gray, _MOTION_WIDTH)
+            moved = 0.0
+            if before is not None:
+                moved = np.median(np.linalg.norm(flow.calc(before, small, None), axis=-1))
+            motion.append(moved / small.shape[1])
+            before = small
+            report(len(motion), claimed if claimed >= len(motion) else None)
+    if len(motion) < FEWEST:
+        raise ProcessingError(
+            f"--video={video} has {len(motion)} readable frames: poses need at least {FEWEST}"
+        )
+    return np.array(sharpness), np.array(motion)
+
+
+def _open(video: pathlib.Path) -> cv2.VideoCapture:
+    # FFmpeg and OpenCV print what is wrong with a file, in their own words.
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    level = cv2.utils.logging.getLogLevel()
+    try:
+        check_file(video, most=LARGEST)
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        opened = cv2.VideoCapture(str(video))
+    except OSError as error:
+        raise ProcessingError(
+            f"--video={video} cannot be read ({error.strerror}): name a video file"
+        ) from error
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+    if not opened.isOpened():
+        raise ProcessingError(
+            f"--video={video} is not a video that can be read: export it again, as MP4"
+        )
+    return opened  # which turns frames upright itself, as the file says
+
+
+def _frames(video: pathlib.Path, wanted: set[int] | None = None) -> Iterator[np.ndarray | None]:
+    """All frames of a video, uint8 BGR `[H, W, 3]`; None in place of those that are not wanted."""
+    opened, index = _open(video), 0
+    try:
+        while opened.grab():
+            frame = None
+            if wanted is None or index in wanted:
+                good, frame = opened.retrieve()
+                if not good:
+                    return
+            yield frame
+            index += 1
+    finally:
+        opened.release()
+
+
+def _reduced(gray: np.ndarray, width: int) -> np.ndarray:
+    if gray.shape[1] <= width:
+        return gray
+    height = max(1, round(gray.shape[0] * width / gray.shape[1]))
+    return cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def _jpeg(frame: np.ndarray) -> bytes:
+    options = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+    options += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    return cv2.imencode(".jpg", frame, options)[1].tobytes()

@@ -1,0 +1,75 @@
+"""The parts of a run in their order, and how long they take relative to each other."""
+
+from collections.abc import Sequence
+
+from jaxcloseup.app.methods import METHODS, Preset
+from jaxcloseup.photos.scene import Scene
+
+
+# Seconds of a step, or of a whole part, of a default run of `table` on two cores.
+_STEP = {
+    **{"coarse_baseline": 0.044, "baseline": 0.1, "control": 0.1, "closeup": 0.2},
+    **{"test_time_control": 0.1, "test_time": 0.2},
+}
+_PART = {
+    **{"refine_baseline": 11, "depths": 30, "gate": 5, "closeup_labels": 30, "detail": 46},
+    **{"test_time_labels": 2, "audit": 10, "dolly": 10, "report": 4},
+    **{"baseline_evaluation": 10, "detail_evaluation": 15},
+}
+_EVALUATION = 3.5  # seconds of any other
+_RAYS = 8  # times as long for images of a field that renders single rays
+_WORDS = {
+    "depths": "rendering depths of the photographs, and what is scored",
+    "gate": "comparing labels with left-out photographs",
+    "audit": "comparing labels with the truth",
+    "detail": "making the detail of the photographs",
+    "dolly": "rendering a dolly",
+    "report": "writing the report",
+}
+
+
+def plan_run(preset: Preset, scene: Scene, to_run: Sequence[str]) -> dict[str, float]:
+    """Typical seconds of the parts of a run by name, in order.
+
+    Args:
+      preset: how the scene is trained.
+      scene: what is trained.
+      to_run: names of stages.
+    """
+    method = METHODS[preset.method]
+    steps = {"baseline": preset.baseline_steps}
+    parts = ["coarse_baseline", "refine_baseline"] if preset.coarse is not None else []
+    if preset.coarse is not None:
+        steps["coarse_baseline"] = preset.coarse.steps
+    parts += ["baseline", "depths", "baseline_evaluation", "gate"]
+    for stage in ("control", "closeup"):
+        steps[stage] = preset.closeup_steps
+    if "control" in to_run:
+        parts += ["control", "control_evaluation"]
+    if "closeup" in to_run:
+        parts += ["closeup_labels"] if preset.labels.label == "residual" else []
+        parts += ["closeup", "closeup_evaluation"]
+    parts += ["detail", "detail_evaluation"] if "detail" in to_run else []
+    if "test_time" in to_run and scene.test is not None:
+        targets = method.target_steps(preset.field, len(scene.test))
+        steps |= dict.fromkeys(("test_time", "test_time_control"), targets)
+        parts += ["test_time_labels"]
+        for stage in ("test_time_control",) * ("control" in to_run) + ("test_time",):
+            parts += [stage, f"{stage}_evaluation"]
+    parts += ["audit"] + ["dolly"] * (scene.test is not None) + ["report"]
+    slower = _RAYS if method.renders_pixels else 1
+    return {
+        name: _STEP[name] * steps[name] if name in steps else slower * _PART.get(name, _EVALUATION)
+        for name in parts
+    }
+
+
+def in_words(part: str) -> str:
+    """What a part of a run does."""
+    if part.endswith("_evaluation"):
+        return f"scoring {part.removesuffix('_evaluation')}"
+    if part.endswith("_labels"):
+        return f"making labels for {part.removesuffix('_labels')}"
+    if part.startswith("refine_"):
+        return "adding surfels where photographs show more"
+    return _WORDS.get(part, part)

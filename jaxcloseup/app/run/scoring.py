@@ -1,0 +1,107 @@
+"""The views to score on, and the scores, renders and exports of a run's stages."""
+
+import functools
+import pathlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxcloseup.app.run.programs import Programs
+from jaxcloseup.app.run.setup import LabelStart, Training, timed
+from jaxcloseup.app.score.ladder import describe_ladder, ladder_targets
+from jaxcloseup.app.score.metrics_text import describe_split
+from jaxcloseup.app.score.renders import write_renders
+from jaxcloseup.app.score.scores import (
+    Perceptual,
+    Target,
+    evaluate,
+    exact_depths,
+    targets_by_split,
+)
+from jaxcloseup.fields.contract import Rendering
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.training.steps import TrainState
+
+
+class HeldOut(NamedTuple):
+    """What stages are scored on.
+
+    Attributes:
+      targets: held-out views by split.
+      ladder: views of the zoom ladder by rung; none where the exact scene is not known.
+      exact: `[V, H, W]` exact depths of the training views, or None.
+    """
+
+    targets: Mapping[str, Sequence[Target]]
+    ladder: Mapping[str, Sequence[Target]]
+    exact: jax.Array | None
+
+    @property
+    def all(self) -> dict[str, Sequence[Target]]:
+        """Targets and ladder together."""
+        return {**self.targets, **self.ladder}
+
+
+def hold_out(programs: Programs, start: LabelStart) -> HeldOut:
+    """The views to score on. Their coverage is that of `start`, so that all are scored alike."""
+    scene, render = programs.scene, functools.partial(programs.render, start.state)
+    exact = exact_depths(scene, scene.train.cameras) if scene.surface else None
+    finer = programs.preset.score_downscale
+    finer = finer if finer and finer < programs.preset.downscale else None
+    targets = targets_by_split(scene, start.sources.depths, exact, render, finer=finer)
+    return HeldOut(targets, {} if exact is None else ladder_targets(scene, exact), exact)
+
+
+class Scorer:
+    """Scores stages on the held-out views, and writes their renders and exports.
+
+    Attributes:
+      scores: by stage and split.
+      images: renders by stage and split, then by the view's name; without the zoom ladder's.
+    """
+
+    def __init__(
+        self,
+        training: Training,
+        held_out: HeldOut,
+        output_dir: pathlib.Path,
+        perceptual: Perceptual,
+    ) -> None:
+        """Score nothing yet."""
+        self._training, self._held_out = training, held_out
+        self._folder, self._perceptual = output_dir, perceptual
+        self.scores: dict[str, dict[str, Any]] = {}
+        self.images: dict[tuple[str, str], Mapping[str, np.ndarray]] = {}
+
+    def score(
+        self, stage: str, state: TrainState, render: Callable[[Camera], Rendering] | None = None
+    ) -> None:
+        """Render, score and keep one stage.
+
+        Args:
+          stage: its name.
+          state: its state.
+          render: `camera -> Rendering`; default: the state's, which is exported too.
+        """
+        programs, log = self._training.programs, self._training.log
+        if render is None:
+            render = functools.partial(programs.render, state)
+            programs.method.export(self._folder, stage, state.params, state.buffers)
+        targets, ladder = self._held_out.targets, self._held_out.ladder
+        with timed(self._training.seconds, f"{stage}_evaluation"):
+            scores, shown = {}, {}
+            for split, views in self._held_out.all.items():
+                scores[split], seen = evaluate(render, views, self._perceptual)
+                write_renders(self._folder / "renders" / stage / split, seen, programs.scene)
+                if split in targets:
+                    self.images[stage, split] = {name: one.rgb for name, one in seen.items()}
+                    name, first = next(iter(seen.items()))
+                    shown[f"{split}/{name}"] = first.rgb
+                    print(f"{stage:>9} {split}: {describe_split(scores[split])}", flush=True)
+            self.scores[stage] = scores
+            if log is not None:
+                log.evaluated(stage, scores, shown)
+            if ladder:
+                print(f"{stage:>9} {describe_ladder(scores)}", flush=True)

@@ -1,0 +1,52 @@
+"""How far a mesh is from the exact surface that the training photographs of a scene see."""
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from jaxcloseup.artifacts.mesh_files import Mesh
+
+
+CLOSE = 0.01  # of the extent
+_POINTS = 1_000_000  # on each of the two surfaces
+
+
+def mesh_error(mesh: Mesh, exact: np.ndarray) -> dict[str, float]:
+    """Distances between a mesh and points of the exact surface, both drawn with a fixed seed.
+
+    Points of the mesh are drawn uniformly over its area. Each of them is `mesh_to_surface` away
+    from the next exact point, and each exact point `surface_to_mesh` from the next point of the
+    mesh, in the mean. Points have gaps, so a perfect mesh has distances of about half a gap.
+
+    Args:
+      mesh: at least one triangle.
+      exact: `[P, 3]` points of the exact surface.
+
+    Returns:
+      In world units `extent`, the longest side of the box around `exact`, `mesh_to_surface`,
+      `surface_to_mesh`, and their mean `chamfer`; and the shares `mesh_close` and `surface_close`
+      of points within `CLOSE` times the extent of the other surface.
+    """
+    rng = np.random.default_rng(0)
+    drawn = sample_mesh(rng, mesh, _POINTS)
+    exact = exact[rng.permutation(len(exact))[:_POINTS]]
+    there, back = KDTree(exact).query(drawn)[0], KDTree(drawn).query(exact)[0]
+    extent = float(np.ptp(exact, axis=0).max())
+    return {
+        "extent": extent,
+        "chamfer": float(there.mean() + back.mean()) / 2,
+        "mesh_to_surface": float(there.mean()),
+        "surface_to_mesh": float(back.mean()),
+        "mesh_close": float(np.mean(there <= CLOSE * extent)),
+        "surface_close": float(np.mean(back <= CLOSE * extent)),
+    }
+
+
+def sample_mesh(rng: np.random.Generator, mesh: Mesh, count: int) -> np.ndarray:
+    """Points `[count, 3]`, uniform over the area of a mesh."""
+    first, second, third = np.moveaxis(mesh.vertices[mesh.faces].astype(np.float64), 1, 0)
+    area = np.linalg.norm(np.cross(second - first, third - first), axis=-1)
+    face = rng.choice(len(area), count, p=area / area.sum())
+    # Reflected at the diagonal, a point of a parallelogram lies in its triangle.
+    u, v = rng.random((2, count, 1))
+    u, v = np.where(u + v > 1, (1 - u, 1 - v), (u, v))
+    return first[face] + u * (second - first)[face] + v * (third - first)[face]

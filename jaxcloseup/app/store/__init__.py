@@ -1,0 +1,1 @@
+"""Runs on disk: manifests, and stored runs loaded again."""

@@ -1,0 +1,226 @@
+"""A stored run, finished or cut off, loaded again: its scene, its preset, a stage's state."""
+
+import pathlib
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxcloseup.app.methods import Preset
+from jaxcloseup.app.run.loop import TrainingError
+from jaxcloseup.app.run.programs import Programs
+from jaxcloseup.app.run.settings import with_settings
+from jaxcloseup.app.run.setup import state_shapes
+from jaxcloseup.app.store import manifest
+from jaxcloseup.app.store.stored_config import preset_from_config
+from jaxcloseup.artifacts.checkpoints import Checkpoints
+from jaxcloseup.captures.load import load_scene
+from jaxcloseup.io.files import read_object
+from jaxcloseup.io.messages import printable
+from jaxcloseup.photos.scene import Scene
+from jaxcloseup.training.steps import TrainState
+
+
+# Which stage is rendered by default: the first of these that a run has.
+_BY_DEFAULT = ("closeup", "control", "baseline")
+# Names of a state's arrays that version 0.1.0 spelled otherwise.
+_OLD_NAMES = {"regularize": "regularise", "image_offset": "probe"}
+
+
+# What rendering needs of the files of a run.
+_FIELDS = {
+    manifest.NAME: {"scene": str, "load_options": dict, "data_sha256": str},
+    "checkpoints/run.json": {"config": dict, "resolution": list, "seed": int},
+}
+_WORDS = {str: "a text", dict: "an object", list: "a list", int: "a whole number from 0 on"}
+
+
+class RunError(Exception):
+    """A run that cannot be rendered. The message is one sentence that says what to do."""
+
+    def __init__(self, message: str) -> None:
+        """Escape what a terminal would obey in what files say."""
+        super().__init__(printable(message))
+
+
+class StoredRun(NamedTuple):
+    """What a run's folder says about it.
+
+    Attributes:
+      folder: the run's folder.
+      manifest: its `manifest.json`.
+      identity: its `checkpoints/run.json`.
+      trained: how it was trained.
+      preset: the same, with the settings that the user changes now.
+      stages: those that have a state.
+    """
+
+    folder: pathlib.Path
+    manifest: Mapping[str, Any]
+    identity: Mapping[str, Any]
+    trained: Preset
+    preset: Preset
+    stages: list[str]
+
+
+def read_run(folder: pathlib.Path) -> StoredRun:
+    """Read how a run was trained, and which states it left.
+
+    Prints the settings that its version lacked, with the values that reproduce its renders.
+
+    Raises:
+      RunError: the folder holds no run, or none that this version can render.
+    """
+    if not folder.is_dir():
+        raise RunError(f"--run={folder} is not a folder: name that of a run of experiments.run")
+    about, identity = (_read_json(folder, name) for name in _FIELDS)
+    if "scene" not in about or "config" not in identity:
+        raise RunError(f"--run={folder} is of a sweep or unknown: name a run of experiments.run")
+    for fields, (name, kinds) in zip((about, identity), _FIELDS.items(), strict=True):
+        _check_fields(folder / name, fields, kinds)
+    if len(identity["resolution"]) != 2:
+        raise RunError(
+            f"{folder / 'checkpoints/run.json'}: resolution must be a width and a height: restore "
+            "the file from a copy of the run"
+        )
+    version = identity.get("version")
+    try:
+        preset, absent = preset_from_config(identity["config"], identity.get("method"))
+    except ValueError as error:
+        raise RunError(
+            f"--run={folder} was trained by version {version}, whose configuration this version "
+            f"cannot read ({error}): render it with version {version}, or restore "
+            "checkpoints/run.json from a copy of the run"
+        ) from None
+    if absent:
+        values = ", ".join(f"{name}={value}" for name, value in absent.items())
+        print(f"{folder}: version {version} had no such settings; it renders with {values}")
+    checkpoints = folder / "checkpoints"
+    stages = sorted(
+        path.name
+        for path in checkpoints.iterdir()
+        if path.is_dir() and any(step.name.isdecimal() for step in path.iterdir())
+    )
+    if not stages:
+        raise RunError(f"--run={folder} has no checkpoint yet: resume it with experiments.run")
+    return StoredRun(folder, about, identity, preset, preset, stages)
+
+
+def change_settings(run: StoredRun, given: Sequence[str]) -> StoredRun:
+    """The run with other settings, for what is trained from its states.
+
+    Raises:
+      RunError: a setting is unknown or has no such value.
+    """
+    try:
+        return run._replace(preset=with_settings(run.preset, given))
+    except ValueError as error:
+        raise RunError(str(error)) from None
+
+
+def choose_stage(run: StoredRun, stage: str | None) -> str:
+    """The stage that the user names; by default the closeup, or the last that trained."""
+    if stage is None:
+        return next(name for name in (*_BY_DEFAULT, *run.stages) if name in run.stages)
+    if stage not in run.stages:
+        raise RunError(
+            f"--stage={stage}: {run.folder} has no state of it (closeup has none where the gate "
+            "let no labels in): choose " + " or ".join(run.stages)
+        )
+    return stage
+
+
+def load_run_scene(run: StoredRun, moved_to: str | None = None) -> Scene:
+    """The scene that a run was trained on, from where it was or `moved_to`.
+
+    Raises:
+      RunError: the capture is another one now.
+      SceneError: it cannot be loaded.
+    """
+    about = run.manifest
+    name = about["scene"] if moved_to is None else moved_to
+    try:
+        scene = load_scene(name, **about["load_options"])
+    except TypeError as error:
+        raise RunError(
+            f"--run={run.folder} was loaded with options that this version lacks ({error}): "
+            "render it with the version that trained it"
+        ) from None
+    size = [scene.train.cameras.width, scene.train.cameras.height]
+    if size != run.identity["resolution"]:
+        raise RunError(
+            f"--run={run.folder} was trained with photographs of "
+            f"{' x '.join(map(str, run.identity['resolution']))} pixels, and {name} has "
+            f"{size[0]} x {size[1]}: name its own capture with --data"
+        )
+    if manifest.hash_data(scene) != about["data_sha256"]:
+        warnings.warn(
+            f"{name} does not hold the photographs or cameras that {run.folder} was trained on.",
+            stacklevel=2,
+        )
+    return scene
+
+
+def restore(run: StoredRun, scene: Scene, stage: str) -> tuple[Programs, TrainState]:
+    """The programs of a run, with the room that its images needed, and a stage's newest state.
+
+    Raises:
+      RunError: there is no such state, it does not fit into memory, or a changed setting does not
+        fit it.
+      CheckpointError: the state has another form.
+    """
+    programs = Programs(run.preset, scene)
+    try:
+        shapes = state_shapes(programs)
+    except TrainingError as error:
+        raise RunError(f"--run={run.folder}: {error}") from None
+    if run.preset != run.trained and shapes != state_shapes(Programs(run.trained, scene)):
+        raise RunError(
+            f"--set changes the shape of what was trained: --run={run.folder} was trained with "
+            "other shapes, so train anew with these settings, or leave them out"
+        )
+    like = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    old = _OLD_NAMES if str(run.identity.get("version", "")).startswith("0.1.") else {}
+    checkpoints = Checkpoints(run.folder / "checkpoints", run.identity)
+    found = checkpoints.load(stage, like, stored_as=old)
+    if found is None:
+        raise RunError(f"--stage={stage}: {run.folder} has no state of it")
+    step, state, progress = found
+    programs.make_room(progress["growth"])
+    print(f"{run.folder}: {scene.name}, {stage} after {step} steps")
+    return programs, state
+
+
+def read_fields(path: pathlib.Path, kinds: Mapping[str, type]) -> dict[str, Any]:
+    """Read the object in a JSON file that has these fields, of these types.
+
+    Raises:
+      RunError: the file cannot be read, or a field is missing or of another type.
+    """
+    try:
+        found = read_object(path)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise RunError(
+            f"{path} cannot be read ({reason}): restore it from a copy of the run"
+        ) from None
+    _check_fields(path, found, kinds)
+    return found
+
+
+def _check_fields(path, found, kinds):
+    for name, kind in kinds.items():
+        value = found.get(name)
+        fits = isinstance(value, kind) and not isinstance(value, bool)
+        if not fits or (kind is int and not 0 <= value < 2**63):
+            raise RunError(
+                f"{path}: {name} must be {_WORDS[kind]}: restore the file from a copy of the run"
+            )
+
+
+def _read_json(folder, name):
+    if not (folder / name).exists():
+        raise RunError(f"--run={folder} has no {name}: name the folder of a run of experiments.run")
+    return read_fields(folder / name, {})

@@ -1,0 +1,1 @@
+"""Ablation sweeps: arms, and their training."""

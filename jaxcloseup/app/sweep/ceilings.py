@@ -1,0 +1,96 @@
+"""Upper bounds for labels: random virtual close-ups with true pixels, or with better depth."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from jaxcloseup.app.score.audit import resolved_by_photographs
+from jaxcloseup.captures.load import Scene
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.labels.make import (
+    LabelSources,
+    PseudoSettings,
+    label_sources,
+    label_views,
+    sample_virtual_camera,
+)
+from jaxcloseup.photos.views import Views, camera_at
+
+
+CEILING_VIEWS = 64
+
+
+def true_close_ups(
+    key: jax.Array,
+    scene: Scene,
+    sources: LabelSources,
+    exact: jax.Array,
+    settings: PseudoSettings,
+    *,
+    blurred: bool,
+) -> Views:
+    """Render random virtual close-ups with their true pixels, where a training view sees them.
+
+    This is an upper bound for labels, because no photograph has so much detail. `blurred` lowers
+    the bound to the detail of the photograph with the smallest footprint.
+
+    Args:
+      key: random key.
+      scene: a scene with `surface`.
+      sources: the training photographs with their depths, for sampling cameras.
+      exact: `[V, H, W]` exact depths of the training views.
+      settings: settings of poses.
+      blurred: whether to blur the true pixels to the detail of the photographs.
+
+    Returns:
+      `CEILING_VIEWS` close-ups; weight 0 where no photograph sees the surface.
+    """
+    sample, surface = jax.jit(sample_virtual_camera), scene.surface
+    images = []
+    for one in jax.random.split(key, CEILING_VIEWS):
+        camera, _ = sample(one, sources, settings)
+        resolved, seen = resolved_by_photographs(scene, camera, exact)
+        rgb = resolved if blurred else surface(camera).rgb
+        images.append(Views(camera, jnp.asarray(rgb, jnp.float32), jnp.asarray(seen, jnp.float32)))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *images)
+
+
+def labels_with_better_depth(
+    key: jax.Array,
+    scene: Scene,
+    sources: LabelSources,
+    exact: jax.Array,
+    render_depths: Callable[[Camera], jax.Array],
+    settings: PseudoSettings,
+    *,
+    share: float,
+) -> Views:
+    """Make labels for random virtual close-ups from depth with less error.
+
+    They show what better geometry would bring.
+
+    Args:
+      key: random key.
+      scene: a scene with `surface`.
+      sources: the training photographs with their trained depths.
+      exact: `[V, H, W]` exact depths of the training views.
+      render_depths: function from stacked cameras `[Q]` to their trained depths `[Q, H, W]`.
+      settings: settings of poses and labels.
+      share: share of the depth error that remains: 1 is the trained depth, 0 the exact depth.
+
+    Returns:
+      `CEILING_VIEWS` labeled close-ups.
+    """
+
+    def mix(trained, true):
+        return jnp.where((trained > 0) & (true > 0), true + share * (trained - true), 0)
+
+    sample, surface = jax.jit(sample_virtual_camera), scene.surface
+    keys = jax.random.split(key, CEILING_VIEWS)
+    cameras = [sample(one, sources, settings)[0] for one in keys]
+    cameras = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
+    true = jnp.stack([surface(camera_at(cameras, i)).depth for i in range(CEILING_VIEWS)])
+    targets, mixed = mix(render_depths(cameras), true), mix(sources.depths, exact)
+    better = jax.jit(label_sources)(sources.views, mixed)
+    return jax.jit(label_views)(cameras, targets, better, settings)

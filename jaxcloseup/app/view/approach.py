@@ -1,0 +1,68 @@
+"""A camera that moves from a photograph towards what a held-out close-up shows."""
+
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcloseup.app import progress
+from jaxcloseup.app.score.scores import Target
+from jaxcloseup.app.view.camera_paths import dolly, named_cameras
+from jaxcloseup.artifacts.images import to_uint8
+from jaxcloseup.fields.contract import Rendering
+from jaxcloseup.geometry.cameras import Camera, pixels_to_points, points_to_pixels
+from jaxcloseup.labels.make import LabelSources, best_source
+from jaxcloseup.labels.rules import label_depth
+
+
+FRAMES = 24
+MAGNIFICATION = (1.5, 8.0)  # smallest and largest: an orbiting close-up may not be nearer at all
+_ENOUGH = 10  # photographs, of which more make no better support
+
+
+def approach(
+    targets: Sequence[Target],
+    sources: LabelSources,
+    render: Callable[[Camera], Rendering],
+    *,
+    far: float,
+) -> list[np.ndarray]:
+    """Render a dolly from the photograph that shows most of the best-supported close-up.
+
+    The camera does not turn, so it ends as near as the close-up to the point in its middle.
+
+    Args:
+      targets: held-out close-ups; frames are as large as they are.
+      sources: the training photographs with their depths.
+      render: `camera -> Rendering`.
+      far: largest depth.
+
+    Returns:
+      Frames, uint8 `[H, W, 3]`; none where the model shows nothing in the middle of the close-up.
+    """
+    target = max(targets, key=lambda one: float(jnp.mean(jnp.minimum(one.seen, _ENOUGH))))
+    camera = target.camera
+    depth = label_depth(render(camera), near=0, far=far)
+    view = int(jax.jit(best_source)(camera, sources.views, sources.depths, depth=depth))
+    # The lens of the close-up gives all frames one shape, so nothing is compiled for them.
+    start = camera.replace(camtoworld=sources.views.cameras.camtoworld[view])
+    height, width = target.weight.shape  # without padding
+    row, column = height // 2, width // 2
+    middle = pixels_to_points(camera, jnp.array([column + 0.5, row + 0.5]), depth[row, column])
+    pixel, distance = points_to_pixels(start, middle)
+    if not (depth[row, column] > 0 and distance > 0):
+        return []
+    nearer = float(distance / depth[row, column])
+    shots = dolly(
+        start,
+        tuple(pixel.tolist()),
+        float(distance),
+        magnification=float(np.clip(nearer, *MAGNIFICATION)),
+        frames=FRAMES,
+    )
+
+    def frame(one):
+        return to_uint8(np.asarray(render(one).rgb)[:height, :width])
+
+    return list(progress.each(frame, [one for _, one in named_cameras(shots)], "frames"))

@@ -1,0 +1,394 @@
+"""Cameras to render: a split's views, a camera_path.json, an orbit, or a dolly towards a surface.
+
+Poses are camera-to-world in the scene's own world; for a capture, that is the world of its
+`transforms*.json`.
+"""
+
+import math
+import pathlib
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcloseup.app.view.orientation import up_direction
+from jaxcloseup.captures.json_fields import number, read_object, rigid_transform
+from jaxcloseup.captures.load import Scene, SceneError
+from jaxcloseup.captures.scale import FOCAL, LENGTH
+from jaxcloseup.geometry.cameras import Camera, pixels_to_points
+from jaxcloseup.geometry.poses import closeup_position
+from jaxcloseup.io.memory import installed_memory
+from jaxcloseup.io.messages import printable
+from jaxcloseup.photos.views import Views, camera_at
+
+
+OPENGL = np.diag([1.0, -1, -1])  # y and z change sign between the OpenGL and OpenCV frames
+_RIGID = 1e-3
+_LARGEST = 2**31 - 1  # side of an image
+_BYTES_PER_PIXEL = 400  # half of what rendering surfels took
+
+
+class CameraError(Exception):
+    """The requested cameras are invalid. The message is one sentence that says what to do."""
+
+    def __init__(self, message: str) -> None:
+        """Escape what a terminal would obey in what files say."""
+        super().__init__(printable(message))
+
+
+class Shots(NamedTuple):
+    """Cameras to render.
+
+    Attributes:
+      cameras: `[Q]` stacked cameras.
+      names: file name of each camera's images, without ending.
+      fps: frames per second that the camera path asks for, or None.
+      sizes: width and height of each photograph whose view this is, without its padding; None where
+        no image is padded.
+    """
+
+    cameras: Camera
+    names: list[str]
+    fps: float | None = None
+    sizes: list[tuple[int, int]] | None = None
+
+
+def view_shots(scene: Scene, split: str) -> Shots:
+    """Return the cameras of a split, named after their photographs.
+
+    Raises:
+      CameraError: the scene has no such split.
+    """
+    views: Views | None = getattr(scene, split, None) if split in scene.names else None
+    if views is None:
+        raise CameraError(
+            f"--views={split}: {scene.name} has no such split: choose " + ", ".join(scene.names)
+        )
+    return Shots(views.cameras, list(scene.names[split]), sizes=scene.sizes(split))
+
+
+def read_camera_path(path: pathlib.Path) -> Shots:
+    """Read the cameras of nerfstudio's `camera_path.json`, in the file's own world.
+
+    The function reads `render_height`, `render_width`, `fps` or `seconds`, and for each entry of
+    `camera_path` its `camera_to_world` (16 numbers by rows, OpenGL) and `fov` (vertical, degrees;
+    default: the file's `default_fov`). Pixels are square, so `aspect` is redundant and ignored.
+
+    Raises:
+      CameraError: the file is invalid; the message names the file, the entry and the field.
+    """
+    try:
+        fields = read_object(path, "a camera_path")
+    except SceneError as error:
+        raise CameraError(str(error)) from None
+    kind = fields.get("camera_type", "perspective")
+    if kind != "perspective":
+        raise CameraError(f"{path}: camera_type is {kind!r}: make it perspective")
+    height, width = (_size(path, fields, key) for key in ("render_height", "render_width"))
+    check_memory(width, height, f"{path}: render_width and render_height")
+    entries = fields.get("camera_path")
+    if not isinstance(entries, list) or not entries:
+        raise CameraError(f"{path}: camera_path must be a list of at least one camera")
+    poses, focals = [], []
+    for i, entry in enumerate(entries):
+        label = f"{path}: camera_path[{i}]"
+        if not isinstance(entry, dict):
+            raise CameraError(f"{label} must be an object with camera_to_world and fov")
+        poses.append(_pose(label, entry))
+        fov = _number(label, {"fov": fields.get("default_fov"), **entry}, "fov")
+        if not 0 < fov < 180:
+            raise CameraError(f"{label}: fov must be between 0 and 180 degrees, not {fov:g}")
+        focals.append(height / 2 / math.tan(math.radians(fov) / 2))
+        if not focals[-1] <= FOCAL[1] * max(width, height):
+            raise CameraError(
+                f"{label}: fov of {fov:g} degrees is too small for any lens: raise it"
+            )
+    fps = None
+    if fields.get("fps") is not None:
+        fps = _number(str(path), fields, "fps")
+    elif fields.get("seconds") is not None:
+        fps = len(entries) / max(_number(str(path), fields, "seconds"), 1e-9)
+    if fps is not None and not 0 < fps <= 1000:
+        raise CameraError(f"{path}: fps and seconds must be positive and give at most 1000 fps")
+    intrinsics = [[f, f, width / 2, height / 2] for f in focals]
+    return Shots(_stack(poses, intrinsics, height, width), _numbered(len(poses)), fps)
+
+
+def read_camera_transform(path: pathlib.Path) -> tuple[np.ndarray, float]:
+    """Read the `transform`, `[3, 4]` float64, and `scale` of a `dataparser_transforms.json`.
+
+    Raises:
+      SceneError: the file is invalid; the message names the file and the field.
+    """
+    fields = read_object(path, "a transform and a scale")
+    transform = rigid_transform(str(path), "transform", fields.get("transform"))
+    return transform, number(str(path), "scale", fields.get("scale"), above=0)
+
+
+def to_capture(shots: Shots, transform: np.ndarray, scale: float, scene: Scene) -> Shots:
+    """Map cameras from nerfstudio's world to the scene's world.
+
+    nerfstudio maps a point x of the capture's original world to scale * transform (x, 1). The
+    original world is the scene's world before the `applied_transform` of its `transforms.json`.
+    The recorded scale includes the `applied_scale`, but nerfstudio's cameras do not.
+
+    Args:
+      shots: cameras in nerfstudio's world.
+      transform: `[3, 4]` nerfstudio's recorded transform.
+      scale: nerfstudio's recorded scale of positions.
+      scene: the scene of the capture that nerfstudio loaded.
+
+    Raises:
+      SceneError: the scene's `applied_transform` and the transform do not combine to a rigid one.
+    """
+    last = [0.0, 0, 0, 1]
+    applied = scene.metadata.get("applied_transform")
+    back = np.linalg.inv(np.vstack([transform, last]))
+    back = (np.eye(3, 4) if applied is None else applied) @ back
+    back = rigid_transform(scene.name, "applied_transform after --camera_transform", back)
+    scale /= scene.metadata.get("applied_scale", 1.0)
+    poses = np.asarray(shots.cameras.camtoworld, np.float64) / [1, 1, 1, scale]
+    poses = back[:, :3] @ poses + back[:, 3:] * [0, 0, 0, 1]
+    camtoworld = jnp.asarray(poses, jnp.float32)
+    return shots._replace(cameras=shots.cameras.replace(camtoworld=camtoworld))
+
+
+def orbit(scene: Scene, frames: int, *, up: Sequence[float] | None = None) -> Shots:
+    """Return cameras on a circle around the training cameras' focus point, looking at it.
+
+    The circle has the training cameras' median height above that point and their median distance
+    from the vertical through it. Lens and image size are those of the first training view.
+
+    Args:
+      scene: the scene with the training cameras.
+      frames: number of cameras.
+      up: `[3]` up direction in the world; default: `up_direction` of the scene.
+    """
+    cameras = scene.train.cameras
+    positions, rotations = (np.asarray(a, np.float64) for a in (cameras.position, cameras.rotation))
+    forward = rotations[..., 2]
+    center = focus_point(positions, forward, near=scene.near, far=scene.far)
+    up = up_direction(scene) if up is None else _unit(np.asarray(up, np.float64))
+    offset = positions - center
+    height = np.median(offset @ up)
+    flat = offset - (offset @ up)[:, None] * up
+    radius = np.median(np.linalg.norm(flat, axis=1))
+    # Two axes perpendicular to `up`; the first frame is as near as possible to the first view.
+    start = flat[0] if np.linalg.norm(flat[0]) > 1e-6 else np.cross(up, forward[0])
+    east = _unit(start)
+    north = np.cross(up, east)
+    poses = []
+    for angle in np.arange(frames) * (2 * np.pi / frames):
+        position = radius * (np.cos(angle) * east + np.sin(angle) * north) + height * up
+        poses.append(look_at(center + position, center, up))
+    first = scene.camera("train", 0)
+    intrinsics = np.tile(np.asarray(first.intrinsics), (frames, 1))
+    return Shots(_stack(poses, intrinsics, first.height, first.width), _numbered(frames))
+
+
+def focus_point(
+    positions: np.ndarray, forward: np.ndarray, *, near: float, far: float
+) -> np.ndarray:
+    """Return the point `[3]` nearest to all optical axes, in the least-squares sense.
+
+    If the median depth of that point is outside `near` to `far`, return the mean over cameras of
+    the point on the optical axis half-way, in inverse depth, between `near` and `far`.
+
+    Args:
+      positions: `[V, 3]` camera positions.
+      forward: `[V, 3]` viewing directions, of unit length.
+      near: smallest depth that the cameras see.
+      far: largest depth that the cameras see.
+    """
+    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
+    matrix, vector = across.sum(0), np.einsum("vij,vj->i", across, positions)
+    point = np.linalg.lstsq(matrix, vector, rcond=1e-6)[0]
+    depth = np.sum((point - positions) * forward, axis=1)
+    if near <= np.median(depth) <= far:
+        return point
+    middle = 2 / (1 / near + 1 / far)
+    return np.mean(positions + middle * forward, axis=0)
+
+
+def find_view(scene: Scene, name: str) -> int:
+    """Return the index of a training view by its name, with or without file ending.
+
+    Raises:
+      CameraError: no training view has this name.
+    """
+    names = scene.names["train"]
+    for candidate in (name, pathlib.Path(name).stem):
+        if candidate in names:
+            return names.index(candidate)
+    some = ", ".join(names[:3]) + (f" ... {names[-1]}" if len(names) > 3 else "")
+    raise CameraError(f"--from={name} is no training view of {scene.name}: choose one of {some}")
+
+
+def check_pixel(camera: Camera, pixel: tuple[float, float]) -> tuple[int, int]:
+    """Return the row and column of a pixel (x, y) of a camera.
+
+    Raises:
+      CameraError: the pixel is outside the image.
+    """
+    x, y = pixel
+    if not (0 <= x < camera.width and 0 <= y < camera.height):
+        raise CameraError(
+            f"--pixel={x:g},{y:g} is outside the view: choose a pixel within the "
+            f"{camera.width} x {camera.height} pixels that the view was trained with"
+        )
+    return int(y), int(x)
+
+
+def dolly(
+    camera: Camera,
+    pixel: tuple[float, float],
+    depth: float,
+    *,
+    magnification: float,
+    frames: int,
+) -> Shots:
+    """Return cameras that move from a view towards the surface at a pixel, without turning.
+
+    The last camera is `magnification` times nearer to the surface. The surface's apparent size
+    grows by the same factor from each frame to the next. A single frame is the last one.
+
+    Args:
+      camera: camera of the view.
+      pixel: (x, y) of the surface in the view.
+      depth: z-depth of the surface at the pixel.
+      magnification: how many times nearer the last camera is; at least 1.
+      frames: number of cameras.
+    """
+    anchor = pixels_to_points(camera, jnp.asarray(pixel, jnp.float32), jnp.float32(depth))
+    powers = np.linspace(0, 1, frames) if frames > 1 else np.ones(1)
+    poses = []
+    for power in powers:
+        position = closeup_position(anchor, camera.position, magnification**power)
+        poses.append(np.column_stack([camera.rotation, position]))
+    intrinsics = np.tile(np.asarray(camera.intrinsics), (frames, 1))
+    return Shots(_stack(poses, intrinsics, camera.height, camera.width), _numbered(frames))
+
+
+def resized(camera: Camera, width: int | None, height: int | None) -> Camera:
+    """Change the image size of a camera or of stacked cameras; the field of view stays.
+
+    Args:
+      camera: one camera, or stacked cameras.
+      width: new width in pixels; None keeps the aspect ratio.
+      height: new height in pixels; None keeps the aspect ratio.
+
+    Raises:
+      CameraError: such an image does not fit into memory.
+    """
+    if width is None and height is None:
+        return camera
+    if width is None:
+        width = max(1, round(height * camera.width / camera.height))
+    if height is None:
+        height = max(1, round(width * camera.height / camera.width))
+    check_memory(width, height, "--width and --height")
+    x, y = width / camera.width, height / camera.height
+    scale = jnp.array([x, y, x, y], jnp.float32)
+    scale = scale.reshape((1,) * (camera.intrinsics.ndim - 1) + (4,))
+    return camera.replace(intrinsics=camera.intrinsics * scale, height=height, width=width)
+
+
+def check_memory(width: int, height: int, given_by: str) -> None:
+    """Raise before rendering images that would not fit into memory.
+
+    Args:
+      width: of the images, in pixels.
+      height: of the images.
+      given_by: what sets their size, for the message.
+
+    Raises:
+      CameraError: they would not.
+    """
+    needed = _BYTES_PER_PIXEL * width * height
+    if needed > (held := installed_memory()):
+        raise CameraError(
+            f"{given_by}: frames of {width} x {height} pixels need {needed / 2**30:.1f} GiB, but "
+            f"this computer has {held / 2**30:.1f}: choose smaller ones"
+        )
+
+
+def named_cameras(shots: Shots) -> list[tuple[str, Camera]]:
+    """Return each camera with its name."""
+    return [(name, camera_at(shots.cameras, i)) for i, name in enumerate(shots.names)]
+
+
+def _numbered(count: int) -> list[str]:
+    return [f"{i:04d}" for i in range(count)]
+
+
+def _stack(poses: Any, intrinsics: Any, height: int, width: int) -> Camera:
+    return Camera(
+        jnp.asarray(np.stack(poses), jnp.float32),
+        jnp.asarray(intrinsics, jnp.float32),
+        height,
+        width,
+    )
+
+
+def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Return the camera-to-world pose `[3, 4]` at a position that looks at a target.
+
+    Args:
+      position: `[3]` camera position, in the world.
+      target: `[3]` point to look at, in the world.
+      up: `[3]` direction that points up in the image.
+    """
+    forward = _unit(target - position)
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-6:  # looks straight up or down: choose any right
+        right = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
+    right = _unit(right)
+    return np.column_stack([right, np.cross(forward, right), forward, position])
+
+
+def _unit(vector):
+    return vector / max(np.linalg.norm(vector), 1e-12)
+
+
+def _pose(label, entry):
+    if "camera_to_world" not in entry:
+        raise CameraError(f"{label}: camera_to_world is missing: give 16 numbers, by rows")
+    try:
+        matrix = np.array(entry["camera_to_world"], np.float64)
+    except (TypeError, ValueError):
+        matrix = np.zeros(())
+    if matrix.size != 16 or not np.isfinite(matrix).all():
+        raise CameraError(f"{label}: camera_to_world must be 16 finite numbers, by rows")
+    matrix = matrix.reshape(4, 4)
+    if not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
+        raise CameraError(
+            f"{label}: camera_to_world must end in the row 0, 0, 0, 1: it may be transposed"
+        )
+    rotation = matrix[:3, :3]
+    with np.errstate(all="ignore"):
+        error = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if not error <= _RIGID or np.linalg.det(rotation) < 0:
+        raise CameraError(
+            f"{label}: camera_to_world is not a rotation and a position: remove scales and "
+            "reflections"
+        )
+    if np.abs(matrix[:3, 3]).max() > LENGTH:
+        raise CameraError(f"{label}: camera_to_world is more than {LENGTH:g} away: correct it")
+    return np.column_stack([rotation @ OPENGL, matrix[:3, 3]])
+
+
+def _number(label, fields, key):
+    value = fields.get(key)
+    if value is None:
+        raise CameraError(f"{label}: {key} is missing: add it")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise CameraError(f"{label}: {key} must be a finite number, not {value!r}")
+    return float(value)
+
+
+def _size(path, fields, key):
+    value = _number(str(path), fields, key)
+    if not 1 <= value <= _LARGEST or value != int(value):
+        raise CameraError(f"{path}: {key} must be a whole number of pixels, not {value:g}")
+    return int(value)

@@ -1,0 +1,166 @@
+"""Frames of a camera path: color, depth, normals and support as images."""
+
+import pathlib
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+
+from jaxcloseup.app import progress
+from jaxcloseup.app.run.kept_detail import detailed
+from jaxcloseup.app.run.programs import Programs
+from jaxcloseup.app.view.camera_paths import Shots, named_cameras
+from jaxcloseup.artifacts.images import (
+    Image,
+    colorize_depth,
+    colorize_expected_error,
+    colorize_normals,
+    colorize_support,
+    write_png,
+)
+from jaxcloseup.detail.add import Detail
+from jaxcloseup.fields.contract import Rendering
+from jaxcloseup.geometry.cameras import Camera, pixel_grid
+from jaxcloseup.labels.make import LabelSources
+from jaxcloseup.labels.rules import label_depth
+from jaxcloseup.photos.scene import Scene
+from jaxcloseup.photos.support import find_support
+from jaxcloseup.training.steps import TrainState
+
+
+SOLID = 0.5  # opacity of a pixel that shows the scene
+_support = jax.jit(find_support)
+
+
+def render_shots(
+    output_dir: pathlib.Path,
+    programs: Programs,
+    state: TrainState,
+    shots: Shots,
+    *,
+    sources: LabelSources | None,
+    detail: Detail | None = None,
+) -> list[pathlib.Path]:
+    """Write `<kind>/<name>.png` for every camera, and return the folders.
+
+    Args:
+      output_dir: folder for `rgb`, `depth`, `normals` (from fields that render them), `support`,
+        `trust` and `error`.
+      programs: the run's compiled programs.
+      state: the state to render.
+      shots: the cameras.
+      sources: the training photographs with their depths, or None to leave out support.
+      detail: of the state, or None to render the state alone.
+    """
+    scene = programs.scene
+    cameras = named_cameras(shots)
+    # Three frames set the depth colors of all frames, so that videos do not flicker.
+    some = [programs.render(state, cameras[i][1]) for i in {0, len(cameras) // 2, len(cameras) - 1}]
+    limits = depth_range([label_depth(one, near=0, far=scene.far) for one in some], scene)
+    sizes = shots.sizes or [(shots.cameras.width, shots.cameras.height)] * len(cameras)
+    images: dict[str, Image] = {}
+    empty = 0
+
+    def draw(one):
+        (name, camera), size = one
+        seen = programs.render(state, camera)
+        given = {"sources": sources, "detail": detail, "limits": limits, "size": size}
+        images = draw_pictures(programs, seen, camera, **given)
+        return name, images, np.asarray(seen.alpha)[: size[1], : size[0]]
+
+    frames = list(zip(cameras, sizes, strict=True))
+    for name, images, alpha in progress.each(draw, frames, "rendering frames"):
+        empty += not bool(np.any(alpha >= SOLID))
+        for kind, image in images.items():
+            write_png(output_dir / kind / f"{name}.png", image)
+    if empty:
+        which = f"{empty} of {len(cameras)}" if empty < len(cameras) else "all"
+        print(
+            f"{which} frames show nothing of the scene: their cameras look past it, or the path is "
+            "in the coordinates of another program (see --camera_transform)"
+        )
+    return [output_dir / kind for kind in images]
+
+
+def render_pictures(
+    programs: Programs,
+    state: TrainState,
+    camera: Camera,
+    *,
+    sources: LabelSources | None,
+    detail: Detail | None = None,
+) -> dict[str, Image]:
+    """Render one camera's images by kind: `rgb`, `depth`, `normals`, `support`, `trust`, `error`.
+
+    `normals` is missing for fields that render none, and `support` without `sources`. Without
+    `detail` there is neither `trust`, how much of the photographs' detail was added, from black to
+    white, nor `error`, the error that is expected.
+
+    Args:
+      programs: the run's compiled programs.
+      state: the state to render.
+      camera: camera of the images.
+      sources: the training photographs with their depths, or None to leave out support.
+      detail: of the state, or None to render the state alone.
+    """
+    seen = programs.render(state, camera)
+    return draw_pictures(programs, seen, camera, sources=sources, detail=detail)
+
+
+def draw_pictures(
+    programs: Programs,
+    seen: Rendering,
+    camera: Camera,
+    *,
+    sources: LabelSources | None,
+    detail: Detail | None = None,
+    limits: tuple[float, float] | None = None,
+    size: tuple[int, int] | None = None,
+) -> dict[str, Image]:
+    """The images of `render_pictures` from a rendering.
+
+    Args:
+      programs: the run's compiled programs.
+      seen: what they rendered with `camera`.
+      camera: camera of the images.
+      sources: as `render_pictures` takes it.
+      detail: likewise.
+      limits: nearest and farthest depth of the color scale; default: `depth_range` of the image.
+      size: width and height of the images, without the camera's padding at the right and the
+        bottom; default: the camera's.
+    """
+    width, height = size or (camera.width, camera.height)
+
+    def crop(image):
+        return np.asarray(image)[:height, :width]
+
+    scene = programs.scene
+    depth = label_depth(seen, near=0, far=scene.far)
+    near, far = limits or depth_range([depth], scene)
+    solid = crop(seen.alpha) >= SOLID
+    depth_colors = colorize_depth(crop(seen.depth), near=near, far=far, valid=solid)
+    images = {"rgb": crop(seen.rgb), "depth": depth_colors}
+    if seen.normal is not None:
+        images["normals"] = colorize_normals(np.where(solid[..., None], crop(seen.normal), 0))
+    if sources is not None:
+        pixels = pixel_grid(camera.height, camera.width)
+        support = _support(camera, pixels, depth, sources.views, sources.depths)
+        images["support"] = colorize_support(*map(crop, support))
+    if detail is not None:
+        sharper = detailed(programs, detail, camera, seen)
+        images |= {"rgb": crop(sharper.rgb), "trust": crop(sharper.weight)}
+        images["error"] = colorize_expected_error(crop(sharper.error))
+    return images
+
+
+def depth_range(depths: Sequence[jax.Array], scene: Scene) -> tuple[float, float]:
+    """Return the 1st and 99th percentile of the depths; the scene's near and far if all are 0.
+
+    A depth of 0 is undefined and does not count.
+    """
+    known = np.concatenate([np.asarray(depth).ravel() for depth in depths])
+    known = known[known > 0]
+    if not len(known):
+        return scene.near, scene.far
+    low, high = np.percentile(known, [1, 99])
+    return float(low), float(high)

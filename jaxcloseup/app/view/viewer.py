@@ -1,0 +1,207 @@
+"""The run that the visitors of `experiments.view` share, and what they ask of it. Needs Viser."""
+
+import functools
+import pathlib
+import queue
+import time
+import traceback
+from collections.abc import Callable
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcloseup.app.run.fine_tuning import fine_tune, tuned_detail
+from jaxcloseup.app.run.kept_detail import detail_finder
+from jaxcloseup.app.run.loop import TrainingError
+from jaxcloseup.app.run.programs import Programs
+from jaxcloseup.app.run.setup import LabelStart, start_labels
+from jaxcloseup.app.view.camera_paths import focus_point
+from jaxcloseup.app.view.frames import render_pictures
+from jaxcloseup.app.view.orientation import up_direction
+from jaxcloseup.app.view.picking import rank_views, ray_camera
+from jaxcloseup.app.view.server import Server
+from jaxcloseup.artifacts.images import Image, to_uint8
+from jaxcloseup.artifacts.viewer_gaussians import Gaussians
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.labels.rules import label_depth
+from jaxcloseup.photos.support import count_seen_points
+from jaxcloseup.training.steps import TrainState
+
+
+_BUSY = "The viewer is still busy: wait until it has finished, and try again."
+_THUMBNAIL = 80  # width of a photograph's thumbnail, in pixels
+
+_count_seen = jax.jit(count_seen_points)
+
+
+class ViewError(Exception):
+    """A visitor's request cannot be met. The message is one sentence that says what to do."""
+
+
+class Viewer:
+    """The run that all visitors share, and the queue of what they ask for.
+
+    Viser calls back in its own threads. Each callback puts its work into a queue that holds one
+    job, and the main thread runs the job. So only one job runs at a time, and the page never waits.
+    """
+
+    def __init__(
+        self,
+        server: Server,
+        programs: Programs,
+        state: TrainState,
+        *,
+        stage: str,
+        seed: int,
+        kept: pathlib.Path | None = None,
+    ) -> None:
+        """Show the scene on the server's pages; `welcome_visitors` fills them.
+
+        Args:
+          server: Viser's server.
+          programs: the run's compiled programs.
+          state: the state to show; every fine-tuning starts from it.
+          stage: name of the state's stage.
+          seed: the run's seed.
+          kept: file that keeps the state's detail, or None.
+        """
+        self.programs, self.state, self.scene = programs, state, programs.scene
+        self.title = f"{self.scene.name}, {stage}"
+        self._seed, self._find = seed, detail_finder(programs, state, kept)
+        self._jobs: queue.Queue = queue.Queue(maxsize=1)
+        cameras = self.scene.train.cameras
+        positions, rotations = (np.asarray(a) for a in (cameras.position, cameras.rotation))
+        near, far = self.scene.near, self.scene.far
+        center = focus_point(positions, rotations[..., 2], near=near, far=far)
+        self.distance = float(np.median(np.linalg.norm(positions - center, axis=1)))
+        gaps = np.linalg.norm(positions[:, None] - positions, axis=-1)
+        gap = np.median(np.sort(gaps)[:, 1]) if len(gaps) > 1 else np.inf
+        self.size = float(min(0.2 * gap, 0.04 * self.distance)) or 0.01 * self.distance
+        self.thumbnails = [self._thumbnail(i) for i in range(len(positions))]
+        server.scene.set_up_direction(up_direction(self.scene))
+        if programs.method.gaussians is not None:
+            # The background that the run's own renderer uses.
+            background = programs.method.background(programs.preset.field)
+            server.scene.set_background_image(to_uint8(np.full((1, 1), background)))
+        server.gui.set_panel_label(self.title)
+
+    def work(self, timeout: float | None = None) -> None:
+        """Wait for one job, and run it.
+
+        Args:
+          timeout: longest wait in seconds; None waits forever.
+
+        Raises:
+          queue.Empty: no job arrived within `timeout` seconds.
+        """
+        what, job, say = self._jobs.get(timeout=timeout)
+
+        def tell(sentence):
+            say(sentence)
+            print(sentence, flush=True)
+
+        tell(f"{what} ...")
+        start = time.perf_counter()
+        try:
+            tell(f"{job()} ({time.perf_counter() - start:.1f} s)")
+        except (ViewError, TrainingError) as error:
+            tell(str(error))
+        except Exception as error:  # a bug must not end the page for its visitors
+            traceback.print_exc()
+            tell(f"{what} failed ({type(error).__name__}): see the terminal for details.")
+
+    def later(self, what: str, job: Callable[[], str], say: Callable[[str], None]) -> None:
+        """Let the main thread do something.
+
+        Args:
+          what: what that is, in words.
+          job: does it, and returns a sentence.
+          say: shows a sentence to the visitor who asked.
+        """
+        try:
+            self._jobs.put_nowait((what, job, say))
+        except queue.Full:
+            say(_BUSY)
+
+    def _thumbnail(self, index):
+        camera = self.scene.camera("train", index)
+        photograph = to_uint8(self.scene.train.rgb[index, : camera.height, : camera.width])
+        height = max(1, round(_THUMBNAIL * photograph.shape[0] / photograph.shape[1]))
+        return cv2.resize(photograph, (_THUMBNAIL, height), interpolation=cv2.INTER_AREA)
+
+    def find_surface(
+        self, origin: np.ndarray, direction: np.ndarray
+    ) -> tuple[int, np.ndarray, str]:
+        """The first surface along a ray.
+
+        Returns:
+          The photograph that shows it best, the point `[3]`, and how many photographs show it.
+
+        Raises:
+          ViewError: there is none, or no photograph shows it.
+        """
+        views = self.scene.train
+        focal = float(np.median(np.asarray(views.cameras.intrinsics)[:, 1]))
+        ray = ray_camera(origin, direction, focal)
+        seen = label_depth(self.programs.render(self.state, ray), near=0, far=np.inf)
+        depth = float(seen[1, 1])
+        if depth <= 0:
+            raise ViewError("There is no surface at that pixel: click on the scene.")
+        point = np.asarray(ray.position) + depth * np.asarray(ray.rotation)[:, 2]
+        data = (jnp.asarray(a, jnp.float32) for a in (point, direction))
+        ranks = np.asarray(rank_views(views, self.labels.sources.depths, *data))
+        if not ranks.any():
+            raise ViewError("No photograph shows that point: click somewhere else.")
+        shown = f"{np.count_nonzero(ranks)} of {len(ranks)} photographs show that point"
+        return int(ranks.argmax()), point, shown
+
+    def render(
+        self,
+        camera: Camera,
+        *,
+        tuned: bool,
+        detail: bool,
+        say_steps: Callable[[int, int], None],
+    ) -> tuple[dict[str, Image], str]:
+        """Pictures of a camera by kind, and what was done, in words.
+
+        `say_steps` is told how many steps of fine-tuning are done, and how many there are.
+        """
+        start, state = self.labels, self.state
+        cameras = jax.tree.map(lambda leaf: leaf[None], camera)
+        if tuned:
+            same = start.state is self.state
+            find = self._find if same else detail_finder(self.programs, start.state)
+            state = fine_tune(self.programs, start, cameras, find, tell=say_steps)
+        added = self._find()[0] if detail else None
+        if detail and tuned and state is not start.state:
+            added = tuned_detail(self.programs, state, cameras, added)
+        images = render_pictures(self.programs, state, camera, sources=start.sources, detail=added)
+        if tuned and state is start.state:
+            return images, (
+                "The gate let no labels in for this camera, so nothing was fine-tuned; rendered"
+            )
+        return images, "Fine-tuned and rendered" if tuned else "Rendered"
+
+    def drawn(self, position: np.ndarray | None = None) -> Gaussians | None:
+        """The Gaussians that stand for the state, colored as seen from a position `[3]`."""
+        gaussians = self.programs.method.gaussians
+        if gaussians is None:
+            return None
+        return gaussians(self.state.params, self.state.buffers, position)
+
+    @functools.cached_property
+    def counts(self) -> np.ndarray:
+        """How many photographs saw each Gaussian, or each point where there are none."""
+        drawn = self.drawn()
+        points = self.scene.points if drawn is None else drawn.means
+        sources = self.labels.sources
+        return np.asarray(_count_seen(jnp.asarray(points), sources.views, sources.depths))
+
+    @functools.cached_property
+    def labels(self) -> LabelStart:
+        """What fine-tuning and support start from; made once."""
+        expected = self.programs.preset.labels.expected_depth
+        return start_labels(self.programs, self.state, self._seed, expected_depth=expected)

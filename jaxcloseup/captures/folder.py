@@ -1,0 +1,252 @@
+"""Load a capture: the photographs, cameras, points and depth range of one folder."""
+
+import functools
+import logging
+import pathlib
+import warnings
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcloseup.captures.depth_range import near_far_from_cameras, near_far_from_points
+from jaxcloseup.captures.formats import Listing, read_listing
+from jaxcloseup.captures.json_fields import affine_transform, number
+from jaxcloseup.captures.photo_checks import check_sizes, check_weights
+from jaxcloseup.captures.photo_files import pad_images, read_image
+from jaxcloseup.captures.photo_reading import Photo, Reading, read_photos
+from jaxcloseup.captures.scale import LENGTH, check_positions
+from jaxcloseup.captures.splits import unique_names
+from jaxcloseup.captures.triangulation import Triangulated, triangulate
+from jaxcloseup.captures.world_frames import Frame
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.io.messages import printable
+from jaxcloseup.photos.scene import NearFarWarning, Scene, SceneError
+from jaxcloseup.photos.views import Views
+
+
+_UP = (0.0, 0.0, 1.0)
+_MEASURED_SIDE = 800  # pixels of photographs whose features tell how near they are
+_MIN_POINTS = 100  # fewer triangulated points say too little about where the scene is
+
+_log = logging.getLogger(__name__)
+
+
+def load_capture(
+    path: pathlib.Path,
+    reading: Reading,
+    *,
+    format: str | None = None,
+    split: str = "given",
+    photographs: int | None = None,
+) -> Scene:
+    """Load the capture in a folder, as `jaxcloseup.captures.load.load_scene` describes.
+
+    Raises:
+      SceneError: one sentence that names the file and the field and says what to do.
+    """
+    try:
+        if not path.is_dir():
+            raise SceneError(f"{path} is not a folder: give the folder that holds the capture.")
+        listing = read_listing(
+            path,
+            format=format,
+            split=split,
+            zoom=reading.zoom,
+            downscale=reading.downscale,
+            photographs=photographs,
+            find_points=functools.partial(_points_of, reading),
+        )
+    except OSError as error:  # from listing folders; reading a file raises SceneError
+        raise SceneError(
+            f"{error.filename or path!s:.200} cannot be read ({error.strerror}): make it readable, "
+            "or correct its name in the file that lists it."
+        ) from error
+    for note in listing.notes:
+        _log.info(note)
+    scene = _load(listing, reading)
+    scene.metadata.update(path=path, split=split)
+    return scene
+
+
+def _load(listing: Listing, reading: Reading) -> Scene:
+    transform = listing.fields.get("applied_transform")
+    if transform is not None:
+        transform = affine_transform(str(listing.file), "applied_transform", transform)
+        if np.linalg.matrix_rank(transform[:, :3]) < 3:
+            raise SceneError(
+                f"{listing.file}: applied_transform flattens space and has no inverse: correct it."
+            )
+    scale = listing.fields.get("applied_scale", 1.0)
+    scale = number(str(listing.file), "applied_scale", scale, above=0)
+
+    parts = read_photos(listing.frames, reading)
+    photos = [photo for members in parts.values() for photo in members]
+    check_weights(listing.folder, listing.frames, photos, reading)
+    check_sizes(listing.file.parent, photos)
+    intrinsics = np.stack([photo.intrinsics(reading.half_pixel) for photo in photos])
+    camtoworld = np.stack([photo.frame.camtoworld for photo in photos])
+    sizes = np.array([photo.size for photo in photos])
+    if not len(listing.points):
+        listing = _with_points(listing, parts["train"], camtoworld, intrinsics)
+    near, far = _near_far(listing, camtoworld, intrinsics, sizes)
+    check_positions([photo.frame for photo in photos], far=far)
+
+    width, height = sizes.max(0).tolist()
+    ends = np.cumsum([len(members) for members in parts.values()])[:-1]
+    rows = dict(zip(parts, np.split(np.arange(len(photos)), ends), strict=True))
+    views = {
+        split: _padded(part, intrinsics[rows[split]], height, width)
+        for split, part in parts.items()
+    }
+    files = {split: [photo.frame.file for photo in part] for split, part in parts.items()}
+    names = {split: unique_names(paths) for split, paths in files.items()}
+    metadata = {
+        "downscale": reading.downscale,
+        "files": files,
+        "sizes": {split: [photo.size for photo in part] for split, part in parts.items()},
+        "applied_transform": transform,
+        "applied_scale": scale,
+        "up": _UP if _is_oriented(listing) else None,
+        "format": listing.format,
+        "notes": listing.notes,
+    }
+    if listing.errors is not None:
+        metadata["seen"] = [frame.seen for frame in listing.frames["train"]]
+        metadata["point_errors"] = listing.errors
+    if listing.times_nearer is not None:
+        metadata["times_nearer"] = listing.times_nearer
+    if reading.zoom > 1:
+        metadata["corners"] = [photo.corner for photo in parts["test"]]
+        names["test"] = [f"{name}_zoom{reading.zoom}" for name in names["test"]]
+    return Scene(
+        name=printable(listing.folder.resolve().name),
+        train=views["train"],
+        test=views.get("test"),
+        test_far=views.get("test_far"),
+        points=listing.points,
+        rgb=listing.rgb,
+        near=near,
+        far=far,
+        names=names,
+        metadata=metadata,
+        # With a zoom, finer photographs would show the very crops that are held out.
+        photographs_at=None if reading.zoom > 1 else functools.partial(_read_at, listing, reading),
+    )
+
+
+def _is_oriented(listing: Listing) -> bool:
+    """Whether a capture says that z points up.
+
+    Blender's files give an angle of view. `orientation_override: none` tells nerfstudio to keep the
+    orientation, because a phone has measured it.
+    """
+    fields = listing.fields
+    return "camera_angle_x" in fields or fields.get("orientation_override") == "none"
+
+
+def _read_at(
+    listing: Listing, reading: Reading, factor: int, split: str = "train"
+) -> tuple[Views, list[tuple[int, int]]]:
+    """Read the photographs of a split again, at 1 / `factor` of their own size."""
+    frames = [frame._replace(reduced=None) for frame in listing.frames[split]]
+    photos = read_photos({split: frames}, reading._replace(downscale=factor))[split]
+    intrinsics = np.stack([photo.intrinsics(reading.half_pixel) for photo in photos])
+    sizes = [photo.size for photo in photos]
+    width, height = np.array(sizes).max(0).tolist()
+    return _padded(photos, intrinsics, height, width), sizes
+
+
+def _padded(photos: Sequence[Photo], intrinsics: np.ndarray, height: int, width: int) -> Views:
+    """Photographs padded to one size."""
+    poses = np.stack([photo.frame.camtoworld for photo in photos])
+    return Views(
+        cameras=Camera(
+            camtoworld=jnp.asarray(poses, jnp.float32),
+            intrinsics=jnp.asarray(intrinsics, jnp.float32),
+            height=height,
+            width=width,
+        ),
+        rgb=jnp.asarray(pad_images([photo.rgb for photo in photos], height, width)),
+        weight=jnp.asarray(pad_images([photo.mask for photo in photos], height, width)) / 255,
+    )
+
+
+def _with_points(
+    listing: Listing, photos: Sequence[Photo], camtoworld: np.ndarray, intrinsics: np.ndarray
+) -> Listing:
+    """Add points triangulated from the training photographs to a listing without points.
+
+    Args:
+      listing: listing without points.
+      photos: training photographs.
+      camtoworld: `[V, 3, 4]` poses of all photographs, those of `photos` first.
+      intrinsics: `[V, 4]` intrinsics, in the same order.
+    """
+    count = len(photos)  # held-out photographs must not leak into training
+    if count < 2:
+        return listing
+    points, rgb, _ = _triangulate(photos, camtoworld[:count], intrinsics[:count])
+    if len(points) < _MIN_POINTS:
+        return listing
+    note = printable(
+        f"{listing.folder.resolve().name} has no points: {len(points)} were triangulated from "
+        f"features of its {count} training photographs"
+    )
+    _log.info(note)
+    return listing._replace(points=points, rgb=rgb, notes=(*listing.notes, note))
+
+
+def _triangulate(
+    photos: Sequence[Photo], camtoworld: np.ndarray, intrinsics: np.ndarray
+) -> Triangulated:
+    images, masks = [photo.rgb for photo in photos], [photo.mask for photo in photos]
+    return triangulate(images, masks, camtoworld, intrinsics)
+
+
+def _points_of(reading: Reading, frames: Sequence[Frame]) -> tuple[list[Frame], np.ndarray]:
+    """Triangulate points of all photographs, to measure how near each is; see `FindPoints`."""
+    size = frames[0].size or read_image(frames[0].file).shape[1::-1]
+    downscale = max(1, round(max(size) / _MEASURED_SIDE))
+    photos = read_photos({"train": frames}, reading._replace(downscale=downscale, zoom=1))["train"]
+    poses = np.stack([frame.camtoworld for frame in frames])
+    intrinsics = np.stack([photo.intrinsics(reading.half_pixel) for photo in photos])
+    points, _, views = _triangulate(photos, poses, intrinsics)
+    seen = [np.flatnonzero((views == i).any(axis=1)) for i in range(len(frames))]
+    return [frame._replace(seen=s) for frame, s in zip(frames, seen, strict=True)], points
+
+
+def _near_far(
+    listing: Listing,
+    camtoworld: np.ndarray,
+    intrinsics: np.ndarray,
+    sizes: np.ndarray,
+) -> tuple[float, float]:
+    label = str(listing.file)
+    given = {
+        key: number(label, key, listing.fields[key], above=0)
+        for key in ("near", "far")
+        if listing.fields.get(key) is not None
+    }
+    near, far = given.get("near"), given.get("far")
+    if near is None or far is None:
+        estimate = near_far_from_points(listing.points, camtoworld, intrinsics, sizes)
+        source = "points" if estimate else "poses"
+        low, high = estimate or near_far_from_cameras(camtoworld)
+        near, far = near or low, far or high
+        absent = " and ".join(key for key in ("near", "far") if key not in given)
+        if source == "poses" or listing.format != "colmap":  # COLMAP has no such field
+            warnings.warn(
+                f"{label}: no {absent}; estimated near {near:.4g} and far {far:.4g} from the "
+                f"{source}: give both in world units if they do not enclose the scene.",
+                NearFarWarning,
+                stacklevel=2,
+            )
+    if near >= far:
+        raise SceneError(f"{label}: near {near:.4g} is not less than far {far:.4g}: correct them.")
+    if near < 1 / LENGTH or far > LENGTH:
+        raise SceneError(
+            f"{label}: near {near:.4g} and far {far:.4g} must lie between {1 / LENGTH:g} and "
+            f"{LENGTH:g}: correct them."
+        )
+    return near, far

@@ -1,0 +1,145 @@
+"""Decode, downscale and pad photographs and masks."""
+
+import io
+import math
+import pathlib
+import threading
+import warnings
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import PIL.Image
+
+from jaxcloseup.io.files import read_bytes
+from jaxcloseup.photos.scene import SceneError
+
+
+ENDINGS = {".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"}  # of photographs
+MOST_PIXELS = 170_000_000  # a file of 100 kB may claim a billion of them
+_filters = threading.Lock()  # filters of warnings belong to all threads
+
+
+def read_file(path: pathlib.Path) -> np.ndarray:
+    """Read the bytes of an image file as uint8 `[N]`.
+
+    Raises:
+      SceneError: the file is missing, cannot be read, or has more than 1 GiB.
+    """
+    try:
+        # `cv2.imread` fails on non-ASCII paths on some systems; decoding from memory does not.
+        return np.frombuffer(read_bytes(path), np.uint8)
+    except OSError as error:
+        raise SceneError(f"{path} cannot be read ({error.strerror}): restore the file.") from error
+
+
+def read_image(
+    path: pathlib.Path,
+    *,
+    background: float = 1.0,
+    keep_alpha: bool = False,
+    data: np.ndarray | None = None,
+) -> np.ndarray:
+    """Read a photograph as uint8 RGB, `[H, W, 3]`.
+
+    Gray becomes RGB, 16 bits become 8, and transparent pixels are composited over the background.
+    The EXIF orientation is ignored, because cameras refer to the stored pixels.
+
+    Args:
+      path: path of the file.
+      background: gray level in [0, 1] behind transparent pixels.
+      keep_alpha: composite over black, and return alpha as a fourth channel if the file has one.
+      data: bytes of the file, if already read.
+
+    Raises:
+      SceneError: the file is missing, truncated, damaged, not an image of 8 or 16 bits, or has more
+        than `MOST_PIXELS`.
+    """
+    image, alpha = _decode(path, read_file(path) if data is None else data), None
+    if image.ndim == 2:
+        image = image[..., None]
+    if image.shape[-1] in (2, 4):
+        image, alpha = image[..., :-1], image[..., -1:]
+        share, behind = alpha.astype(np.float32) / 255, 0.0 if keep_alpha else 255 * background
+        image = np.rint(image * share + behind * (1 - share)).astype(np.uint8)
+    # OpenCV stores blue first.
+    image = np.repeat(image, 3, -1) if image.shape[-1] == 1 else image[..., ::-1]
+    if keep_alpha and alpha is not None:
+        image = np.concatenate([image, alpha], -1)
+    return np.ascontiguousarray(image)
+
+
+def read_mask(path: pathlib.Path, *, data: np.ndarray | None = None) -> np.ndarray:
+    """Read a mask as uint8 `[H, W]`: white is 255; black and transparent pixels are 0."""
+    return read_image(path, background=0.0, data=data)[..., 0]
+
+
+def downscale_image(image: np.ndarray, factor: int) -> np.ndarray:
+    """Shrink `[H, W, ...]` to `[H // factor, W // factor, ...]` by averaging equal areas."""
+    if factor == 1:
+        return image
+    height, width = (max(1, side // factor) for side in image.shape[:2])
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def pad_images(images: Sequence[np.ndarray], height: int, width: int) -> np.ndarray:
+    """Stack `[h, w, ...]` images into the top left of zeros `[V, height, width, ...]`."""
+    stack = np.zeros((len(images), height, width, *images[0].shape[2:]), images[0].dtype)
+    for target, image in zip(stack, images, strict=True):
+        target[: image.shape[0], : image.shape[1]] = image
+    return stack
+
+
+def _decode(path: pathlib.Path, data: np.ndarray) -> np.ndarray:
+    image, large = None, _pixels(data) > MOST_PIXELS
+    if not large and data.size and not _is_truncated_jpeg(data.tobytes()):
+        try:
+            image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)  # ignores EXIF, keeps alpha and depth
+        except cv2.error as error:
+            large = "MAX_IMAGE" in str(error) or error.code == cv2.Error.StsNoMem
+    if large:
+        raise SceneError(
+            f"{path} has more than {MOST_PIXELS / 10**6:g} megapixels and is too large to decode, "
+            "or its header is damaged: shrink or export it again."
+        )
+    if image is None:
+        raise SceneError(
+            f"{path} is not a readable image or is truncated: copy or export it again."
+        )
+    if image.dtype == np.uint16:
+        image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    if image.dtype != np.uint8:
+        raise SceneError(
+            f"{path} holds {image.dtype} values: export it with 8 or 16 bits per channel."
+        )
+    return image
+
+
+def _pixels(data: np.ndarray) -> float:
+    """Number of pixels that an image's header claims; 0 for formats that Pillow does not know."""
+    try:
+        # Pillow warns of many pixels too, and of fields that do not matter here.
+        with _filters, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with PIL.Image.open(io.BytesIO(data)) as image:
+                return math.prod(image.size)
+    except PIL.Image.DecompressionBombError:
+        return math.inf
+    except Exception:  # OpenCV tells what is wrong
+        return 0
+
+
+def _is_truncated_jpeg(data: bytes) -> bool:
+    """Whether a JPEG ends before its end marker; some decoders silently fill the rest with gray.
+
+    The search skips the segments before the scan, since a thumbnail in one of them has its own end
+    marker. Inside the scan, ff d9 is always the end marker.
+    """
+    if not data.startswith(b"\xff\xd8"):
+        return False
+    position = 2
+    while position + 4 <= len(data) and data[position] == 0xFF:
+        if data[position + 1] == 0xDA:
+            return b"\xff\xd9" not in data[position:]
+        position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
+    return True

@@ -1,0 +1,134 @@
+"""Find masks by name, in a folder `masks/` or beside their photographs.
+
+The mask of `images/a.jpg` is the first that exists of `masks/a.jpg.png` (COLMAP's name),
+`masks/a.mask.png`, `masks/a` with any image suffix, `images/a.jpg.png` and `images/a.mask.png`.
+White pixels are kept and black ones are ignored. `masks` mirrors the subfolders of `images`.
+"""
+
+import collections
+import functools
+import pathlib
+from collections.abc import Iterator, Sequence
+
+from jaxcloseup.captures.world_frames import Frame
+from jaxcloseup.photos.scene import SceneError
+
+
+FOLDER = "masks"
+# The full name comes first, because it tells the masks of a.jpg and a.png apart.
+_BESIDE = ("{name}", "{stem}.mask")
+_IN_FOLDER = (*_BESIDE, "{stem}")
+_PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+
+
+def is_picture(path: pathlib.Path) -> bool:
+    """Whether a file has an image's name; hidden files such as macOS's `._a.jpg` do not."""
+    return path.suffix.lower() in _PICTURES and not path.name.startswith(".")
+
+
+def list_photographs(folder: pathlib.Path) -> list[pathlib.Path]:
+    """List the images in a folder, sorted, except those that are masks of other images there."""
+    pictures, by_stem = list_pictures(folder), _by_stem(folder)
+    masks = {_find(by_stem, picture, _BESIDE) for picture in pictures}
+    return [picture for picture in pictures if picture not in masks]
+
+
+def attach_masks(
+    folder: pathlib.Path, splits: dict[str, list[Frame]]
+) -> tuple[dict[str, list[Frame]], tuple[str, ...]]:
+    """Attach the masks found by name to the frames, and note how many photographs have one.
+
+    Args:
+      folder: folder of the capture; every folder between it and a photograph may hold `masks/`.
+      splits: frames by split; a frame that names its own mask keeps it.
+
+    Raises:
+      SceneError: a folder `masks/` fits no photograph, or several photographs share a mask.
+    """
+    every = [frame for frames in splits.values() for frame in frames]
+    waiting = list({frame.file: frame for frame in every if frame.mask is None}.values())
+    places = {frame.file: list(_places(folder, frame.file)) for frame in waiting}
+    holders = sorted({holder for found in places.values() for holder, _ in found})
+    pictures = functools.cache(_by_stem)  # list each folder once
+    found = {}
+    for file, around in places.items():
+        masks = (_find(pictures(place), file, _IN_FOLDER) for _, place in around)
+        found[file] = next((mask for mask in masks if mask), None)
+    listed = {frame.file for frame in every}
+    total = len(listed)
+    if holders and not any(found.values()) and len(waiting) == total:
+        stem, name = waiting[0].file.stem, waiting[0].file.name
+        raise SceneError(
+            f"{holders[0]} holds no mask for any of the {total} photographs: for {name}, name the "
+            f"mask {name}.png, {stem}.mask.png or {stem} with an image suffix, or rename the "
+            "folder if it holds something else."
+        )
+    for file in found:
+        beside = _find(pictures(file.parent), file, _BESIDE)
+        found[file] = found[file] or (None if beside in listed else beside)
+    masked = [file for file, mask in found.items() if mask]
+    if not holders and not masked:
+        return splits, ()
+    _check_shared({file: found[file] for file in masked})
+    count = len(masked) + total - len(waiting)
+    note = f"{folder.resolve().name}: {count} of {total} photographs have a mask"
+    if count < total:
+        note += "; the others are used whole"
+    return {
+        split: [frame._replace(mask=frame.mask or found[frame.file]) for frame in frames]
+        for split, frames in splits.items()
+    }, (note,)
+
+
+def _places(
+    folder: pathlib.Path, photograph: pathlib.Path
+) -> Iterator[tuple[pathlib.Path, pathlib.Path]]:
+    """Yield the `masks/` folders around a photograph, each with the subfolder for its mask."""
+    around = list(photograph.parents)
+    # Photographs may lie outside the capture's folder; then their two nearest folders count.
+    around = around[: around.index(folder) + 1] if folder in around else around[:2]
+    for root in around:
+        if (root / FOLDER).is_dir():
+            # A file may list ../images/a.jpg, but masks/../images holds no masks.
+            inner = [part for part in photograph.parent.relative_to(root).parts if part != ".."]
+            yield root / FOLDER, root.joinpath(FOLDER, *inner)
+            if inner:  # masks/ beside images/ may leave out the name images
+                yield root / FOLDER, root.joinpath(FOLDER, *inner[1:])
+
+
+def list_pictures(folder: pathlib.Path) -> tuple[pathlib.Path, ...]:
+    """List the images in a folder, sorted; empty if the folder does not exist."""
+    try:
+        return tuple(
+            sorted(path for path in folder.iterdir() if is_picture(path)) if folder.is_dir() else ()
+        )
+    except OSError as error:
+        raise SceneError(
+            f"{folder} cannot be listed ({error.strerror}): make it readable."
+        ) from error
+
+
+def _by_stem(folder: pathlib.Path) -> dict[str, pathlib.Path]:
+    """Map stems to the images in a folder; the first image wins a shared stem."""
+    return {path.stem: path for path in reversed(list_pictures(folder))}
+
+
+def _find(
+    pictures: dict[str, pathlib.Path], photograph: pathlib.Path, stems: Sequence[str]
+) -> pathlib.Path | None:
+    """Find the first image that matches a stem pattern of `{name}` and `{stem}`."""
+    wanted = [stem.format(name=photograph.name, stem=photograph.stem) for stem in stems]
+    return next((pictures[stem] for stem in wanted if stem in pictures), None)
+
+
+def _check_shared(found: dict[pathlib.Path, pathlib.Path]) -> None:
+    """Raise if photographs share a mask, such as `a.jpg` and `a.png`."""
+    owners = collections.defaultdict(list)
+    for file, mask in found.items():
+        owners[mask].append(file)
+    for mask, (first, *others) in owners.items():
+        if others:
+            raise SceneError(
+                f"{mask} matches both {first} and {others[0]}: name each mask after its "
+                f"photograph, such as {first.name}.png, in a subfolder of the same name."
+            )

@@ -1,0 +1,102 @@
+"""`Frame`: the files, camera and lens of a photograph that is not decoded yet."""
+
+import math
+import pathlib
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxcloseup.captures.distortion import Distortion
+from jaxcloseup.captures.json_fields import number
+from jaxcloseup.photos.scene import SceneError
+
+
+class Frame(NamedTuple):
+    """A listed photograph that is not decoded yet.
+
+    Attributes:
+      source: file that lists the photograph.
+      listed: path of the photograph as written in `source`.
+      file: path of the image.
+      mask: path of the mask, or None.
+      camtoworld: `[3, 4]` float64 OpenCV pose.
+      size: (width, height) that the intrinsics refer to; None means the image's own size.
+      lens: lens fields of this frame, then those of the whole file.
+      distortion: lens distortion, or None for a pinhole.
+      seen: indices of the capture's points that the photograph shows; None if the format does not
+        tell.
+      reduced: path of an already shrunk copy to read instead of `file`, or None.
+    """
+
+    source: pathlib.Path
+    listed: str
+    file: pathlib.Path
+    mask: pathlib.Path | None
+    camtoworld: np.ndarray
+    size: tuple[int, int] | None
+    lens: tuple[dict[str, Any], dict[str, Any]]
+    distortion: Distortion | None = None
+    seen: np.ndarray | None = None
+    reduced: pathlib.Path | None = None
+
+    @property
+    def label(self) -> str:
+        """Name of the frame in error messages."""
+        return f"{self.source}: frame {self.listed!r}"
+
+
+def frame_intrinsics(
+    frame: Frame, width: int, height: int, *, half_pixel: bool = False
+) -> np.ndarray:
+    """Compute fx, fy, cx, cy `[4]` float64 in pixels of an image of `width` x `height`.
+
+    Focal lengths win over angles of view, and a frame's own fields win over the file's. By default
+    pixels are square and the principal point is the middle of the image. `half_pixel` is for files
+    with integer pixel centers: it adds 0.5 to the principal point that they give.
+
+    Raises:
+      SceneError: a field is wrong, or no field gives a focal length.
+    """
+    for lens in frame.lens:
+        focal = _focal(frame.label, lens, width, height)
+        if focal:
+            break
+    else:
+        raise SceneError(f"{frame.label}: no focal length: give fl_x (or fx) or camera_angle_x.")
+    lens = {**frame.lens[1], **frame.lens[0]}
+    center = [
+        number(frame.label, key, lens[key]) + 0.5 * half_pixel if key in lens else side / 2
+        for key, side in (("cx", width), ("cy", height))
+    ]
+    return np.array([*focal, *center])
+
+
+def check_photographs(path: pathlib.Path, frames: Sequence[Frame]) -> None:
+    """Raise one `SceneError` for all photographs that `path` lists but that do not exist."""
+    missing = [frame.listed for frame in frames if not frame.file.is_file()]
+    if missing:
+        first = ", ".join(missing[:3]) + (", ..." if len(missing) > 3 else "")
+        raise SceneError(
+            f"{path}: {len(missing)} of {len(frames)} listed images do not exist ({first}): "
+            "restore them or remove their frames."
+        )
+
+
+def _focal(label: str, lens: dict[str, Any], width: int, height: int) -> tuple[float, float] | None:
+    def one(keys: tuple[str, str], angle: str, side: int) -> float | None:
+        for key in keys:
+            if key in lens:
+                return number(label, key, lens[key], above=0)
+        if angle not in lens:
+            return None
+        radians = number(label, angle, lens[angle], above=0)
+        if radians >= math.pi:
+            raise SceneError(f"{label}: {angle} must be in radians, below pi, got {radians}.")
+        return side / 2 / math.tan(radians / 2)
+
+    x = one(("fx", "fl_x"), "camera_angle_x", width)
+    y = one(("fy", "fl_y"), "camera_angle_y", height)
+    if x is None and y is None:
+        return None
+    return (y if x is None else x), (x if y is None else y)

@@ -1,0 +1,228 @@
+"""Adaptive density control (Kerbl et al. 2023) for 2-D Gaussian splatting, at fixed capacity.
+
+Where the loss has a large gradient with respect to a surfel's image, the scene needs more surfels:
+small surfels are cloned, large ones split in two. Faint and huge surfels are removed, and all
+opacities are lowered now and then, so that needless surfels fade. New surfels take free rows; when
+rows run out, the surfels with the largest gradient come first.
+
+Two things differ from the published code: the gradient includes the shares of the low-pass filter
+and of view-dependent color, and views in which it is 0 do not count.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from jaxcloseup.fields.splats.control import DensityControl, is_due, replace_surfels
+from jaxcloseup.fields.splats.surfels import Surfels
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.geometry.numerics import matmul, safe_norm
+from jaxcloseup.geometry.rotations import quaternion_to_matrix
+
+
+@dataclasses.dataclass(frozen=True)
+class AdaptiveConfig:
+    """When surfels are added and removed; lengths are in extents of the capture.
+
+    Attributes:
+      every: steps between refinements.
+      start: the first refinement comes after this step.
+      stop: the last refinement and the last reset come before this step.
+      gradient: a surfel is cloned or split where its mean 2-D gradient is at least this: the norm
+        of the loss's gradient with respect to the image of its center, in units of half an image,
+        averaged over the views in which it is not 0.
+      small: a surfel up to this scale is cloned; a larger one is split.
+      shrink: factor by which the halves of a split surfel are smaller.
+      min_opacity: fainter surfels are removed.
+      huge: larger surfels are removed after the first reset, unless they are split.
+      reset_every: steps between resets of the opacities.
+      reset_opacity: largest opacity after a reset.
+    """
+
+    every: int = 100
+    start: int = 500
+    stop: int = 15_000
+    gradient: float = 2e-4
+    small: float = 0.01
+    shrink: float = 1.6
+    min_opacity: float = 0.05
+    huge: float = 0.1
+    reset_every: int = 3000
+    reset_opacity: float = 0.01
+
+
+@struct.dataclass
+class OffsetSurfels(Surfels):
+    """Surfels with an image-plane offset: a parameter that stays 0 and whose gradient is recorded.
+
+    Attributes:
+      image_offset: `[N, 2]` shift of the center's image (x, y) in units of half an image: a shift
+        from -1 to 1 crosses the whole image.
+    """
+
+    image_offset: jax.Array
+
+
+class ImageGradientState(struct.PyTreeNode):
+    """The 2-D gradient that surfels accumulated since the last refinement.
+
+    Attributes:
+      total: `[N]` sum of the norms of the image offset's gradient.
+      views: `[N]` number of views in which that gradient was not 0.
+    """
+
+    total: jax.Array
+    views: jax.Array
+
+
+def adaptive_control(
+    config: AdaptiveConfig, *, extent: float, means_lr: Callable[[jax.Array], jax.Array]
+) -> DensityControl:
+    """Refinement and resets of opacity when they are due; see `density_control`.
+
+    The wrapped optimizer's state must start with that of `optax.scale_by_adam`.
+    """
+    del means_lr
+
+    def wrap_optimizer(optimizer):
+        return optax.chain(record_image_gradients(), optimizer)
+
+    def adapt(key, state):
+        due = is_due(state.step, every=config.every, start=config.start, stop=config.stop)
+        reset_due = is_due(state.step, every=config.reset_every, start=0, stop=config.stop)
+        state = jax.lax.cond(
+            due, lambda state: _refine(key, state, config, extent), lambda state: state, state
+        )
+        return jax.lax.cond(
+            reset_due, lambda state: _reset(state, config), lambda state: state, state
+        )
+
+    return DensityControl(with_image_offset, wrap_optimizer, apply_image_offset, adapt)
+
+
+def with_image_offset(surfels: Surfels) -> OffsetSurfels:
+    """The same surfels with an image-plane offset of 0."""
+    leaves = {f.name: getattr(surfels, f.name) for f in dataclasses.fields(Surfels)}
+    return OffsetSurfels(**leaves, image_offset=jnp.zeros_like(surfels.means[:, :2]))
+
+
+def apply_image_offset(surfels: OffsetSurfels, camera: Camera) -> OffsetSurfels:
+    """Shift surfels parallel to the image plane by their image offset.
+
+    The offset is 0, so the surfels stay in place, but the loss has a gradient with respect to it.
+    """
+    offset = jax.lax.stop_gradient(surfels.means) - camera.position[None]
+    depth = matmul(offset, camera.rotation)[:, 2:]
+    half_image = jnp.array([[camera.width / 2, camera.height / 2]], depth.dtype)
+    moved = surfels.image_offset * half_image * depth / camera.intrinsics[None, :2]
+    return surfels.replace(means=surfels.means + matmul(moved, camera.rotation[:, :2].T))
+
+
+def record_image_gradients() -> optax.GradientTransformation:
+    """Accumulate the image offset's gradient in the optimizer's state; leave updates unchanged."""
+
+    def init(params):
+        zeros = jnp.zeros(params.image_offset.shape[0], params.image_offset.dtype)
+        return ImageGradientState(zeros, zeros)
+
+    def update(updates, state, params=None):
+        del params
+        norm = safe_norm(updates.image_offset)
+        return updates, ImageGradientState(state.total + norm, state.views + (norm > 0))
+
+    return optax.GradientTransformation(init, update)
+
+
+def refine(
+    key: jax.Array,
+    surfels: OffsetSurfels,
+    alive: jax.Array,
+    gradients: ImageGradientState,
+    config: AdaptiveConfig,
+    *,
+    extent: float,
+    remove_huge: jax.Array,
+) -> tuple[OffsetSurfels, jax.Array, jax.Array]:
+    """Clone, split and remove surfels.
+
+    A clone is an exact copy. Two surfels replace a split one; their centers are drawn from its
+    Gaussian in its plane or in space and their scales are smaller by `config.shrink`.
+
+    Args:
+      key: random key; consumed.
+      surfels: `N` surfels.
+      alive: `[N]` bool.
+      gradients: the 2-D gradients accumulated since the last refinement.
+      config: static.
+      extent: size of the capture in world units.
+      remove_huge: `[]` bool, whether surfels larger than `config.huge` are removed.
+
+    Returns:
+      Surfels, `alive [N]`, and `[N]` bool, True where a surfel is new and the optimizer must forget
+      its row.
+    """
+    count = alive.shape[0]
+    scale = jnp.max(jnp.exp(surfels.log_scales), axis=-1) / extent
+    mean_gradient = gradients.total / jnp.maximum(gradients.views, 1)
+    opaque = alive & (jax.nn.sigmoid(surfels.opacity_logits) >= config.min_opacity)
+    wanted = opaque & (mean_gradient >= config.gradient)
+    keep = opaque & (wanted | ~(remove_huge & (scale > config.huge)))
+    strongest = jnp.argsort(jnp.where(wanted, -mean_gradient, 1), stable=True)
+    room = jnp.argsort(keep, stable=True)
+    number = jnp.minimum(jnp.sum(wanted), jnp.sum(~keep))
+    granted = jnp.arange(count) < number
+    place = jnp.where(granted, room, count)  # `count` is out of bounds, so the update is dropped
+    source = jnp.arange(count).at[place].set(strongest, mode="drop")
+    added = jnp.zeros(count, bool).at[place].set(True, mode="drop")
+    parent = jnp.zeros(count, bool).at[jnp.where(granted, strongest, count)].set(True, mode="drop")
+
+    split = (parent | added) & (scale[source] > config.small)
+    surfels = jax.tree.map(lambda leaf: leaf[source], surfels)
+    shape = surfels.log_scales.shape
+    step = jax.random.normal(key, shape, surfels.means.dtype) * jnp.exp(surfels.log_scales)
+    axes = quaternion_to_matrix(surfels.quaternions)[..., : shape[1]]
+    moved = surfels.means + jnp.sum(axes * step[:, None], axis=-1)
+    surfels = surfels.replace(
+        means=jnp.where(split[:, None], moved, surfels.means),
+        log_scales=surfels.log_scales - jnp.where(split, jnp.log(config.shrink), 0)[:, None],
+    )
+    return surfels, keep | added, added | split
+
+
+def reset_opacities(surfels: OffsetSurfels, config: AdaptiveConfig) -> OffsetSurfels:
+    """Surfels whose opacities are at most `config.reset_opacity`."""
+    most = jnp.log(config.reset_opacity / (1 - config.reset_opacity))
+    return surfels.replace(opacity_logits=jnp.minimum(surfels.opacity_logits, most))
+
+
+def _refine(key, state, config, extent):
+    """A state whose surfels are refined and whose 2-D gradients accumulate anew."""
+    gradients, adam = state.opt_state
+    refined = refine(
+        key,
+        state.params,
+        state.buffers.alive,
+        gradients,
+        config,
+        extent=extent,
+        remove_huge=state.step > config.reset_every,
+    )
+    zeros = jax.tree.map(jnp.zeros_like, gradients)
+    return replace_surfels(state.replace(opt_state=(zeros, adam)), *refined)
+
+
+def _reset(state, config):
+    """A state whose opacities are reset, with Adam's moments of the opacities."""
+    gradients, (moments, *others) = state.opt_state
+    mu, nu = (
+        moment.replace(opacity_logits=jnp.zeros_like(moment.opacity_logits))
+        for moment in (moments.mu, moments.nu)
+    )
+    return state.replace(
+        params=reset_opacities(state.params, config),
+        opt_state=(gradients, (moments._replace(mu=mu, nu=nu), *others)),
+    )

@@ -1,0 +1,101 @@
+"""Volumetric Gaussians to ellipses and their boxes, for one camera: EWA splatting (Zwicker 2001).
+
+A Gaussian of covariance S, in the camera's frame, has in the image about the covariance J S J^T,
+with the derivative J of the projection at its center (Kerbl et al. 2023). Its depth is that of its
+center. So it is a footprint of constant inverse depth: with the Cholesky factor L of the ellipse,
+(u, v) = L^-1 (q - center).
+"""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxcloseup.fields.splats.filters import widen_ellipse
+from jaxcloseup.fields.splats.projection import Discs
+from jaxcloseup.fields.splats.rasterize import Footprints
+from jaxcloseup.fields.splats.splat_math import ALPHA_MIN
+from jaxcloseup.geometry.cameras import Camera
+
+
+_BEYOND = 0.15  # of an image's size, outside of which J no longer follows a center
+
+
+def project_ellipsoids(
+    ellipsoids: Discs,
+    opacity: jax.Array,
+    payload: jax.Array,
+    camera: Camera,
+    *,
+    near: float,
+    antialias: bool = False,
+) -> Footprints:
+    """Ellipses of volumetric Gaussians; invisible ones get opacity 0 and an empty box.
+
+    Args:
+      ellipsoids: `N` of them in the frame of `camera`, with three scales.
+      opacity: `[N]` in [0, 1].
+      payload: `[F, N]` values to blend.
+      camera: one camera; only its intrinsics and image size are used.
+      near: positive z-depth; a Gaussian whose center is nearer is not drawn.
+      antialias: filter of the ellipses, see `widen_ellipse`.
+
+    Raises:
+      ValueError: `near` is not positive.
+    """
+    if near <= 0:
+        raise ValueError(f"near must be a positive depth, not {near}")
+    focal, principal = camera.intrinsics[:2], camera.intrinsics[2:]
+    depth = ellipsoids.center[2]
+    ahead = depth > near
+    inverse_depth = 1 / jnp.where(ahead, depth, 1)
+    slopes = [ellipsoids.center[i] * inverse_depth for i in range(2)]
+    center = [slopes[i] * focal[i] + principal[i] for i in range(2)]
+    axes = [
+        tuple(scale * component for component in axis)
+        for scale, axis in zip(ellipsoids.scales, ellipsoids[1:4], strict=True)
+    ]
+    # The rows of J times the semi-axes.
+    x, y = (
+        tuple(focal[i] * inverse_depth * (axis[i] - slope * axis[2]) for axis in axes)
+        for i, slope in enumerate(bounded_slopes(slopes, camera))
+    )
+    (first, below, second), kept = widen_ellipse(x, y, antialias=antialias)
+    opacity = opacity * kept
+    none = jnp.zeros_like(depth)
+    homography = [
+        [none, inverse_depth / first, none],
+        [none, -inverse_depth * below / (first * second), inverse_depth / second],
+        [inverse_depth, none, none],
+    ]
+
+    # The box has no derivative.
+    opacity_now, middle, half = lax.stop_gradient((opacity, center, (first, (below, second))))
+    cutoff = jnp.sqrt(2 * jnp.log(jnp.maximum(opacity_now / ALPHA_MIN, 1)))
+    # The margin keeps pixels that only just reach the cutoff in spite of rounding.
+    half = [1.001 * cutoff * size + 0.01 for size in (half[0], jnp.hypot(*half[1]))]
+    box = [*(at - to for at, to in zip(middle, half, strict=True))]
+    box += [at + to for at, to in zip(middle, half, strict=True)]
+    drawn = ahead & (opacity_now >= ALPHA_MIN)
+    return Footprints(
+        anchor=jnp.stack(center),
+        homography=jnp.stack([jnp.stack(row) for row in homography]),
+        opacity=jnp.where(drawn, opacity, 0),
+        low_pass=jnp.full_like(depth, 1e9),
+        inverse_depth=jnp.stack([inverse_depth, inverse_depth]),
+        payload=payload,
+        order=jnp.maximum(lax.stop_gradient(depth), near),
+        box=jnp.where(drawn[None], jnp.stack(box), -1),
+    )
+
+
+def bounded_slopes(slopes: list[jax.Array], camera: Camera) -> list[jax.Array]:
+    """x / z and y / z at which J is taken: at most those a little outside of the image.
+
+    As published, for a principal point anywhere: beside the camera, J grows without bound.
+    """
+    bounded = []
+    for i, (slope, size) in enumerate(zip(slopes, (camera.width, camera.height), strict=True)):
+        focal, principal = camera.intrinsics[i], camera.intrinsics[2 + i]
+        low, high = -_BEYOND * size - principal, (1 + _BEYOND) * size - principal
+        bounded.append(jnp.clip(slope, low / focal, high / focal))
+    return bounded

@@ -1,0 +1,128 @@
+"""Filters that suit splats to what is sampled: in images the pixel, in space the finest photograph.
+
+A renderer samples at the centers of pixels, so a splat smaller than a pixel would show by chance.
+Each kind of splat has two filters in the image: the published one, which draws it larger than it is
+and as bright, and a convolution with the pixel, which keeps its light. The filter in space, the 3-D
+smoothing filter of Mip-Splatting (Yu et al. 2024), bounds how small a splat is: no photograph shows
+more than its pixels, and a close-up would show what was left to chance.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxcloseup.fields.splats.surfels import Surfels
+from jaxcloseup.fields.splats.vectors import cross, dot, scaled
+from jaxcloseup.geometry.cameras import Camera, mean_focal, points_to_pixels
+from jaxcloseup.geometry.masks import in_bounds
+
+
+LOW_PASS = 2.0  # 1/px^2: no disc is drawn smaller than a Gaussian of sigma = sqrt(1/2) pixel
+PIXEL_VARIANCE = 1 / 12  # px^2, along each side of a square pixel
+DILATION = 0.3  # px^2, by which published 3-D Gaussians grow in the image
+MIP_VARIANCE = 0.1  # px^2, of Mip-Splatting's 2-D filter
+SMOOTHING_VARIANCE = 0.2  # squared sampling intervals, of its 3-D filter
+_SEEN_BEYOND = 0.15  # of an image's size, by which a center outside of it still counts as seen
+
+
+def pixel_spread(homography, depth, known):
+    """Cholesky factor (l11, l21, l22) of I + s^2 J J^T of each disc; the identity if not known.
+
+    J is the derivative of (u, v) by the pixel at the disc's center, and s^2 a pixel's variance.
+    """
+    (ux, uy), (vx, vy) = (
+        [jnp.where(known, depth * slope, 0) for slope in row[1:]] for row in homography[:2]
+    )
+    uu, uv, vv = (
+        PIXEL_VARIANCE * sums for sums in (ux * ux + uy * uy, ux * vx + uy * vy, vx * vx + vy * vy)
+    )
+    first = jnp.sqrt(1 + uu)
+    below = uv / first
+    # 1 + vv - below^2, without taking large numbers from each other.
+    cross = PIXEL_VARIANCE * (ux * vy - vx * uy)
+    second = jnp.sqrt((1 + uu + vv + cross * cross) / (1 + uu))
+    return first, below, second
+
+
+def widen(homography, vectors, spread):
+    """Homography and vectors of discs whose covariance of (u, v) is L L^T."""
+    first, below, second = spread
+    u = scaled(1 / first, homography[0])
+    v = tuple((b - below * a) / second for a, b in zip(u, homography[1], strict=True))
+    one, other = vectors
+    one = tuple(first * a + below * b for a, b in zip(one, other, strict=True))
+    return (u, v, homography[2]), (one, scaled(second, other))
+
+
+def widen_ellipse(x, y, *, antialias: bool):
+    """Ellipses in the image, with a filter.
+
+    Args:
+      x: the displacement in x, in pixels, by each of an ellipsoid's semi-axes: three of `[N]`.
+      y: the displacement in y. Without a filter, x.x, x.y and y.y are the covariance.
+      antialias: convolve with Mip-Splatting's 2-D filter, which keeps the light; without it, dilate
+        as published.
+
+    Returns:
+      Cholesky factor (l11, l21, l22) of the covariance, and the factor on the opacity.
+    """
+    variance = MIP_VARIANCE if antialias else DILATION
+    first = jnp.sqrt(dot(x, x) + variance)
+    # Divided by l11 already, so that no product of four large numbers is taken.
+    x, per_first = scaled(1 / first, x), variance / (first * first)
+    below = dot(x, y)
+    across = cross(x, y)
+    area = dot(across, across)  # squared, of the ellipse without filter, by l11
+    # y.y + variance - below^2, without taking large numbers from each other.
+    second = jnp.sqrt(variance + area + per_first * dot(y, y))
+    if not antialias:
+        return (first, below, second), 1.0
+    flat = area == 0
+    return (first, below, second), jnp.where(flat, 0, jnp.sqrt(jnp.where(flat, 1, area))) / second
+
+
+def sampling_intervals(means: jax.Array, cameras: Camera, *, near: float) -> jax.Array:
+    """Distance `[N]` between neighboring pixels of the photograph that shows each point finest.
+
+    That is the least z / f (Mip-Splatting, equation 6), whether or not something hides the point.
+    A point that no photograph shows gets the largest distance of the others.
+
+    Args:
+      means: `[N, 3]` world points.
+      cameras: stacked `[V]`, of photographs.
+      near: z-depth before which a photograph shows nothing.
+    """
+
+    def least(found, camera):
+        pixels, depth = points_to_pixels(camera, means)
+        margin = jnp.array([[camera.width, camera.height]], pixels.dtype) * _SEEN_BEYOND
+        wide = jnp.array([1 + 2 * _SEEN_BEYOND], pixels.dtype)[None]
+        inside = in_bounds((pixels + margin) / wide, camera.height, camera.width)
+        interval = depth / mean_focal(camera.intrinsics)
+        return jnp.where(inside & (depth > near), jnp.minimum(found, interval), found), None
+
+    nowhere = jnp.full(means.shape[0], jnp.inf, means.dtype)
+    found, _ = lax.scan(least, nowhere, cameras)
+    seen = jnp.isfinite(found)
+    return jnp.where(seen, found, jnp.max(jnp.where(seen, found, 0)))
+
+
+def smoothed(surfels: Surfels, interval: jax.Array | None) -> Surfels:
+    """Splats convolved in space with a Gaussian of `SMOOTHING_VARIANCE` squared intervals.
+
+    Each keeps its integral, over the plane of a disc or over space: scales grow and the opacity
+    falls (Mip-Splatting, equation 9).
+
+    Args:
+      surfels: `N` splats.
+      interval: `[N]` from `sampling_intervals`, which gets no gradient; None changes nothing.
+    """
+    if interval is None:
+        return surfels
+    variance = lax.stop_gradient(jnp.maximum(SMOOTHING_VARIANCE * interval**2, 1e-30))
+    log_scales = 0.5 * jnp.logaddexp(2 * surfels.log_scales, jnp.log(variance)[:, None])
+    kept = jnp.exp(jnp.sum(surfels.log_scales - log_scales, axis=-1))
+    opacity = jnp.clip(jax.nn.sigmoid(surfels.opacity_logits) * kept, 1e-10, 1 - 1e-6)
+    return surfels.replace(
+        log_scales=log_scales, opacity_logits=jnp.log(opacity) - jnp.log1p(-opacity)
+    )

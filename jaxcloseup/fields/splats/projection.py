@@ -1,0 +1,246 @@
+"""Surfels to planar homographies and exact boxes, for one camera.
+
+A pixel's ray r, with r_z = 1, meets a disc with center mu, unit tangents t_u, t_v, normal
+n = t_u x t_v and radii s_u, s_v at depth z with local coordinates (u, v). The three quantities
+
+    u / z = r.(t_v x mu) / (s_u n.mu),    v / z = r.(mu x t_u) / (s_v n.mu),    1 / z = r.n / n.mu
+
+are affine in the pixel: they are the rows of `Footprints.homography`, taken about the projected
+center, where they are (0, 0, 1 / mu_z) without rounding.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxcloseup.fields.splats.filters import LOW_PASS, pixel_spread, widen
+from jaxcloseup.fields.splats.rasterize import Footprints
+from jaxcloseup.fields.splats.splat_math import ALPHA_MIN
+from jaxcloseup.fields.splats.surfels import Surfels
+from jaxcloseup.fields.splats.vectors import Vector, cross, dot, scaled
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.geometry.rotations import quaternion_rows
+
+
+EDGE_ON = 1e-4  # |cos| between normal and line of sight below which a disc is not drawn
+MAX_LOG_SCALE = 30.0  # beyond it, products of scales leave the range of float32
+
+
+class Discs(NamedTuple):
+    """`N` discs, or ellipsoids, in one camera's frame, in world units.
+
+    Attributes:
+      center: centers.
+      tangent_u: first unit tangents.
+      tangent_v: second unit tangents.
+      normal: unit normals.
+      scales: standard deviations `[N]` along the two tangents and, of ellipsoids, the normal.
+    """
+
+    center: Vector
+    tangent_u: Vector
+    tangent_v: Vector
+    normal: Vector
+    scales: tuple[jax.Array, ...]
+
+
+def surfel_columns(surfels: Surfels) -> Surfels:
+    """The surfels with tuples of columns `[N]` in place of arrays `[N, ...]`, see `Vector`."""
+    split = lambda array: _split(array.reshape(array.shape[0], -1))  # noqa: E731
+    sh = split(surfels.sh)
+    return Surfels(
+        means=split(surfels.means),
+        log_scales=split(surfels.log_scales),
+        quaternions=split(surfels.quaternions),
+        opacity_logits=surfels.opacity_logits,
+        sh=tuple(sh[start : start + 3] for start in range(0, len(sh), 3)),
+    )
+
+
+def _split(array):
+    # The derivative of a split is one concatenation, that of slices a sum of padded arrays.
+    return tuple(row[0] for row in lax.split(array.T, (1,) * array.shape[1]))
+
+
+def to_camera(surfels: Surfels, camera: Camera) -> tuple[Discs, Vector]:
+    """Discs in the camera's frame, and their normals, world frame, facing the camera.
+
+    Args:
+      surfels: from `surfel_columns`.
+      camera: one camera.
+    """
+    tangent_u, tangent_v, normal = zip(*quaternion_rows(*surfels.quaternions), strict=True)
+    offset = offsets(surfels, camera)
+    away = dot(offset, normal) > 0
+
+    def turn(vector):
+        return tuple(dot(axis, vector) for axis in camera.rotation.T)
+
+    discs = Discs(
+        *map(turn, (offset, tangent_u, tangent_v, normal)),
+        scales=tuple(
+            jnp.exp(jnp.clip(scale, -MAX_LOG_SCALE, MAX_LOG_SCALE)) for scale in surfels.log_scales
+        ),
+    )
+    return discs, tuple(jnp.where(away, -n, n) for n in normal)
+
+
+def offsets(surfels: Surfels, camera: Camera) -> Vector:
+    """From the camera to the centers of surfels from `surfel_columns`, world frame."""
+    return tuple(mean - at for mean, at in zip(surfels.means, camera.position, strict=True))
+
+
+def project_discs(
+    discs: Discs,
+    opacity: jax.Array,
+    payload: jax.Array,
+    camera: Camera,
+    *,
+    near: float,
+    antialias: bool = False,
+) -> Footprints:
+    """Homographies and boxes of discs; invisible discs get opacity 0 and an empty box.
+
+    With `antialias`, each disc is convolved with the pixel, so that an image of fewer pixels is the
+    mean of one of more (the elliptical weighted average of Zwicker et al. 2001, as the 2-D filter
+    of Mip-Splatting): where J is the derivative of (u, v) by the pixel at the center, and s^2 a
+    pixel's variance, rho becomes (u, v) (I + s^2 J J^T)^-1 (u, v)^T, and the opacity falls as the
+    disc's area grows. Without it, small discs are drawn larger than they are, as published.
+
+    Args:
+      discs: `N` discs in the frame of `camera`.
+      opacity: `[N]` in [0, 1].
+      payload: `[F, N]` values to blend.
+      camera: one camera; only its intrinsics and image size are used.
+      near: positive z-depth; nothing nearer is drawn, and a disc may reach through it.
+      antialias: see above.
+
+    Raises:
+      ValueError: `near` is not positive.
+    """
+    if near <= 0:
+        raise ValueError(f"near must be a positive depth, not {near}")
+    focal, principal = camera.intrinsics[:2], camera.intrinsics[2:]
+    size = camera.width, camera.height
+    mu, depth = discs.center, discs.center[2]
+    ahead = depth > near
+    inverse_depth = 1 / jnp.where(ahead, depth, 1)
+    center = [mu[i] * inverse_depth * focal[i] + principal[i] for i in range(2)]
+
+    # A center far outside the image, or behind the camera, is a poor origin for numbers that are
+    # evaluated inside it. Any other pixel serves if the low-pass about it stays out of sight.
+    # Discs behind the camera are anchored at a corner of pixels, never at a pixel's center.
+    margin = [max(side, 16) for side in size]
+    around = list(zip(center, margin, size, strict=True))
+    within = [(at > -more) & (at < side + more) for at, more, side in around]
+    centered = ahead & within[0] & within[1]
+    elsewhere = [
+        jnp.where(ahead, jnp.clip(at, -more, side + more), side // 2) for at, more, side in around
+    ]
+    anchor = [
+        jnp.where(centered, at, lax.stop_gradient(other))
+        for at, other in zip(center, elsewhere, strict=True)
+    ]
+
+    facing = dot(discs.normal, mu)
+    edge_on = jnp.abs(facing) <= EDGE_ON * jnp.sqrt(lax.stop_gradient(dot(mu, mu)))
+    per_facing = 1 / jnp.where(edge_on, 1, facing)
+    covectors = (
+        scaled(per_facing / discs.scales[0], cross(discs.tangent_v, mu)),
+        scaled(per_facing / discs.scales[1], cross(mu, discs.tangent_u)),
+        scaled(per_facing, discs.normal),
+    )
+    ray = [(anchor[i] - principal[i]) / focal[i] for i in range(2)]
+    homography = [
+        (
+            jnp.where(centered, at_center, x * ray[0] + y * ray[1] + z),
+            x / focal[0],
+            y / focal[1],
+        )
+        for (x, y, z), at_center in zip(covectors, (0, 0, inverse_depth), strict=True)
+    ]
+    vectors = scaled(discs.scales[0], discs.tangent_u), scaled(discs.scales[1], discs.tangent_v)
+    if antialias:
+        spread = pixel_spread(homography, depth, centered & ~edge_on)
+        homography, vectors = widen(homography, vectors, spread)
+        opacity = opacity / (spread[0] * spread[2])
+
+    # Neither the box nor the disc's range of depth has a derivative.
+    mu, vectors, opacity_now, center = lax.stop_gradient((mu, vectors, opacity, center))
+    cutoff = jnp.sqrt(2 * jnp.log(jnp.maximum(opacity_now / ALPHA_MIN, 1)))
+    reach = cutoff * jnp.hypot(vectors[0][2], vectors[1][2])
+    drawn = ~edge_on & (opacity_now >= ALPHA_MIN) & (mu[2] + reach >= near)
+    nearest, farthest = (jnp.maximum(limit, near) for limit in (mu[2] - reach, mu[2] + reach))
+    box = _disc_box(mu, vectors, cutoff, camera, near)
+    if not antialias:
+        half = 1.001 * cutoff / jnp.sqrt(LOW_PASS) + 0.01
+        square = center[0] - half, center[1] - half, center[0] + half, center[1] + half
+        sides = zip([jnp.minimum] * 2 + [jnp.maximum] * 2, box, square, strict=True)
+        box = [jnp.where(ahead, farther(a, b), a) for farther, a, b in sides]
+    return Footprints(
+        anchor=jnp.stack(anchor),
+        homography=jnp.stack([jnp.stack(row) for row in homography]),
+        opacity=jnp.where(drawn, opacity, 0),
+        low_pass=jnp.where(ahead & (not antialias), LOW_PASS, 1e9),
+        inverse_depth=jnp.stack([1 / farthest, 1 / nearest]),
+        payload=payload,
+        order=jnp.maximum(mu[2], near),
+        box=jnp.where(drawn[None], jnp.stack(box), -1),
+    )
+
+
+def _disc_box(center, vectors, cutoff, camera, near):
+    """Exact bounds x0, y0, x1, y1 `[N]` in pixels of discs of radius `cutoff[N]` cut at z = near.
+
+    The rim is center + cutoff (cos t vectors[0] + sin t vectors[1]). The visible part is convex, so
+    points of its rim bound its image: those where a coordinate is stationary along the circle, and
+    the ends of the chord at z = near.
+    """
+    # The margin keeps pixels that only just reach the cutoff in spite of rounding.
+    radius = 1.001 * cutoff
+    # Each coordinate x, y, z of the rim is a cos + b sin + c, a triple of [N].
+    circle = [(radius * vectors[0][i], radius * vectors[1][i], center[i]) for i in range(3)]
+    depth = circle[2]
+    chord, has_chord = _meet_circle(depth[0], depth[1], depth[2] - near)
+    low, high = [], []
+    for axis in range(2):
+        a = circle[axis]
+        # The derivative of (a.p) / (depth.p) vanishes, where p = (cos t, sin t, 1).
+        cos, sin, constant = cross(a, depth)
+        rim, has_rim = _meet_circle(cos, sin, -constant)
+        candidates = [(point, near, has_chord) for point in chord]
+        for point in rim:
+            at_depth = _on_circle(depth, point)
+            exists = has_rim & (at_depth >= near)
+            candidates.append((point, jnp.where(exists, at_depth, 1), exists))
+        least, most = jnp.inf, -jnp.inf
+        for point, at_depth, exists in candidates:
+            at = _on_circle(a, point) / at_depth
+            at = at * camera.intrinsics[axis] + camera.intrinsics[2 + axis]
+            least = jnp.minimum(least, jnp.where(exists, at, jnp.inf))
+            most = jnp.maximum(most, jnp.where(exists, at, -jnp.inf))
+        low.append(least - 0.01)
+        high.append(most + 0.01)
+    return *low, *high
+
+
+def _on_circle(coordinate, point):
+    """The value `[N]` of a coordinate (a, b, c) of the rim at a point (cos, sin)."""
+    return coordinate[0] * point[0] + coordinate[1] * point[1] + coordinate[2]
+
+
+def _meet_circle(a, b, c):
+    """Both points (cos, sin) `[N]` with a cos + b sin + c = 0, and whether they exist `[N]`."""
+    largest = jnp.maximum(jnp.maximum(jnp.abs(a), jnp.abs(b)), jnp.maximum(jnp.abs(c), 1e-30))
+    a, b, c = a / largest, b / largest, c / largest
+    squared = a * a + b * b
+    discriminant = squared - c * c
+    root = jnp.sqrt(jnp.maximum(discriminant, 0))
+    # For a disc without extent the equation vanishes, and any point of its rim serves.
+    divisor = jnp.where(squared == 0, 1, squared)
+    points = [
+        ((-c * a - s * b * root) / divisor, (-c * b + s * a * root) / divisor) for s in (-1, 1)
+    ]
+    return points, discriminant >= 0

@@ -1,0 +1,31 @@
+"""Volume rendering: rays and samples, encodings, networks, compositing, and the fields on them."""
+
+from jaxcloseup.lazy import lazy_names
+
+
+__all__, __getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "compositing": "Composite composite composite_intervals",
+        "cones": "Moments frustum_gaussians frustum_moments frustum_samples integrated_encoding",
+        "coordinates": "contract contraction_scale spaced unspaced",
+        "depth_supervision": "DepthSupervision Sightings depth_divergence mean_divergence",
+        "encodings": "positional_encoding",
+        "hash_grid": "HashGridConfig grid_rows hash_features init_hash_grid",
+        "interpolation": "weighted_rows",
+        "intervals": "Histogram IntervalConfig Round interval_field",
+        "mipnerf": "MipNerfConfig",
+        "nerf": "NerfConfig",
+        "networks": (
+            "Raw apply_mlp apply_network dense exponential_density init_mlp init_network "
+            "rays_in_cache"
+        ),
+        "ngp": "NgpConfig",
+        "rays": "Rays Traced VolumeAux photometric_loss ray_field",
+        "regularizers": "antialiased_proposal_penalty distortion proposal_penalty",
+        "renderer": "Samples VolumeConfig volume_field",
+        "samplers": "importance interval_quantiles resample stratified widen",
+        "tensorf": "TensorfBuffers TensorfConfig factor_products",
+        "zipnerf": "ZipNerfConfig downweighted_features mean_squares",
+    },
+)

@@ -1,0 +1,110 @@
+"""mip-NeRF: a NeRF that sees cones, by one network in both passes (Barron et al., ICCV 2021)."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxcloseup.fields.contract import RadianceField
+from jaxcloseup.fields.volume.cones import frustum_gaussians, integrated_encoding
+from jaxcloseup.fields.volume.depth_supervision import DepthSupervision
+from jaxcloseup.fields.volume.encodings import positional_encoding
+from jaxcloseup.fields.volume.intervals import IntervalConfig, Round, interval_field
+from jaxcloseup.fields.volume.networks import apply_network, init_network, rays_in_cache
+from jaxcloseup.fields.volume.rays import photometric_loss
+from jaxcloseup.fields.volume.renderer import Samples
+from jaxcloseup.fields.volume.samplers import widen
+
+
+_PADDING = 0.001  # colors reach this far beyond [0, 1], so that the loss can reach 0 and 1
+
+
+@dataclasses.dataclass(frozen=True)
+class MipNerfConfig:
+    """The network and its samples; the defaults are the paper's.
+
+    Attributes:
+      depth: number of layers of the trunk.
+      width: width of the trunk's layers.
+      skip_after: index of the trunk's layer after which the encoded position enters again.
+      position_octaves: octaves of the integrated positional encoding.
+      direction_octaves: octaves of the positional encoding of view directions.
+      direction_width: width of the layer that sees the view direction.
+      num_coarse: intervals per ray of the coarse pass.
+      num_fine: intervals per ray of the fine pass.
+      coarse_weight: weight of the coarse colors in the loss.
+      spacing: exponent of the coarse pass's spacing, see `spaced`.
+      background: gray level in [0, 1] behind the scene; None adds nothing, which is black.
+      chunk: rays rendered at once; None leaves the choice to `rays_in_cache`.
+    """
+
+    depth: int = 8
+    width: int = 256
+    skip_after: int = 4
+    position_octaves: int = 16
+    direction_octaves: int = 4
+    direction_width: int = 128
+    num_coarse: int = 128
+    num_fine: int = 128
+    coarse_weight: float = 0.1
+    spacing: float = 1.0
+    background: float | None = None
+    chunk: int | None = None
+
+
+def mipnerf(
+    config: MipNerfConfig,
+    *,
+    near: float,
+    far: float,
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    scale: float = 1.0,
+    supervision: DepthSupervision | None = None,
+) -> RadianceField:
+    """A mip-NeRF between z-depths `near` and `far`, in world units.
+
+    The network sees `(position - center) * scale`, which should lie roughly within [-1, 1].
+    Parameters are those of the network; there are no buffers. `supervision` adds a loss on depth,
+    see `ray_field`.
+
+    Raises:
+      ValueError: the depth range is empty.
+    """
+
+    def init(key: jax.Array, points: jax.Array, rgb: jax.Array) -> tuple[Any, tuple[()]]:
+        del points, rgb
+        network = init_network(
+            key,
+            depth=config.depth,
+            width=config.width,
+            skip_after=config.skip_after,
+            position_features=6 * config.position_octaves,
+            direction_features=3 + 6 * config.direction_octaves,
+            direction_width=config.direction_width,
+        )
+        return network, ()
+
+    def query(params, buffers, key, rays, edges) -> Samples:
+        del buffers, key
+        shape = edges.shape[0], edges.shape[1] - 1
+        mean, variance = (x.reshape(3, -1) for x in frustum_gaussians(rays, edges))
+        encoded = integrated_encoding(mean, variance, config.position_octaves)
+        looking = positional_encoding(rays.unit, config.direction_octaves)
+        raw = apply_network(params, encoded, looking)
+        rgb = (1 + 2 * _PADDING) * jax.nn.sigmoid(raw.rgb) - _PADDING
+        density = scale * jax.nn.softplus(raw.density - 1)
+        return Samples(density.reshape(shape), jnp.moveaxis(rgb.reshape(3, *shape), 0, -1))
+
+    chunk = config.chunk or rays_in_cache(config.num_coarse + config.num_fine, config.width)
+    return interval_field(
+        IntervalConfig(near, far, config.spacing, config.background, chunk),
+        init=init,
+        rounds=[Round(config.num_coarse, query), Round(config.num_fine, query)],
+        blur=widen,
+        center=center,
+        scale=scale,
+        loss=functools.partial(photometric_loss, coarse_weight=config.coarse_weight),
+        supervision=supervision,
+    )

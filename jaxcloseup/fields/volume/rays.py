@@ -1,0 +1,213 @@
+"""Rays of a camera, and a radiance field made of a function that traces them.
+
+Rays are `[R]`. They go through in chunks, one after another, in training as for whole images: the
+working set stays in the cache, and memory does not grow with the number of rays.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from jaxcloseup.fields.contract import RadianceField, Rendering
+from jaxcloseup.fields.volume.depth_supervision import DepthSupervision, mean_divergence
+from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_rays
+from jaxcloseup.geometry.numerics import safe_divide, safe_norm
+
+
+_SUPERVISED = 1  # folded into the key of rays through known points
+
+
+class Rays(NamedTuple):
+    """Rays with unit camera-z, so their parameter is z-depth, in a field's own coordinates.
+
+    Attributes:
+      origins: `[R, 3]` field units.
+      directions: `[R, 3]` field units per unit of z-depth.
+      length: `[R]` world units per unit of z-depth.
+      pixel: `[R]` width of a pixel at z-depth 1, field units.
+    """
+
+    origins: jax.Array
+    directions: jax.Array
+    length: jax.Array
+    pixel: jax.Array
+
+    @property
+    def unit(self) -> jax.Array:
+        """Unit directions, coordinates first, `[3, R]`."""
+        return (self.directions / safe_norm(self.directions, keepdims=True)).T
+
+    def at(self, depth: jax.Array) -> jax.Array:
+        """Positions `[3, R, S]` at z-depths `[R, S]`."""
+        return self.origins.T[..., None] + self.directions.T[..., None] * depth[None]
+
+
+class VolumeAux(NamedTuple):
+    """The `aux` of a volumetric field's rendering.
+
+    Attributes:
+      coarse_rgb: `[..., 3]` colors of the coarse pass, for the loss; None from fields whose coarse
+        passes have no colors.
+      median_depth: `[...]` z-depth at which half of the light is absorbed, 0 where it never is.
+      expected_depth: `[...]` weighted sum of z-depths, not divided by alpha.
+      penalty: `[...]` what the loss adds for each ray; None for fields without regularizers.
+    """
+
+    coarse_rgb: jax.Array | None
+    median_depth: jax.Array
+    expected_depth: jax.Array
+    penalty: jax.Array | None = None
+
+
+class Traced(NamedTuple):
+    """What tracing R rays gives.
+
+    Attributes:
+      rendering: `[R]`, with a `VolumeAux`.
+      light: of each pass that photographs teach, first to last: edges `[R, S + 1]` of its
+        intervals, ascending z-depths, and weights `[R, S]`, the shares of light from there.
+    """
+
+    rendering: Rendering
+    light: list[tuple[jax.Array, jax.Array]]
+
+
+Trace = Callable[[Any, Any, jax.Array | None, Rays], Traced]
+
+
+def ray_field(
+    *,
+    init: Callable[[jax.Array, jax.Array, jax.Array], tuple[Any, Any]],
+    trace: Trace,
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    scale: float = 1.0,
+    chunk: int | None = None,
+    loss: Callable[..., tuple[jax.Array, dict[str, jax.Array]]] | None = None,
+    supervision: DepthSupervision | None = None,
+) -> RadianceField:
+    """A radiance field that renders by tracing rays.
+
+    The field's own coordinates are `(world position - center) * scale`. A field that keeps
+    `buffers` up to date adds its own `adapt` with `_replace`.
+
+    Args:
+      init: `(key, points [P, 3], rgb [P, 3]) -> (params, buffers)`.
+      trace: `(params, buffers, key, rays [R]) -> Traced`; `key` is None in a deterministic
+        rendering.
+      center: world position that becomes the origin of the field's coordinates.
+      scale: field units per world unit.
+      chunk: rays traced, and in training differentiated, at once; None for all.
+      loss: `photometric_loss` by default.
+      supervision: adds a loss on depth to the penalty of renderings with a key.
+
+    Returns:
+      A field whose `render` takes single pixels, also with stacked cameras.
+    """
+
+    def trace_pixels(params, buffers, camera, pixels, key, take):
+        """`take(Traced)` of pixels `[N, 2]`, chunk by chunk."""
+
+        def trace_rays(rays):
+            key, origins, directions, pixel = rays
+            own = (origins - jnp.array([center])) * scale, directions * scale
+            rays = Rays(*own, safe_norm(directions), pixel * scale)
+            return take(trace(params, buffers, key, rays))
+
+        return _map_chunks(trace_rays, key, _rays(camera, pixels), chunk)
+
+    def render(
+        params: Any,
+        buffers: Any,
+        camera: Camera,
+        pixels: jax.Array | None,
+        key: jax.Array | None,
+    ) -> Rendering:
+        if pixels is None:
+            pixels = pixel_grid(camera.height, camera.width)
+        shape, pixels = pixels.shape[:-1], pixels.reshape(-1, 2)
+        bound = functools.partial(trace_pixels, params, buffers)
+        rendering = bound(camera, pixels, key, lambda traced: traced.rendering)
+        if supervision is not None and key is not None:
+
+            def see(key, cameras, pixels):
+                return bound(cameras, pixels, key, lambda traced: traced.light)
+
+            key = jax.random.fold_in(key, _SUPERVISED)
+            more = mean_divergence(supervision, key, len(pixels), see)
+            before = rendering.aux.penalty
+            more = jnp.broadcast_to(more, (len(pixels),)) + (0 if before is None else before)
+            rendering = rendering._replace(aux=rendering.aux._replace(penalty=more))
+        return jax.tree.map(lambda x: x.reshape((*shape, *x.shape[1:])), rendering)
+
+    return RadianceField(init, render, loss or photometric_loss, gradient_chunk=chunk)
+
+
+def photometric_loss(
+    rendering: Rendering,
+    target_rgb: jax.Array,
+    weight: jax.Array,
+    *,
+    coarse_weight: float = 1.0,
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Weighted mean squared error of the fine and the coarse colors (NeRF, eq. 6), and penalties.
+
+    Args:
+      rendering: rendering of pixels `[...]` with a `VolumeAux`.
+      target_rgb: `[..., 3]` true colors.
+      weight: `[...]` non-negative; all zero gives a zero loss.
+      coarse_weight: of the coarse colors, where there are any.
+
+    Returns:
+      The loss, and `{"psnr"}` of the fine colors, which is inf where no pixel has weight.
+    """
+    chex.assert_equal_shape([rendering.rgb, target_rgb])
+    chex.assert_shape(weight, target_rgb.shape[:-1])
+
+    def mean(values):
+        return safe_divide(jnp.sum(weight * values), jnp.sum(weight))
+
+    def error(rgb):
+        return mean(jnp.mean((rgb - target_rgb) ** 2, axis=-1))
+
+    aux, fine = rendering.aux, error(rendering.rgb)
+    loss = fine
+    if aux.coarse_rgb is not None:
+        loss += coarse_weight * error(aux.coarse_rgb)
+    if aux.penalty is not None:
+        loss += mean(aux.penalty)
+    return loss, {"psnr": -10 * jnp.log10(fine)}
+
+
+def _rays(camera: Camera, pixels: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Rays of one camera, or of stacked cameras `[N]`, one for each of `pixels[N, 2]`."""
+    # A pixel that is not square has the width of a square one of its area.
+    width = jax.lax.rsqrt(camera.intrinsics[..., 0] * camera.intrinsics[..., 1])
+    if camera.intrinsics.ndim == 1:
+        return *pixels_to_rays(camera, pixels), jnp.broadcast_to(width, pixels.shape[:-1])
+    chex.assert_shape(pixels, (camera.intrinsics.shape[0], 2))
+    return *jax.vmap(pixels_to_rays)(camera, pixels), width
+
+
+def _map_chunks(fn, key, rays, chunk):
+    """`fn((key, *rays))` on chunks of the rays' leading axis `[R]`, in fixed memory.
+
+    A backward pass computes each chunk again: remembering all of them takes as long, and gigabytes.
+    """
+    (num_rays,) = {x.shape[0] for x in rays}
+    if chunk is None or num_rays <= chunk:
+        return fn((key, *rays))
+    num_chunks = -(-num_rays // chunk)
+    pad = num_chunks * chunk - num_rays
+    rays = [
+        jnp.pad(x, ((0, pad), *((0, 0),) * (x.ndim - 1)), mode="edge").reshape(
+            num_chunks, chunk, *x.shape[1:]
+        )
+        for x in rays
+    ]
+    keys = None if key is None else jax.random.split(key, num_chunks)
+    out = jax.lax.map(jax.checkpoint(fn), (keys, *rays))
+    return jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:]))[:num_rays], out)

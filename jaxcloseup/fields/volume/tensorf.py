@@ -1,0 +1,260 @@
+"""TensoRF: a scene as sums of vector-matrix products (Chen et al., ECCV 2022).
+
+Grids begin small and grow: arrays have the size of the last grid, and a grid of n vertices along
+each side lies in their first n rows and columns, so nothing is compiled again. Where the paper
+skips empty space by an alpha mask, a first round looks at densities alone, and a second one is cut
+where the first saw something; both see the same factors.
+"""
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from jaxcloseup.fields.contract import RadianceField
+from jaxcloseup.fields.volume.depth_supervision import DepthSupervision
+from jaxcloseup.fields.volume.encodings import positional_encoding
+from jaxcloseup.fields.volume.interpolation import weighted_rows
+from jaxcloseup.fields.volume.intervals import IntervalConfig, Round, interval_field
+from jaxcloseup.fields.volume.networks import apply_mlp, init_mlp
+from jaxcloseup.fields.volume.rays import Rays
+from jaxcloseup.fields.volume.renderer import Samples
+
+
+_PLANES = ((0, 1), (0, 2), (1, 2))  # axes of the matrix of each mode; its vector has the third
+_LINES = (2, 1, 0)
+_INITIAL = 0.1  # standard deviation of initial factors
+
+
+@struct.dataclass
+class TensorfBuffers:
+    """Vertices along each side of the grid, `[]` int32."""
+
+    vertices: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class TensorfConfig:
+    """The decomposition, its growth, and the samples; the defaults are near the paper's.
+
+    Attributes:
+      coarsest: vertices along each side of the first grid.
+      finest: vertices along each side of the last grid.
+      growths: how often the grid grows, by about one factor.
+      grow_every: steps from one growth to the next.
+      density_components: products whose sum makes density, of each mode.
+      color_components: products that make appearance, of each mode.
+      appearance: features that the color network gets.
+      width: width of its two hidden layers.
+      octaves: octaves of the positional encodings of view directions and of appearance.
+      density_shift: added to the sum of products before softplus.
+      density_scale: density per field unit where softplus is 1.
+      sparsity_weight: weight of the mean absolute density factor.
+      smoothness_weight: weight of the mean squared difference of neighboring factors.
+      num_coarse: intervals per ray of the first round.
+      num_fine: intervals per ray that are rendered.
+      spacing: exponent of the first round's spacing, see `spaced`.
+      background: gray level in [0, 1] behind the scene; None adds nothing, which is black.
+      chunk: rays rendered at once.
+    """
+
+    coarsest: int = 128
+    finest: int = 300
+    growths: int = 5
+    grow_every: int = 1500
+    density_components: int = 16
+    color_components: int = 48
+    appearance: int = 27
+    width: int = 128
+    octaves: int = 2
+    density_shift: float = -10.0
+    density_scale: float = 25.0
+    sparsity_weight: float = 8e-5
+    smoothness_weight: float = 0.1
+    num_coarse: int = 512
+    num_fine: int = 128
+    spacing: float = 1.0
+    background: float | None = None
+    chunk: int = 2**12
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Vertices along each side after 0, 1, ... growths: even steps of their logarithm."""
+        steps = np.linspace(math.log(self.coarsest), math.log(self.finest), self.growths + 1)
+        return tuple(max(2, round(size)) for size in np.exp(steps).tolist())
+
+
+def tensorf(
+    config: TensorfConfig,
+    *,
+    near: float,
+    far: float,
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    scale: float = 1.0,
+    supervision: DepthSupervision | None = None,
+) -> RadianceField:
+    """A TensoRF between z-depths `near` and `far`, in world units.
+
+    The field's coordinates are `(position - center) * scale`; what matters should lie within the
+    unit cube, others are taken to its surface. Parameters are factors `"density"` and `"color"`,
+    each of planes `[3, N, N, C]` and lines `[3, N, C]`, a `"basis"` and a `"network"`; buffers are
+    `TensorfBuffers`. `supervision` adds a loss on depth, see `ray_field`.
+
+    Raises:
+      ValueError: the depth range is empty.
+    """
+    size = max(config.sizes)
+
+    def init(key: jax.Array, points: jax.Array, rgb: jax.Array) -> tuple[Any, TensorfBuffers]:
+        del points, rgb
+        keys = jax.random.split(key, 4)
+        inputs = config.appearance * (1 + 2 * config.octaves)
+        params = {
+            "density": _init_factors(keys[0], size, config.density_components),
+            "color": _init_factors(keys[1], size, config.color_components),
+            "basis": init_mlp(keys[2], (3 * config.color_components, config.appearance)),
+            "network": init_mlp(
+                keys[3],
+                (inputs, config.width, config.width, 3),
+                ray_features=3 + 6 * config.octaves,
+            ),
+        }
+        return params, TensorfBuffers(jnp.asarray(config.sizes[0], jnp.int32))
+
+    def density(params, buffers, rays: Rays, edges: jax.Array) -> tuple[jax.Array, jax.Array]:
+        positions = rays.at(0.5 * (edges[..., 1:] + edges[..., :-1])).reshape(3, -1)
+        total = jnp.sum(factor_products(params["density"], buffers.vertices, positions), (0, 1))
+        per_field_unit = config.density_scale * jax.nn.softplus(total + config.density_shift)
+        return positions, scale * per_field_unit.reshape(edges.shape[0], -1)
+
+    def look(params, buffers, key, rays, edges) -> Samples:
+        del key
+        return Samples(density(params, buffers, rays, edges)[1], None)
+
+    def render(params, buffers, key, rays, edges) -> Samples:
+        del key
+        positions, absorbed = density(params, buffers, rays, edges)
+        products = factor_products(params["color"], buffers.vertices, positions)
+        features = apply_mlp(params["basis"], products.reshape(-1, positions.shape[1]))
+        encoded = positional_encoding(features, config.octaves)
+        looking = positional_encoding(rays.unit, config.octaves)
+        rgb = jax.nn.sigmoid(apply_mlp(params["network"], encoded, looking))
+        return Samples(absorbed, jnp.moveaxis(rgb.reshape(3, *absorbed.shape), 0, -1))
+
+    def penalty(params, buffers, histograms):
+        n = buffers.vertices
+        total = config.sparsity_weight * _mean_size(params["density"], n)
+        for factors in (params["density"], params["color"]):
+            total += config.smoothness_weight * _mean_step(factors, n)
+        return jnp.broadcast_to(total, histograms[0].weights.shape[:1])
+
+    def adapt(key, state):
+        del key
+        for i, (old, new) in enumerate(zip(config.sizes, config.sizes[1:], strict=False)):
+            due = state.step == (i + 1) * config.grow_every
+            state = jax.lax.cond(due, lambda s, o=old, n=new: _grown(s, o, n), lambda s: s, state)
+        return state
+
+    field = interval_field(
+        IntervalConfig(near, far, config.spacing, config.background, config.chunk),
+        init=init,
+        rounds=[Round(config.num_coarse, look), Round(config.num_fine, render)],
+        penalty=penalty,
+        center=center,
+        scale=scale,
+        supervision=supervision,
+    )
+    return field._replace(adapt=adapt)
+
+
+def factor_products(factors: Any, vertices: jax.Array, positions: jax.Array) -> jax.Array:
+    """Matrices times vectors at positions (TensoRF, eq. 4), interpolated between vertices.
+
+    Args:
+      factors: planes `[3, N, N, C]`, of axes (x, y), (x, z) and (y, z), and lines `[3, N, C]`, of
+        axes z, y and x.
+      vertices: `[]` int32 vertices along each side; at most N.
+      positions: `[3, M]` in [-1, 1]; others are taken to the nearest such position.
+
+    Returns:
+      `[3, C, M]`.
+    """
+    _, size, _, components = factors["planes"].shape
+    last = (vertices - 1).astype(positions.dtype)
+    scaled = jnp.clip(0.5 * positions + 0.5, 0, 1) * last
+    low = jnp.clip(jnp.floor(scaled), 0, last - 1)
+    share = jnp.stack([1 - (scaled - low), scaled - low])  # [2, 3, M] of the vertices around
+    vertex = low.astype(jnp.int32)[None] + jnp.arange(2, dtype=jnp.int32)[:, None, None]
+    first, second = (np.array(axes) for axes in zip(*_PLANES, strict=True))
+    modes = jnp.arange(3, dtype=jnp.int32)[None, :, None]
+
+    # [4, 3, M]: the corners of each plane's cell, and [2, 3, M]: the ends of each line's.
+    rows = vertex[:, None, first] * size + vertex[None, :, second]
+    rows = rows.reshape(4, 3, -1) + modes * size**2
+    weights = (share[:, None, first] * share[None, :, second]).reshape(4, 3, -1)
+    planes = weighted_rows(factors["planes"].reshape(-1, components), rows, weights)
+    line = np.array(_LINES)
+    rows, weights = vertex[:, line] + modes * size, share[:, line]
+    return planes * weighted_rows(factors["lines"].reshape(-1, components), rows, weights)
+
+
+def _init_factors(key, size, components):
+    keys = jax.random.split(key)
+    planes = _INITIAL * jax.random.normal(keys[0], (3, size, size, components))
+    return {"planes": planes, "lines": _INITIAL * jax.random.normal(keys[1], (3, size, components))}
+
+
+def _mean_size(factors, vertices):
+    """The mean absolute factor, planes plus lines (TensoRF, eq. 11)."""
+    inside = jnp.arange(factors["lines"].shape[1], dtype=jnp.int32) < vertices
+    both = inside[:, None] & inside[None]
+    lines = _mean(jnp.abs(factors["lines"]), inside[None, :, None])
+    return lines + _mean(jnp.abs(factors["planes"]), both[None, :, :, None])
+
+
+def _mean_step(factors, vertices):
+    """The mean squared step between neighbors in planes, along both axes (TensoRF, eq. 12)."""
+    planes = factors["planes"]
+    inside = jnp.arange(planes.shape[1], dtype=jnp.int32) < vertices
+    both = (inside[:, None] & inside[None])[None, :, :, None]
+    down = _mean(jnp.diff(planes, axis=1) ** 2, both[:, 1:])
+    return down + _mean(jnp.diff(planes, axis=2) ** 2, both[:, :, 1:])
+
+
+def _mean(values, inside):
+    counted = jnp.broadcast_to(inside, values.shape)
+    return jnp.sum(jnp.where(counted, values, 0)) / jnp.sum(counted).astype(values.dtype)
+
+
+def _grown(state, old, new):
+    """The state with a grid of `new` instead of `old` vertices, and an optimizer without memory."""
+
+    def grow(factors):
+        size = factors["lines"].shape[1]
+        take = _resampling(size, old, new).astype(factors["lines"].dtype)
+        lines = jnp.einsum("ni,mic->mnc", take, factors["lines"], precision="highest")
+        planes = jnp.einsum("ni,kj,mijc->mnkc", take, take, factors["planes"], precision="highest")
+        return {"planes": planes, "lines": lines}
+
+    params = state.params | {name: grow(state.params[name]) for name in ("density", "color")}
+    # Moments of other vertices say nothing of these; counts of steps stay.
+    opt_state = jax.tree.map(
+        lambda x: jnp.zeros_like(x) if jnp.issubdtype(x.dtype, jnp.floating) else x,
+        state.opt_state,
+    )
+    buffers = TensorfBuffers(jnp.asarray(new, jnp.int32))
+    return state.replace(params=params, buffers=buffers, opt_state=opt_state)
+
+
+def _resampling(size, old, new):
+    """The matrix `[size, size]` that interpolates `old` vertices to `new` between the same ends."""
+    matrix = np.zeros((size, size))
+    at = np.arange(new) * (old - 1) / (new - 1)
+    low = np.minimum(at.astype(int), old - 2)
+    matrix[np.arange(new), low] = 1 - (at - low)
+    matrix[np.arange(new), low + 1] = at - low
+    return jnp.asarray(matrix)

@@ -1,0 +1,107 @@
+"""Label rules: which depth labels are made from, and how their loss joins the photographs'.
+
+`PAPER` follows the paper's text, `RELEASED` its public script where the two differ, `POOLED` takes
+the paper's depth and the script's loss. A step looks its rule up by name in `LABEL_RULES`.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxcloseup.fields.contract import Rendering
+from jaxcloseup.photos.views import Batch
+
+
+Loss = tuple[jax.Array, dict[str, jax.Array]]
+
+
+@jax.jit
+def label_depth(
+    rendering: Rendering, *, near: float = 0.0, far: float = math.inf, min_alpha: float = 0.5
+) -> jax.Array:
+    """Z-depth `[...]` of a rendering where labels can use it, 0 elsewhere.
+
+    Labels cannot use depth where alpha is below `min_alpha` or depth outside [near, far].
+    """
+    defined = rendering.alpha >= min_alpha
+    defined &= (rendering.depth >= near) & (rendering.depth <= far)
+    return jnp.where(defined, rendering.depth, 0)
+
+
+def undivided_label_depth(rendering: Rendering, **limits: float) -> jax.Array:
+    """`label_depth` of the weighted sum of depths, which the script does not divide by alpha."""
+    return label_depth(rendering._replace(depth=rendering.depth * rendering.alpha), **limits)
+
+
+def add_label_loss(
+    loss_of: Callable[[Batch, jax.Array], Loss],
+    photographs: tuple[Batch, jax.Array],
+    labels: tuple[Batch, jax.Array],
+    weight: jax.Array,
+) -> Loss:
+    """(1 - w) L_c + w L_pl, each a mean over its own pixels: the paper's total loss with w = 1/2.
+
+    Args:
+      loss_of: loss and metrics of a batch and a random key.
+      photographs: pixels of photographs, and a key.
+      labels: labeled pixels, and a key.
+      weight: `[]` w.
+
+    Returns:
+      The loss, and the metrics of both; those of labels as `label_<name>`.
+    """
+    (photograph_loss, metrics), (label_loss, label_metrics) = (
+        loss_of(*photographs),
+        loss_of(*labels),
+    )
+    named = {f"label_{name}": value for name, value in label_metrics.items()}
+    return (1 - weight) * photograph_loss + weight * label_loss, metrics | named
+
+
+def pool_label_loss(
+    loss_of: Callable[[Batch, jax.Array], Loss],
+    photographs: tuple[Batch, jax.Array],
+    labels: tuple[Batch, jax.Array],
+    weight: jax.Array,
+) -> Loss:
+    """One mean over all pixels of both, as released. Arguments as in `add_label_loss`.
+
+    Any `weight` above 0 counts as 1.
+    """
+    (batch, key), (labeled, _) = photographs, labels
+    counts = (weight > 0).astype(labeled.weight.dtype)
+    return loss_of(_pool(batch, labeled._replace(weight=counts * labeled.weight)), key)
+
+
+def _pool(batch, labeled):
+    """One batch of the pixels of both; the second has one camera for all its pixels."""
+    cameras = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(leaf, (len(labeled.pixels), *leaf.shape)), labeled.cameras
+    )
+    return jax.tree.map(
+        lambda *leaves: jnp.concatenate(leaves), batch, labeled._replace(cameras=cameras)
+    )
+
+
+class LabelRule(NamedTuple):
+    """How a step makes and weighs labels of single pixels.
+
+    Attributes:
+      depth: `(rendering, near=, far=) -> [...]`, the z-depth of labels, 0 where undefined.
+      depth_key: `key -> key | None`, the random key of the rendering that depth is taken from;
+        None renders without sampling noise.
+      loss: joins the losses of photographs and labels, as `add_label_loss` does.
+    """
+
+    depth: Callable[..., jax.Array] = label_depth
+    depth_key: Callable[[Any], Any] = lambda key: None
+    loss: Callable[..., Loss] = add_label_loss
+
+
+PAPER = LabelRule()
+POOLED = LabelRule(loss=pool_label_loss)
+RELEASED = LabelRule(undivided_label_depth, lambda key: key, pool_label_loss)
+LABEL_RULES = {"paper": PAPER, "pooled": POOLED, "released": RELEASED}

@@ -1,0 +1,28 @@
+"""Public names of a package that load their modules on first use (PEP 562).
+
+So `import jaxcloseup` is cheap, and configurations can be read without importing JAX.
+"""
+
+import importlib
+from collections.abc import Callable, Mapping
+from typing import Any
+
+
+def lazy_names(
+    package: str, modules: Mapping[str, str]
+) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
+    """Return `__all__`, `__getattr__` and `__dir__` of a package.
+
+    Args:
+      package: its `__name__`.
+      modules: public names, separated by spaces, by the module within the package that defines
+        them.
+    """
+    module_of = {name: module for module, names in modules.items() for name in names.split()}
+
+    def load(name: str) -> Any:
+        if name not in module_of:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(f"{package}.{module_of[name]}"), name)
+
+    return sorted(module_of), load, lambda: sorted(module_of)

@@ -1,0 +1,12 @@
+"""Image metrics: PSNR, SSIM, color-corrected PSNR, LPIPS."""
+
+from jaxcloseup.lazy import lazy_names
+
+
+__all__, __getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "image_metrics": "quantize psnr ssim cc_psnr fit_colors change_colors",
+        "lpips": "LpipsError LpipsWeights layer_shapes load_lpips",
+    },
+)

@@ -1,0 +1,139 @@
+"""Image quality: PSNR, SSIM and color-corrected PSNR, each for one image and weighted by pixel.
+
+Images are `[H, W, 3]` floats in [0, 1]; batch with `jax.vmap`. Published numbers refer to 8-bit
+images: `quantize` both images first, so that a saved PNG reproduces the number. A weight that is 0
+everywhere gives NaN, which callers report as absent.
+"""
+
+import chex
+import dm_pix
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxcloseup.geometry.numerics import matmul, safe_divide
+
+
+SSIM_TAPS, SSIM_SIGMA = 11, 1.5
+
+
+def quantize(image: jax.Array) -> jax.Array:
+    """Round an image to 8 bits per channel: clip to [0, 1], then round to n / 255."""
+    return jnp.round(jnp.clip(image, 0, 1) * 255) / 255
+
+
+def psnr(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = None) -> jax.Array:
+    """Peak signal-to-noise ratio, -10 log10(mean squared error), in dB; inf for equal images.
+
+    Args:
+      image: `[H, W, 3]` in [0, 1].
+      target: `[H, W, 3]` in [0, 1].
+      weight: `[H, W]` weight of each pixel in the mean; 1 by default.
+    """
+    weight = _check(image, target, weight)
+    return -10 * jnp.log10(_weighted_mean((image - target) ** 2, weight))
+
+
+def ssim(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = None) -> jax.Array:
+    """Structural similarity, 1 for equal images; mean over the windows inside the image.
+
+    Wang et al., "Image quality assessment: from error visibility to structural similarity", 2004,
+    equations 13 to 17, per channel: Gaussian windows of 11 taps and sigma 1.5,
+    K1 = 0.01, K2 = 0.03.
+
+    Args:
+      image: `[H, W, 3]` in [0, 1], at least 11 pixels a side.
+      target: `[H, W, 3]` in [0, 1].
+      weight: `[H, W]`; a window has the weight of its central pixel, whatever else it covers, so
+        crop padding away instead of giving it weight 0.
+
+    Raises:
+      ValueError: a side of the image has fewer than 11 pixels.
+    """
+    weight = _check(image, target, weight)
+    if min(image.shape[:2]) < SSIM_TAPS:
+        raise ValueError(f"SSIM needs {SSIM_TAPS} pixels a side: the image is {image.shape[:2]}.")
+    with jax.numpy_dtype_promotion("standard"):  # dm_pix mixes integers and floats
+        similarity = dm_pix.ssim(image, target, max_val=1.0, filter_fn=_blur, return_map=True)
+    border = SSIM_TAPS // 2
+    return _weighted_mean(similarity, weight[border:-border, border:-border])
+
+
+def _blur(image: jax.Array) -> jax.Array:
+    """Gaussian windows of `ssim`, as matrices: XLA's CPU backend convolves ten times slower."""
+    rows, columns = (jnp.asarray(_window_sums(size), image.dtype) for size in image.shape[:2])
+    image = jnp.einsum("ih,hwc->iwc", rows, image, precision=lax.Precision.HIGHEST)
+    return jnp.einsum("jw,iwc->ijc", columns, image, precision=lax.Precision.HIGHEST)
+
+
+def _window_sums(size: int) -> np.ndarray:
+    """Matrix `[size - 10, size]` whose rows are the window at all places along a side."""
+    taps = np.exp(-0.5 * ((np.arange(SSIM_TAPS) - SSIM_TAPS // 2) / SSIM_SIGMA) ** 2)
+    places = range(size - SSIM_TAPS + 1)
+    return np.stack([np.pad(taps / taps.sum(), (k, len(places) - 1 - k)) for k in places])
+
+
+def cc_psnr(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = None) -> jax.Array:
+    """PSNR after the affine change of the image's colors that fits the target best.
+
+    The change, a 3x3 matrix and an offset for the whole image, minimizes the weighted squared
+    error; its result is clipped to [0, 1]. Differences in exposure and white balance do not count.
+    Other programs fit other changes (multinerf adds quadratic terms, gsplat fits each channel
+    alone), so do not compare these numbers with theirs. Where colors span less than three
+    dimensions, as in a gray image, the change of least norm applies. Arguments as in `psnr`.
+    """
+    weight = _check(image, target, weight)
+    fitted = change_colors(image, *fit_colors(image, target, weight))
+    return psnr(jnp.clip(fitted, 0, 1), target, weight=weight)
+
+
+def fit_colors(
+    image: jax.Array, target: jax.Array, weight: jax.Array, *, ridge: float = 0.0
+) -> tuple[jax.Array, jax.Array]:
+    """The affine change of an image's colors with the least weighted squared error.
+
+    Args:
+      image: `[H, W, 3]` colors to change.
+      target: `[H, W, 3]` colors to reach.
+      weight: `[H, W]` non-negative weights of the pixels.
+      ridge: weight of the squared distance from the identity, against the mean squared error.
+
+    Returns:
+      Matrix `[3, 3]` and offset `[3]` for `change_colors`. Both are NaN if the weights sum to 0,
+      and have the least norm if the colors do not determine them.
+    """
+    share = safe_divide(weight, jnp.sum(weight), fill=jnp.nan)[..., None]
+    mean = jnp.sum(share * image, axis=(0, 1), keepdims=True)
+    target_mean = jnp.sum(share * target, axis=(0, 1), keepdims=True)
+    # Centered colors take the offset out of the system and keep its condition number low.
+    colors, targets = (image - mean).reshape(-1, 3), (target - target_mean).reshape(-1, 3)
+    weighted = colors.T * share.reshape(1, -1)
+    towards = ridge * jnp.eye(3, dtype=image.dtype)
+    inverse = jnp.linalg.pinv(matmul(weighted, colors) + towards, rtol=1e-5, hermitian=True)
+    matrix = matmul(inverse, matmul(weighted, targets) + towards)
+    mean, target_mean = mean[0, 0], target_mean[0, 0]
+    reached = mean + (target_mean - mean) / (1 + ridge)
+    return matrix, reached - matmul(mean[None], matrix)[0]
+
+
+def change_colors(image: jax.Array, matrix: jax.Array, offset: jax.Array) -> jax.Array:
+    """Colors `image @ matrix + offset` of an image `[H, W, 3]`."""
+    return matmul(image, matrix[None]) + offset[None, None]
+
+
+def _check(image: jax.Array, target: jax.Array, weight: jax.Array | None) -> jax.Array:
+    """Check shapes and types, and return the weight or ones."""
+    chex.assert_shape(image, (None, None, 3))
+    chex.assert_equal_shape([image, target])
+    chex.assert_type([image, target], float)
+    if weight is None:
+        return jnp.ones(image.shape[:2], image.dtype)
+    chex.assert_shape(weight, image.shape[:2])
+    return weight
+
+
+def _weighted_mean(values: jax.Array, weight: jax.Array) -> jax.Array:
+    """Mean of `[H, W, 3]` values with weights `[H, W]`, NaN where these sum to 0."""
+    total = jnp.sum(weight)
+    return safe_divide(jnp.sum(jnp.mean(values, axis=-1) * weight), total, fill=jnp.nan)

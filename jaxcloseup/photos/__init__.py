@@ -1,0 +1,23 @@
+"""Training photographs: views, pyramids, windows, and what they show of other views."""
+
+from jaxcloseup.lazy import lazy_names
+
+
+__all__, __getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "views": "Views Batch to_float camera_at sample_pixels sample_image",
+        "scene": (
+            "SceneError SceneWarning UnknownKeyWarning ImageSizeWarning NearFarWarning "
+            "DuplicateFileWarning PointsWarning Surface Scene keep_photographs"
+        ),
+        "pyramids": "Pyramid scene_pyramid photograph_pyramid fractional_level read_pyramid",
+        "windows": (
+            "Windows photograph_windows view_windows windows_that_see sample_window "
+            "sample_window_pixels cut_window in_quarters"
+        ),
+        "gather": "GatherSources GatherSettings Gathered gather_sources gather_parts",
+        "support": "Support find_support count_seen count_seen_points",
+        "tsdf": "DepthMaps Fused depth_maps fuse fuse_grid",
+    },
+)

@@ -1,0 +1,205 @@
+"""Pyramids: images of several views at a fine size, at halves of it, and as a model reads them."""
+
+import itertools
+import math
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from jaxcloseup.geometry.cameras import Camera, mean_focal
+from jaxcloseup.photos.scene import Scene
+from jaxcloseup.photos.views import Views, to_float
+
+
+BUDGET = 2**29  # bytes that the photographs of a scene may take
+_BYTES_PER_PIXEL = 4 * 4 / 3  # colors and weight of the finest level, and of all halves of it
+
+
+@struct.dataclass
+class Pyramid:
+    """Images of V views at L sizes, from the finest level to the coarsest; P pixels in all.
+
+    Attributes:
+      values: `[V, P, C]` the levels one after the other, each row by row: uint8 (255 means 1),
+        int8 (127 means 1) or float.
+      intrinsics: `[V, L, 4]` fx, fy, cx, cy of each level, in its own pixels.
+      sizes: (height, width) of each level, static.
+    """
+
+    values: jax.Array
+    intrinsics: jax.Array
+    sizes: tuple[tuple[int, int], ...] = struct.field(pytree_node=False)
+
+    def coarseness(self, view: int | jax.Array) -> jax.Array:
+        """log2 of how much larger each level's pixels are than the finest ones, `[L]`."""
+        focal = mean_focal(self.intrinsics[view])
+        return jnp.log2(focal[0] / focal)
+
+    @property
+    def starts(self) -> tuple[int, ...]:
+        """Index of each level's first pixel, among the P."""
+        counts = [height * width for height, width in self.sizes]
+        return tuple(itertools.accumulate(counts[:-1], initial=0))
+
+    def pixels_of(self, index: int) -> slice:
+        """The pixels of one level, among the P."""
+        start, (height, width) = self.starts[index], self.sizes[index]
+        return slice(start, start + height * width)
+
+    def level_near(self, width: int) -> int:
+        """The finest level that is not 1.5 times as wide as `width`; there must be one."""
+        return [own < 1.5 * width for _, own in self.sizes].index(True)
+
+    def level(self, index: int) -> jax.Array:
+        """Images `[V, H, W, C]` of one level."""
+        flat = self.values[:, self.pixels_of(index)]
+        return flat.reshape(flat.shape[0], *self.sizes[index], flat.shape[-1])
+
+    def image(self, view: int, index: int) -> jax.Array:
+        """The image `[H, W, C]` of one view at one level."""
+        flat = self.values[view, self.pixels_of(index)]
+        return flat.reshape(*self.sizes[index], flat.shape[-1])
+
+    def camera(self, camera: Camera, view: int, index: int) -> Camera:
+        """The camera of one view's image at one level, given any camera with its pose."""
+        height, width = self.sizes[index]
+        intrinsics = self.intrinsics[view, index]
+        return camera.replace(intrinsics=intrinsics, height=height, width=width)
+
+
+def scene_pyramid(scene: Scene, *, finest: int = 1, budget: int = BUDGET) -> tuple[Pyramid, int]:
+    """The training photographs of a scene, from the finest size that fits to that of training.
+
+    Args:
+      scene: a scene whose photographs were divided by `metadata["downscale"]` for training.
+      finest: smallest divisor of the photographs' own size.
+      budget: bytes that the pyramid may take; larger photographs are divided more.
+
+    Returns:
+      The pyramid, as `photograph_pyramid`, and the divisor of its finest level.
+    """
+    train, coarse = scene.train, scene.metadata.get("downscale", 1)
+    pixels = train.weight.size * coarse**2
+    factor = max(finest, math.ceil(math.sqrt(pixels * _BYTES_PER_PIXEL / budget)))
+    if scene.photographs_at is None or factor >= coarse:
+        return photograph_pyramid(train), coarse
+    finer, _ = scene.photographs_at(factor)
+    return photograph_pyramid(finer, train), factor
+
+
+def photograph_pyramid(
+    views: Views, coarsest: Views | None = None, *, least: tuple[int, int] | None = None
+) -> Pyramid:
+    """Photographs, halves of them, and the same photographs as training reads them.
+
+    The values are `[V, P, 4]` uint8, colors and weight. A half averages 2 x 2 pixels by their
+    weights; a last odd row or column is dropped, so that the intrinsics halve exactly. Pixels
+    without weight are black.
+
+    Args:
+      views: photographs at the finest size.
+      coarsest: the last level, after halves that are at least 1.5 times as wide.
+      least: without `coarsest`, smallest height and width of a half; None makes only one level.
+    """
+    sizes = [views.rgb.shape[1:3]]
+    if coarsest is not None:
+        least = 1, 1.5 * coarsest.cameras.width
+    while least is not None and all(np.floor_divide(sizes[-1], 2) >= least):
+        sizes.append((sizes[-1][0] // 2, sizes[-1][1] // 2))
+    if coarsest is not None:
+        sizes.append(coarsest.rgb.shape[1:3])
+    images, weight = _bytes(views), np.asarray(views.weight)
+    values = np.empty((len(images), sum(h * w for h, w in sizes), 4), np.uint8)
+    halves = sizes if coarsest is None else sizes[:-1]
+    for row, image, shares in zip(values, images, weight, strict=True):
+        level = image.astype(np.float32), shares.astype(np.float32)
+        start = 0
+        for height, width in halves:
+            if level[1].shape != (height, width):
+                level = _halve(*level)
+            row[start : start + height * width] = _pixels(*level)
+            start += height * width
+    powers = 2.0 ** -np.arange(len(halves), dtype=np.float32)
+    intrinsics = np.asarray(views.cameras.intrinsics)[:, None] * powers[:, None]
+    if coarsest is not None:
+        last = zip(_bytes(coarsest), np.asarray(coarsest.weight), strict=True)
+        values[:, start:] = [_pixels(*level) for level in last]
+        own = np.asarray(coarsest.cameras.intrinsics)[:, None]
+        intrinsics = np.concatenate([intrinsics, own], axis=1)
+    return Pyramid(jnp.asarray(values), jnp.asarray(intrinsics), tuple(sizes))
+
+
+def _bytes(views):
+    images = np.asarray(views.rgb)
+    if images.dtype != np.uint8:
+        images = np.rint(np.clip(images, 0, 1) * 255).astype(np.uint8)
+    return images
+
+
+def _pixels(colors, weight):
+    """Colors and weight of one image as bytes `[H * W, 4]`."""
+    whole = np.dstack([colors * (weight > 0)[..., None], 255 * weight])
+    return np.rint(whole).astype(np.uint8).reshape(-1, 4)
+
+
+def _halve(image, weight):
+    height, width = weight.shape[0] // 2, weight.shape[1] // 2
+
+    def mean(array):
+        array = np.ascontiguousarray(array[: 2 * height, : 2 * width])
+        return cv2.resize(array, (width, height), interpolation=cv2.INTER_AREA)
+
+    shares = mean(weight)
+    colors = mean(image * weight[..., None]) / np.maximum(shares, 1e-6)[..., None]
+    return colors, shares
+
+
+def fractional_level(wanted: jax.Array, coarseness: jax.Array) -> jax.Array:
+    """The fractional level `[N]` that is `wanted[N]` coarser than the finest of `[L]` levels.
+
+    Args:
+      wanted: log2 of how much coarser.
+      coarseness: of the levels, from `Pyramid.coarseness`.
+    """
+    level = jnp.zeros_like(wanted)
+    for before, after in itertools.pairwise(coarseness):
+        level += jnp.clip((wanted - before) / (after - before), 0, 1)
+    return level
+
+
+def read_pyramid(
+    pyramid: Pyramid, view: jax.Array | int, ray: jax.Array, level: jax.Array
+) -> jax.Array:
+    """Values `[N, C]` of one view, linear between pixels and between levels.
+
+    Args:
+      pyramid: of all views.
+      view: which of them.
+      ray: `[N, 2]` x / z and y / z in the view's frame.
+      level: `[N]` fractional levels; 0 is the finest.
+    """
+    sizes, starts = (jnp.asarray(x, jnp.int32) for x in (pyramid.sizes, pyramid.starts))
+    finer = jnp.floor(jax.lax.stop_gradient(level)).astype(jnp.int32)
+    share = (level - finer.astype(level.dtype))[:, None]
+
+    def read(index):
+        index = jnp.minimum(index, len(pyramid.sizes) - 1)
+        height, width = sizes[index, 0], sizes[index, 1]
+        intrinsics = pyramid.intrinsics[view][index]
+        pixel = ray * intrinsics[:, :2] + intrinsics[:, 2:] - 0.5
+        corner = jnp.floor(jax.lax.stop_gradient(pixel))
+        wx, wy = jnp.moveaxis(pixel - corner, -1, 0)
+        x, y = jnp.moveaxis(jnp.clip(corner, -2.0, 2.0**20).astype(jnp.int32), -1, 0)
+
+        def tap(dx, dy):
+            row, column = jnp.clip(y + dy, 0, height - 1), jnp.clip(x + dx, 0, width - 1)
+            return to_float(pyramid.values[view, starts[index] + row * width + column])
+
+        top = (1 - wx)[:, None] * tap(0, 0) + wx[:, None] * tap(1, 0)
+        bottom = (1 - wx)[:, None] * tap(0, 1) + wx[:, None] * tap(1, 1)
+        return (1 - wy)[:, None] * top + wy[:, None] * bottom
+
+    return (1 - share) * read(finer) + share * read(finer + 1)

@@ -1,0 +1,147 @@
+"""`Scene`, the record that every loader returns, with its errors and warnings."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxcloseup.geometry.cameras import Camera, points_to_pixels
+from jaxcloseup.io.messages import printable
+from jaxcloseup.photos.views import Views, camera_at
+
+
+class SceneError(ValueError):
+    """The scene cannot be loaded; the message is one printable sentence that says what to do."""
+
+    def __init__(self, message: str):
+        """Escape what names from files bring into the message."""
+        super().__init__(printable(message))
+
+
+class SceneWarning(UserWarning):
+    """The scene was loaded, but something in its files looks like a mistake."""
+
+    def __init__(self, message: str):
+        """Escape what names from files bring into the message."""
+        super().__init__(printable(message))
+
+
+class UnknownKeyWarning(SceneWarning):
+    """A file holds fields that the loader ignores."""
+
+
+class ImageSizeWarning(SceneWarning):
+    """Photographs differ in size from what their file states; intrinsics were scaled."""
+
+
+class NearFarWarning(SceneWarning):
+    """The files give no depth range, so it was estimated."""
+
+
+class DuplicateFileWarning(SceneWarning):
+    """A photograph is listed more than once."""
+
+
+class PointsWarning(SceneWarning):
+    """Some initial points were dropped."""
+
+
+class Surface(NamedTuple):
+    """The exact image, depth and normals that a camera sees, per pixel `[H, W]`.
+
+    Attributes:
+      rgb: `[H, W, 3]` anti-aliased color in [0, 1].
+      depth: `[H, W]` exact z-depth at the pixel center in world units; 0 where rays hit nothing.
+      normal: `[H, W, 3]` unit world normal at the pixel center, facing the camera; 0 where rays
+        hit nothing.
+    """
+
+    rgb: jax.Array
+    depth: jax.Array
+    normal: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """A capture in memory.
+
+    Attributes:
+      name: name of the scene.
+      train: far photographs to train on.
+      test: held-out close-ups, or None.
+      test_far: held-out ordinary views, or None.
+      points: `[P, 3]` float32 world points on surfaces; P may be 0.
+      rgb: `[P, 3]` float32 colors of the points in [0, 1].
+      near: lower bound of z-depth in the scene, in world units.
+      far: upper bound of z-depth in the scene, in world units.
+      names: for each split present, the names of its photographs in order.
+      metadata: extra facts from the loader, such as source paths and downscale; `seen`, for each
+        training photograph the indices of the points that it shows, and `point_errors`, their mean
+        reprojection errors `[P]` in pixels of the photographs' own size, where the files tell.
+      surface: renders a `Camera` to its exact `Surface`; None for photographed scenes.
+      photographs_at: reads the photographs of a split again at 1 / n of their own size, given n
+        and the split, "train" by default, and returns `Views` and what `sizes` says of these; None
+        where they have no finer size to be read at.
+    """
+
+    name: str
+    train: Views
+    test: Views | None
+    test_far: Views | None
+    points: np.ndarray
+    rgb: np.ndarray
+    near: float
+    far: float
+    names: dict[str, list[str]]
+    metadata: dict[str, Any] = dataclasses.field(default_factory=dict)
+    surface: Callable[[Camera], Surface] | None = None
+    photographs_at: Callable[..., tuple[Views, list[tuple[int, int]]]] | None = None
+
+    def sizes(self, split: str) -> list[tuple[int, int]]:
+        """Width and height of each photograph of a split, without its padding."""
+        views = getattr(self, split)
+        padded = views.cameras.width, views.cameras.height
+        return self.metadata.get("sizes", {}).get(split) or [padded] * len(views)
+
+    def camera(self, split: str, index: int) -> Camera:
+        """The camera of one photograph, without the padding at its right and its bottom."""
+        width, height = self.sizes(split)[index]
+        return camera_at(getattr(self, split).cameras, index).replace(width=width, height=height)
+
+
+def keep_photographs(scene: Scene, chosen: Sequence[int]) -> Scene:
+    """The scene with some of its training photographs, and the points in two of their pictures.
+
+    Args:
+      scene: a scene whose metadata say nothing of single training photographs.
+      chosen: indices of the training photographs that stay.
+    """
+    if len(chosen) == len(scene.train):
+        return scene
+    rows = np.array(chosen)
+
+    def take(views: Views) -> Views:
+        return jax.tree.map(lambda leaf: leaf[rows], views)
+
+    def photographs_at(factor: int, split: str = "train") -> tuple[Views, list[tuple[int, int]]]:
+        views, sizes = scene.photographs_at(factor, split)
+        return (take(views), [sizes[i] for i in chosen]) if split == "train" else (views, sizes)
+
+    train = take(scene.train)
+    size = np.array([train.cameras.width, train.cameras.height], np.float32)
+    times_seen = np.zeros(len(scene.points), int)
+    for view in range(len(rows)):
+        pixels, depth = map(
+            np.asarray, points_to_pixels(camera_at(train.cameras, view), scene.points)
+        )
+        times_seen += np.all((pixels >= 0) & (pixels < size), axis=-1) & (depth > 0)
+    return dataclasses.replace(
+        scene,
+        train=train,
+        points=scene.points[times_seen > 1],
+        rgb=scene.rgb[times_seen > 1],
+        names=scene.names | {"train": [scene.names["train"][i] for i in chosen]},
+        photographs_at=scene.photographs_at and photographs_at,
+    )

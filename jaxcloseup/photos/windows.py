@@ -1,0 +1,214 @@
+"""Windows: parts of photographs at several sizes, each as costly to render as a reduced photograph.
+
+A window is a camera with a shifted principal point, so a field renders it as any image.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from jaxcloseup.geometry.cameras import Camera, crop_camera, pixels_to_points
+from jaxcloseup.geometry.visibility import sample_where_visible
+from jaxcloseup.photos.pyramids import Pyramid, photograph_pyramid
+from jaxcloseup.photos.views import Batch, Views, camera_at, to_float
+
+
+@struct.dataclass
+class Windows:
+    """Photographs of one capture at L sizes, V views.
+
+    Attributes:
+      cameras: stacked cameras, with the size of all windows; of photographs, of their coarsest
+        level.
+      pyramid: `[V, P, 4]` colors and weights of the photographs.
+      shares: `[L]` probability of each level, finest first.
+      places: `[K, 3]` centers of windows, of which each is drawn alike: a view, and x and y as
+        shares of its width and height; None: windows lie anywhere.
+    """
+
+    cameras: Camera
+    pyramid: Pyramid
+    shares: jax.Array
+    places: jax.Array | None = None
+
+    def __len__(self) -> int:
+        """Number of photographs."""
+        return self.pyramid.values.shape[0]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of a window in pixels."""
+        return self.cameras.height, self.cameras.width
+
+
+def photograph_windows(cameras: Camera, pyramid: Pyramid, *, whole_share: float) -> Windows:
+    """Windows of which a share is whole photographs of the coarsest level; other levels are alike.
+
+    Args:
+      cameras: stacked cameras of the coarsest level.
+      pyramid: `[V, P, 4]` colors and weights.
+      whole_share: in [0, 1].
+    """
+    finer = len(pyramid.sizes) - 1
+    shares = [(1 - whole_share) / finer] * finer + [whole_share] if finer else [1.0]
+    return Windows(cameras, pyramid, jnp.array(shares, jnp.float32))
+
+
+def view_windows(views: Views, height: int, width: int) -> Windows:
+    """Windows of views that are at least as large, at their own size and at halves, drawn alike."""
+    pyramid = photograph_pyramid(views, least=(height, width))
+    count = len(pyramid.sizes)
+    cameras = views.cameras.replace(height=height, width=width)
+    return Windows(cameras, pyramid, jnp.full(count, 1 / count, jnp.float32))
+
+
+def windows_that_see(
+    key: jax.Array,
+    windows: Windows,
+    cameras: Camera,
+    depths: jax.Array,
+    views: Views,
+    view_depths: jax.Array,
+    *,
+    count: int = 4096,
+    tolerance: float = 0.05,
+) -> Windows:
+    """The same photographs, with windows around what other cameras see; consumes `key`.
+
+    Pixels of these cameras are drawn uniformly, and for each one of the photographs that see its
+    surface; a pixel that none sees draws a place in any photograph.
+
+    Args:
+      key: random key.
+      windows: the photographs.
+      cameras: stacked `[Q]`.
+      depths: `[Q, H, W]` their z-depths; 0 is undefined.
+      views: the photographs as small as their depths, V views.
+      view_depths: `[V, H, W]` z-depths of the photographs.
+      count: number K of places.
+      tolerance: relative difference of depths up to which a photograph sees a surface.
+    """
+    key_camera, key_pixel, key_view, key_any = jax.random.split(key, 4)
+    which = jax.random.randint(key_camera, (count,), 0, depths.shape[0])
+    size = jnp.array([cameras.width, cameras.height], jnp.float32)
+    pixels = jax.random.uniform(key_pixel, (count, 2)) * size[None]
+    column, row = jnp.floor(pixels).astype(jnp.int32).T
+    depth = depths[which, row, column]
+
+    def point(camera, pixel, depth):
+        return pixels_to_points(camera_at(cameras, camera), pixel, depth)
+
+    points = jax.vmap(point)(which, pixels, jnp.where(depth > 0, depth, 1))
+
+    def look(camera, own_depth, weight):
+        landed, _, weight = sample_where_visible(camera, own_depth, weight, points, tolerance)
+        return landed, weight
+
+    landed, seen = jax.vmap(look)(views.cameras, view_depths, views.weight)
+    seen = jnp.where(depth[None] > 0, seen, 0)
+    # Any photograph is as good as another where none sees the point.
+    view = jax.random.categorical(key_view, jnp.log(seen + 1e-6), axis=0)
+    chosen = view, jnp.arange(count)
+    size = jnp.array([views.cameras.width, views.cameras.height], jnp.float32)
+    anywhere = jax.random.uniform(key_any, (count, 2))
+    place = jnp.where(seen[chosen][:, None] > 0, landed[chosen] / size[None], anywhere)
+    return windows.replace(places=jnp.concatenate([view[:, None].astype(place.dtype), place], 1))
+
+
+def sample_window(key: jax.Array, windows: Windows) -> Batch:
+    """Draw a place, of any photograph or of those given, and a level by its share; consumes `key`.
+
+    The window lies around the place as far as the photograph reaches.
+    """
+    key_view, key_level, key_y, key_x = jax.random.split(key, 4)
+    level = jax.random.categorical(key_level, jnp.log(windows.shares))
+    sizes = jnp.asarray(windows.pyramid.sizes, jnp.int32)
+    own = jnp.array(windows.size, jnp.int32)
+    room = sizes[level] - own + 1
+    if windows.places is None:
+        view = jax.random.randint(key_view, (), 0, len(windows))
+        corner = jnp.stack(
+            [jax.random.randint(key_y, (), 0, room[0]), jax.random.randint(key_x, (), 0, room[1])]
+        )
+    else:
+        view, center = _draw_place(key_view, windows, ())
+        extent = sizes[level].astype(center.dtype)
+        corner = jnp.floor(center * extent - own.astype(center.dtype) / 2).astype(jnp.int32)
+        corner = jnp.clip(corner, 0, room - 1)
+    return cut_window(windows, view, level, corner)
+
+
+def _draw_place(key, windows, shape):
+    """A view `[...]`, and y and x `[..., 2]` as shares of its height and width."""
+    place = windows.places[jax.random.randint(key, shape, 0, len(windows.places))]
+    return place[..., 0].astype(jnp.int32), place[..., :0:-1]
+
+
+def sample_window_pixels(key: jax.Array, windows: Windows, count: int) -> Batch:
+    """Draw `count` pixels with replacement, for fields that render single rays; consumes `key`.
+
+    Each is one of a photograph drawn uniformly, of a level by its share, of its pixels uniformly;
+    or of a window around a given place.
+    """
+    key_view, key_level, key_y, key_x = jax.random.split(key, 4)
+    pyramid = windows.pyramid
+    level = jax.random.categorical(key_level, jnp.log(windows.shares), shape=(count,))
+    sizes, starts = (jnp.asarray(x, jnp.int32) for x in (pyramid.sizes, pyramid.starts))
+    height, width = sizes[level].T
+    if windows.places is None:
+        view = jax.random.randint(key_view, (count,), 0, len(windows))
+        y = jax.random.randint(key_y, (count,), 0, height)
+        x = jax.random.randint(key_x, (count,), 0, width)
+    else:
+        view, center = _draw_place(key_view, windows, (count,))
+        within = jax.random.uniform(key_y, (count, 2)) - 0.5
+        extent = sizes[level].astype(center.dtype)
+        own = jnp.array(windows.size, center.dtype)
+        pixel = jnp.floor(center * extent + within * own[None]).astype(jnp.int32)
+        y, x = jnp.clip(pixel, 0, sizes[level] - 1).T
+    values = to_float(pyramid.values[view, starts[level] + y * width + x])
+    return Batch(
+        cameras=camera_at(windows.cameras, view).replace(
+            intrinsics=pyramid.intrinsics[view, level]
+        ),
+        pixels=jnp.stack([x, y], axis=-1).astype(jnp.float32) + 0.5,
+        rgb=values[..., :3],
+        weight=values[..., 3],
+    )
+
+
+def cut_window(
+    windows: Windows, view: jax.Array | int, level: jax.Array | int, corner: jax.Array
+) -> Batch:
+    """The window of one view at one level whose first pixel is in row and column `corner[2]`."""
+    pyramid = windows.pyramid
+    height, width = windows.size
+    sizes, starts = (jnp.asarray(x, jnp.int32) for x in (pyramid.sizes, pyramid.starts))
+    rows = corner[0] + jnp.arange(height)[:, None]
+    columns = corner[1] + jnp.arange(width)[None]
+    values = to_float(pyramid.values[view, starts[level] + rows * sizes[level, 1] + columns])
+    camera = camera_at(windows.cameras, view).replace(intrinsics=pyramid.intrinsics[view, level])
+    camera = crop_camera(camera, corner[::-1], height=height, width=width)
+    return Batch(camera, None, values[..., :3], values[..., 3])
+
+
+def in_quarters(render: Callable[[Camera], Any], camera: Camera) -> Any:
+    """What `render(camera)` gives, from four calls for a quarter of the image each.
+
+    Args:
+      render: gives arrays `[H, W, ...]` of a camera's pixels.
+      camera: one camera.
+    """
+    height, width = -(-camera.height // 2), -(-camera.width // 2)
+    corners = (0, 0), (width, 0), (0, height), (width, height)
+    parts = [crop_camera(camera, np.array(x), height=height, width=width) for x in corners]
+
+    def join(*images):
+        halves = (np.concatenate(pair, axis=1) for pair in (images[:2], images[2:]))
+        return jnp.asarray(np.concatenate(list(halves))[: camera.height, : camera.width])
+
+    return jax.tree.map(join, *map(render, parts))

@@ -1,0 +1,148 @@
+"""The loss of a rendering, with its gradient taken in the same program, at once or in chunks."""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxcloseup.fields.contract import RadianceField, Rendering
+from jaxcloseup.geometry.numerics import safe_divide, take_turns
+from jaxcloseup.photos.views import Batch
+
+
+Loss = tuple[jax.Array, dict[str, jax.Array]]
+
+
+def judge(
+    field: RadianceField, rendering: Rendering, target_rgb: jax.Array, weight: jax.Array
+) -> Loss:
+    """`field.loss` of a rendering, with the rendering's overflow among the metrics.
+
+    Args:
+      field: field that rendered.
+      rendering: rendering of pixels `[...]`.
+      target_rgb: `[..., 3]` true colors.
+      weight: `[...]` non-negative.
+
+    Returns:
+      The loss and its metrics, with `"overflow"`, float32, if the field has a static capacity.
+    """
+    loss, metrics = field.loss(rendering, target_rgb, weight)
+    if rendering.overflow is not None:
+        metrics = metrics | {"overflow": rendering.overflow.astype(jnp.float32)}
+    return loss, metrics
+
+
+def rendered_loss(
+    params: Any,
+    buffers: Any,
+    batch: Batch,
+    key: jax.Array | None,
+    *,
+    field: RadianceField,
+    chunk: int | None = None,
+) -> Loss:
+    """Loss of what `field` renders at a batch's pixels, differentiable in `params` alone.
+
+    With `chunk`, differentiation renders that many pixels, takes their gradient and adds it to a
+    sum, so nothing is kept for a backward pass and nothing is computed twice. The sum is exact,
+    because a field's loss is a weighted mean over pixels. The chunks' renderings are then joined
+    along the pixels and judged once, so every array of a rendering must be per pixel: an array that
+    belongs to a whole rendering, such as `overflow`, could not be joined. Chunking changes the
+    random draws. A field that renders only whole images gains nothing from it.
+
+    Args:
+      params: parameters of the field.
+      buffers: buffers of the field.
+      batch: pixels and their true colors.
+      key: consumed by the rendering; None renders deterministically.
+      field: static; renders, and defines the loss.
+      chunk: static; pixels to differentiate at once, usually `field.gradient_chunk`; None for all.
+
+    Returns:
+      The loss and its metrics, from `judge`.
+    """
+    if chunk is None or batch.pixels is None or len(batch.pixels) <= chunk:
+        return _at_once(field, params, buffers, batch, key)
+    return _chunked(field, chunk, params, buffers, batch, key)
+
+
+def _plain(field, params, buffers, batch, key):
+    rendering = field.render(params, buffers, batch.cameras, batch.pixels, key)
+    return judge(field, rendering, batch.rgb, batch.weight)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _at_once(field, params, buffers, batch, key):
+    return _plain(field, params, buffers, batch, key)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _at_once_forward(field, params, buffers, batch, key):
+    # Outside `jax.jit`, JAX would compile what comes before and after the derivative apart, and
+    # trace both in every step.
+    of_params = jax.value_and_grad(functools.partial(_plain, field), has_aux=True)
+    return of_params(params, buffers, batch, key)
+
+
+def _scale_gradients(*arguments):
+    """The cotangents of a loss whose forward pass has taken the gradients already."""
+    gradients, (cotangent, _) = arguments[-2:]
+    return _times(cotangent, gradients), None, None, None
+
+
+@jax.jit
+def _times(factor, tree):
+    return jax.tree.map(lambda leaf: factor * leaf, tree)
+
+
+_at_once.defvjp(_at_once_forward, _scale_gradients)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+def _chunked(field, chunk, params, buffers, batch, key):
+    del chunk
+    return _plain(field, params, buffers, batch, key)
+
+
+def _chunked_forward(field, chunk, params, buffers, batch, key):
+    return take_turns(functools.partial(_add_up, field, chunk))(params, buffers, batch, key)
+
+
+def _add_up(field, chunk, params, buffers, batch, key):
+    total = jnp.sum(batch.weight)
+
+    def add_gradient(gradients, piece):
+        piece, key = piece
+
+        def share_of_loss(params):
+            rendering = field.render(params, buffers, piece.cameras, piece.pixels, key)
+            loss, _ = field.loss(rendering, piece.rgb, piece.weight)
+            return loss * safe_divide(jnp.sum(piece.weight), total), rendering
+
+        gradient, rendering = jax.grad(share_of_loss, has_aux=True)(params)
+        return jax.tree.map(jnp.add, gradients, gradient), rendering
+
+    pieces = _split(batch, chunk)
+    keys = None if key is None else jax.random.split(key, len(pieces.pixels))
+    zeros = jax.tree.map(jnp.zeros_like, params)
+    gradients, renderings = jax.lax.scan(add_gradient, zeros, (pieces, keys))
+    rendering = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: len(batch.pixels)], renderings)
+    return judge(field, rendering, batch.rgb, batch.weight), gradients
+
+
+_chunked.defvjp(_chunked_forward, _scale_gradients)
+
+
+def _split(batch: Batch, chunk: int) -> Batch:
+    """Pieces of `chunk` pixels on a new leading axis; pixels of weight 0 fill up the last one."""
+    count = len(batch.pixels)
+    fill = -count % chunk
+    cameras = batch.cameras
+    if cameras.intrinsics.ndim == 1:
+        cameras = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), cameras)
+    batch = batch._replace(cameras=cameras)
+    padded = jax.tree.map(lambda x: jnp.concatenate([x, x[:1].repeat(fill, 0)]), batch)
+    padded = padded._replace(weight=jnp.pad(batch.weight, (0, fill)))
+    return jax.tree.map(lambda x: x.reshape(-1, chunk, *x.shape[1:]), padded)

@@ -1,0 +1,204 @@
+"""Files of a run that somebody edited, or that a disk damaged: one sentence names what is wrong."""
+
+import json
+import os
+import shutil
+
+import pytest
+from absl import flags
+from absl.testing import flagsaver
+from test_render import copy_of
+from tiny_runs import KEPT
+
+from jaxcloseup.app.cli import render, sweep
+from jaxcloseup.app.methods import METHODS
+from jaxcloseup.app.run import setup
+from jaxcloseup.app.run.logs import TrainLog
+from jaxcloseup.app.run.loop import TrainingError
+from jaxcloseup.app.run.programs import Programs
+from jaxcloseup.app.run.settings import (
+    BOUNDS,
+    check_value,
+    plain_config,
+    settings_of,
+    with_settings,
+)
+from jaxcloseup.app.store.manifest import write_manifest
+from jaxcloseup.app.store.stored_config import preset_from_config
+from jaxcloseup.app.store.stored_run import RunError, read_run
+from jaxcloseup.artifacts.checkpoints import CheckpointError, Checkpoints
+from jaxcloseup.captures.json_fields import read_object
+from jaxcloseup.captures.load import load_scene
+from jaxcloseup.photos.scene import SceneError
+
+
+RUN = "checkpoints/run.json"
+NESTED = "[" * 5000 + "]" * 5000
+
+
+def without(name):
+    return lambda fields: {key: value for key, value in fields.items() if key != name}
+
+
+def with_setting(name, value):
+    """The run with a setting of its surfels changed."""
+
+    def change(fields):
+        config = fields["config"]
+        return fields | {"config": config | {"field": config["field"] | {name: value}}}
+
+    return change
+
+
+CAPACITY = r"config\.field\.capacity must be"
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("manifest.json", without("load_options"), "manifest.json: load_options must be an object"),
+        ("manifest.json", without("data_sha256"), "manifest.json: data_sha256 must be a text"),
+        ("manifest.json", lambda a: a | {"scene": 3}, "manifest.json: scene must be a text"),
+        ("manifest.json", lambda _: NESTED, "manifest.json cannot be read .it is nested too deep"),
+        (RUN, without("resolution"), "run.json: resolution must be a list"),
+        (RUN, lambda a: a | {"resolution": [32] * 99}, "resolution must be a width and a height"),
+        (RUN, without("seed"), "run.json: seed must be a whole number"),
+        (RUN, lambda a: a | {"seed": 2**70}, "run.json: seed must be a whole number"),
+        (RUN, lambda a: a | {"config": None}, "run.json: config must be an object"),
+        (RUN, lambda _: NESTED, "run.json cannot be read .it is nested too deep"),
+        (RUN, lambda _: "[]", "run.json cannot be read .it is not an object"),
+        (RUN, with_setting("capacity", 0), f"{CAPACITY} between 1 and 100000000"),
+        (RUN, with_setting("capacity", -1), f"{CAPACITY} between 1 and 100000000"),
+        (RUN, with_setting("capacity", 10**12), f"{CAPACITY} between 1 and 100000000"),
+        (RUN, with_setting("capacity", 10**999), f"{CAPACITY} a whole number between"),
+        (RUN, with_setting("capacity", "a"), f"{CAPACITY} a whole number between"),
+        (RUN, with_setting("capacity", 1.5), f"{CAPACITY} a whole number between"),
+        (RUN, with_setting("capacity", True), f"{CAPACITY} a whole number between"),
+        (RUN, with_setting("capacity", {"a": 1}), r"config\.field\.capacity holds fields"),
+        (
+            RUN,
+            with_setting("sh_degree", 10**9),
+            r"config\.field\.sh_degree must be between 0 and 3",
+        ),
+        (RUN, with_setting("depth", ["mean"]), r"config\.field\.depth must be median or expected"),
+        (RUN, with_setting("means_lr", [1]), r"config\.field\.means_lr must be two numbers"),
+        (RUN, with_setting("raster", None), r"config\.field\.raster must hold fields"),
+        (RUN, lambda a: a | {"config": a["config"] | {"field": None}}, r"config\.field must hold"),
+        (RUN, lambda a: a | {"config": a["config"] | {"method": [1]}}, "there is no method"),
+    ],
+)
+def test_an_edited_run_is_one_sentence(kept, tmp_path, name, change, message):
+    copy_of(kept, tmp_path / "run", name, change)
+    with pytest.raises(RunError, match=message) as error:
+        read_run(tmp_path / "run")
+    assert "\n" not in str(error.value) and str(tmp_path / "run") in str(error.value)
+
+
+def pipe(path):
+    os.mkfifo(path)
+
+
+def endless(path):
+    path.symlink_to("/dev/zero")
+
+
+def terabyte(path):
+    path.touch()
+    os.truncate(path, 2**40)
+
+
+@pytest.mark.parametrize("make", [pipe, endless, terabyte])
+def test_a_file_that_does_not_end_is_not_read(kept, tmp_path, make):
+    copy_of(kept, tmp_path, None, None)
+    (tmp_path / RUN).unlink()
+    make(tmp_path / RUN)
+    message = r"run\.json cannot be read \((Not an ordinary file|More than 1024 MiB)"
+    with pytest.raises(RunError, match=message):
+        read_run(tmp_path)
+    with pytest.raises(CheckpointError, match=message):
+        Checkpoints(tmp_path / "checkpoints", {})
+    shutil.copy(kept / RUN, tmp_path / "copy.json")
+    make(tmp_path / "transforms.json")
+    with pytest.raises(SceneError, match=r"transforms\.json cannot be read"):
+        read_object(tmp_path / "transforms.json", "frames")
+
+
+def test_the_program_says_so(kept, tmp_path):
+    flags.FLAGS(["render"])
+    broken = copy_of(kept, tmp_path / "broken", RUN, with_setting("capacity", 0))
+    with (
+        flagsaver.flagsaver(compilation_cache="", run=broken, views="test"),
+        pytest.raises(SystemExit, match=r"^experiments\.render: --run=.*capacity must be"),
+    ):
+        render.main(["render"])
+
+
+@pytest.mark.parametrize(
+    ("method", "setting"), [("surfels", "capacity=100000000"), ("nerf", "width=2147483647")]
+)
+def test_what_does_not_fit_into_memory_is_not_begun(capture_folder, monkeypatch, method, setting):
+    monkeypatch.setattr(setup, "installed_memory", lambda: 2**30)
+    preset = with_settings(METHODS[method].presets["quick"], [setting])
+    programs = Programs(preset, load_scene(str(capture_folder)))
+    with pytest.raises(TrainingError, match=r"takes [\d.]+ GiB, but this computer has 1.0: choose"):
+        setup.initial_state(programs, 0)
+
+
+@pytest.mark.parametrize("text", ["{}", NESTED, "[1]", '{"scenes": 3}'])
+def test_a_sweep_with_another_manifest_is_one_sentence(capture_folder, tmp_path, text):
+    flags.FLAGS(["sweep"])
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "manifest.json").write_text(text)
+    scenes = {"scenes": [str(capture_folder)], "downscale": 1, "arms": ["control"]}
+    with (
+        flagsaver.flagsaver(compilation_cache="", output_dir=str(tmp_path), resume=True, **scenes),
+        pytest.raises(SystemExit, match=r"manifest\.json.*: restore") as error,
+    ):
+        sweep.main(["sweep"])
+    assert "\n" not in error.value.code
+
+
+@pytest.mark.parametrize("text", ["[]", "{}", NESTED, '{"git_commit": [3]}'])
+def test_a_damaged_manifest_is_written_anew(tmp_path, text):
+    (tmp_path / "manifest.json").write_text(text)
+    write_manifest(tmp_path, {"seed": 0})
+    assert json.loads((tmp_path / "manifest.json").read_text())["seed"] == 0
+
+
+def test_damaged_lines_of_the_log_are_left_out(tmp_path):
+    rates = {"steps_per_second": 1.0, "seconds": 2.0}
+    good = {"stage": "baseline", "step": 5, "loss": 0.5, **rates}
+    bad = [{"stage": [[]]}, {"step": {}}, {"seconds": "a"}, {"steps_per_second": []}]
+    lines = [json.dumps(good | change) for change in (*bad, {})]
+    file = tmp_path / "stats" / "train.jsonl"
+    file.parent.mkdir()
+    file.write_text("\n".join([*lines, NESTED]))
+    TrainLog(tmp_path).begin("control", [])
+    assert list(map(json.loads, file.read_text().splitlines())) == [good]
+
+
+def test_a_log_that_is_a_pipe_is_one_sentence(tmp_path):
+    (tmp_path / "stats").mkdir()
+    pipe(tmp_path / "stats" / "train.jsonl")
+    with pytest.raises(
+        OSError, match=r"^/.*train\.jsonl cannot be read .* ordinary file\): remove it"
+    ):
+        TrainLog(tmp_path).begin("control", [])
+
+
+def test_every_preset_is_within_the_bounds_of_settings():
+    names = set()
+    for method in METHODS.values():
+        for preset in method.presets.values():
+            assert preset_from_config(json.loads(json.dumps(plain_config(preset)))) == (preset, {})
+            for name, setting in settings_of(preset, method).items():
+                assert check_value(name, setting.value, setting.kind) == setting.value
+                names.add(name.rpartition(".")[2])
+    assert set(BOUNDS) <= names  # none is misspelled
+
+
+def test_whole_numbers_may_stand_for_others():
+    stored = plain_config(KEPT)
+    stored["labels"]["lr_scale"] = 1
+    preset, _ = preset_from_config(stored)
+    assert preset == KEPT and isinstance(preset.labels.lr_scale, float)

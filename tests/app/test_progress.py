@@ -1,0 +1,203 @@
+"""What a run says while it computes: by a clock that the test moves, and by lines as they come."""
+
+import io
+import re
+import sys
+import time
+
+import pytest
+
+from jaxcloseup.app import progress
+from jaxcloseup.app.process.counting import progress as stage_progress
+from jaxcloseup.app.progress import display, threads
+from jaxcloseup.app.progress.estimate import Estimate
+from jaxcloseup.app.run import plan
+
+
+PLAN = {"a": 10.0, "b": 20.0, "c": 30.0, "d": 40.0}
+
+
+class Clock:
+    def __init__(self):
+        self.now = self.compiled = 0.0
+
+    def wait(self, seconds, compiling=0.0):
+        self.now += seconds + compiling
+        self.compiled += compiling
+
+
+@pytest.fixture
+def clock():
+    return Clock()
+
+
+@pytest.fixture
+def estimate(clock):
+    return Estimate(PLAN, clock=lambda: clock.now, compiled=lambda: clock.compiled)
+
+
+def test_a_run_that_takes_three_times_as_long_as_planned(estimate, clock):
+    assert estimate.left() is None
+    estimate.begin("a")
+    assert estimate.left() is None and estimate.place == (1, 4)
+    clock.wait(30)
+    estimate.end()
+    assert estimate.left() == pytest.approx(3 * (20 + 30 + 40))
+    estimate.begin("b")
+    clock.wait(10)
+    assert estimate.left() == pytest.approx(50 + 3 * (30 + 40)) and estimate.place == (2, 4)
+    clock.wait(500)  # longer than planned: its end is near
+    assert estimate.left() == pytest.approx(3 * (30 + 40))
+
+
+def test_compiling_is_not_part_of_the_rate(estimate, clock):
+    estimate.begin("a")
+    estimate.count(0, 100)
+    clock.wait(2, compiling=60)
+    estimate.count(20, 100)
+    assert estimate.rate == pytest.approx(10)
+    clock.wait(4)
+    estimate.count(40, 100)
+    assert estimate.rate == pytest.approx(5)  # the first count says less than one without compiling
+    # 12 s are left of this part, whose 100 steps take 20 s instead of 10.
+    assert estimate.left() == pytest.approx(12 + 2 * (20 + 30 + 40))
+    clock.wait(1)
+    assert estimate.left() == pytest.approx(11 + 2 * (20 + 30 + 40))
+    clock.wait(100, compiling=20)
+    estimate.end()
+    estimate.begin("b")
+    clock.wait(0, compiling=50)
+    assert estimate.left() == pytest.approx(2 * (20 + 30 + 40))
+
+
+def test_a_resumed_part_is_measured_by_the_steps_that_it_takes(estimate, clock):
+    estimate.begin("a")
+    estimate.count(90, 100)
+    clock.wait(2)
+    estimate.count(100, 100)
+    assert estimate.rate == pytest.approx(5)
+    estimate.end()
+    # A tenth of what was planned to take 10 s took 2.
+    assert estimate.left() == pytest.approx(2 * (20 + 30 + 40))
+
+
+def test_what_does_not_come_is_not_waited_for(estimate, clock):
+    estimate.begin("a")
+    clock.wait(10)
+    estimate.end()
+    estimate.skip("c", "a", "nothing")
+    assert estimate.left() == pytest.approx(20 + 40)
+    estimate.begin("unplanned")
+    clock.wait(5)
+    assert estimate.place is None
+    estimate.end()
+    estimate.begin("d")
+    assert estimate.place == (3, 3) and estimate.left() == pytest.approx(1.5 * 40)
+
+
+def test_without_a_plan_the_time_of_the_part_is_left(clock):
+    estimate = Estimate({}, clock=lambda: clock.now)
+    estimate.begin("a")
+    estimate.count(0, 100)
+    clock.wait(10)
+    estimate.count(50, 100)
+    assert estimate.left() == pytest.approx(10) and estimate.place is None
+
+
+def test_silence_is_broken(monkeypatch, capsys):
+    monkeypatch.setattr(display, "QUIET", 0.3)
+    with progress.showing(PLAN, words=lambda name: f"part {name}"):
+        with progress.part("b"), progress.saying("compiling the steps"):
+            assert capsys.readouterr().out.splitlines()[-1] == "[2/4] part b, compiling the steps"
+            time.sleep(1.4)
+            said = capsys.readouterr().out
+            assert said.count("\n") >= 2
+            assert "[2/4] part b, compiling the steps, 1 s" in said
+        with progress.part("c"):
+            for i in progress.track(range(3), "views"):
+                said = capsys.readouterr().out
+                time.sleep(0.6 * (i == 1))
+            assert "[3/4] part c, views: 1 of 3" in capsys.readouterr().out + said
+            counted = progress.count("c", 0, 20)
+            assert re.fullmatch(r"\[3/4\] c  0/20  \d+:\d\d left", counted)
+    assert progress.count("c", 5, 10) == "c  5/10"
+
+
+def test_a_stage_that_counts_breaks_the_silence_too(monkeypatch, capsys):
+    monkeypatch.setattr(display, "QUIET", 0.3)
+    with progress.showing(), stage_progress("matching", "pairs") as report:
+        assert capsys.readouterr().out == "matching\n"
+        report(10, 1000)
+        time.sleep(0.5)
+        report(30, 1000)
+        time.sleep(0.7)
+    first, *_, shown, last = capsys.readouterr().out.splitlines()
+    assert first.startswith("matching: 10 of 1000, 0.0 pairs/s")
+    # 20 pairs, because 10 were there before.
+    assert re.fullmatch(r"matching: 30 of 1000, [234]\d\.\d pairs/s, 0:[234]\d left(, 1 s)?", shown)
+    assert re.fullmatch(r"matching: 30 of 1000, [234]\d\.\d pairs/s", last)
+
+
+def test_a_terminal_shows_one_line_below_what_is_printed(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stdout", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    with progress.showing(), progress.showing(PLAN), progress.part("a"):
+        print("a sentence")
+        time.sleep(0.8)
+    said = terminal.getvalue()
+    assert "a sentence\n" in said and "[1/4] a" in said
+    assert said.rindex("\x1b[?25h") > said.rindex("[1/4] a")  # the cursor is back
+
+
+def test_parts_have_words():
+    assert plan.in_words("control_evaluation") == "scoring control"
+    assert plan.in_words("refine_baseline").startswith("adding surfels")
+    assert plan.in_words("coarse_baseline") == "coarse_baseline"
+
+
+@pytest.mark.parametrize("cores", [1, 2, 64])
+def test_each_keeps_the_order(monkeypatch, cores):
+    """Later values may be done first; the first is done before another one begins."""
+    monkeypatch.setattr(threads.os, "cpu_count", lambda: cores)
+    begun, ended, before_second = [], [], []
+
+    def give(value):
+        begun.append(value)
+        if value == 1:
+            before_second.extend(ended)
+        time.sleep(0.02 if value % 2 else 0)
+        ended.append(value)
+        return -value
+
+    found = progress.each(give, range(9), "values")
+    assert next(found) == 0
+    assert len(begun) <= 1 + min(cores, 4) + 1  # no more is held than threads work on
+    assert list(found) == [-value for value in range(1, 9)]
+    assert before_second == [0]
+    assert sorted(ended) == list(range(9))
+    assert list(progress.each(give, [], "values")) == []
+
+
+@pytest.mark.parametrize("cores", [1, 2])
+@pytest.mark.parametrize("bad", [0, 3])
+def test_each_passes_an_error_on(monkeypatch, cores, bad):
+    monkeypatch.setattr(threads.os, "cpu_count", lambda: cores)
+    begun = []
+
+    def give(value):
+        begun.append(value)
+        if value == bad:
+            raise ValueError("no such value")
+        return value
+
+    found = []
+    with pytest.raises(ValueError, match="no such value"):
+        for value in progress.each(give, range(100), "values"):
+            found.append(value)
+    assert found == list(range(bad))
+    assert len(begun) < 20

@@ -1,0 +1,203 @@
+"""The page of a run: what it says first, and where photographs show the same as a close-up."""
+
+import math
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from browser import open_browser
+
+from jaxcloseup.app.report.page import Picture
+from jaxcloseup.app.report.pictures import comparisons, enlarge
+from jaxcloseup.app.report.report import print_results, write_report
+from jaxcloseup.app.report.showcase import Exhibit, best_middle_worst, cut_out, find_place
+from jaxcloseup.app.report.summary import conclusion, tables
+from jaxcloseup.app.score.scores import Target
+from jaxcloseup.artifacts.images import side_by_side
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.photos.pyramids import Pyramid
+
+
+def results(psnr, *, weight=None, detail=None, **changes):
+    """Results of stages with these PSNRs of close-ups; ordinary views have 10 dB more."""
+
+    def score(value):
+        return {"psnr": value, "ssim": 0.5, "cc_psnr": value + 1, "depth_error_median": 0.0123}
+
+    gate = None if weight is None else {"weight": weight, "agreement": 0.08}
+    return {
+        "stages": {
+            stage: {"test": score(value), "test_far": score(value + 10)}
+            for stage, value in psnr.items()
+        },
+        "gate": gate,
+        "config": {"targets": None},
+        "detail": detail and {"stage": detail},
+        "history": {"closeup": [{"label_coverage": 0.254}]},
+        "finer_resolution": None,
+        **changes,
+    }
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        (results({"baseline": 20.04}), "Close-ups have a PSNR of 20.0 dB."),
+        (
+            results({"control": 20.0, "closeup": 20.26}),
+            "Close-ups have a PSNR of 20.3 dB. Labels found for 25% of the pixels of close-ups "
+            "made the field 0.26 dB better than as many steps without.",
+        ),
+        (
+            results({"control": 20.0, "closeup": 19.9, "detail": 22.0}, detail="closeup"),
+            "Close-ups have a PSNR of 22.0 dB with the photographs' detail, 2.1 dB better than the "
+            "trained field alone. Labels found for 25% of the pixels of close-ups made the field "
+            "0.10 dB worse than as many steps without.",
+        ),
+        (
+            results({"control": 20.0, "closeup": 20.001}, weight=1.0),
+            "Labels found for 25% of the pixels of close-ups changed nothing.",
+        ),
+        (
+            results({"control": 20.0, "closeup": 20.0}, weight=0.0),
+            "Labels were not used: on photographs that were left out, only 8% of their pixels "
+            "agreed closely, too few to trust them.",
+        ),
+        (results({"closeup": 20.0}), "no control tells what they changed."),
+        (results({}), "No view was held out"),
+    ],
+)
+def test_a_page_begins_with_what_was_found(found, said):
+    assert said in conclusion(found)
+
+
+def test_without_close_ups_the_ordinary_views_count():
+    found = results({"baseline": 20.0})
+    del found["stages"]["baseline"]["test"]
+    assert conclusion(found) == "Ordinary views have a PSNR of 30.0 dB."
+    assert list(tables(found)) == ["Ordinary views"]
+
+
+def test_stages_without_labels_share_the_row_of_their_control():
+    psnr = {"baseline": 19.0, "control": 20.0, "closeup": 20.0, "test_time": 20.5}
+    header, body = tables(results(psnr, weight=0.0))["Close-ups"]
+    assert header == ["stage", "PSNR (dB)", "SSIM", "color-corrected", "depth off by"]
+    assert body[1] == ["control, closeup", "20.00", "0.5000", "21.00", "1.23%"]
+    assert [row[0] for row in body] == ["baseline", "control, closeup", "test_time"]
+    _, body = tables(results(psnr, weight=0.1))["Close-ups"]
+    assert [row[0] for row in body] == list(psnr)
+    by_warps = results(psnr | {"test_time_control": 20.0}, weight=0.0)
+    _, body = tables(by_warps)["Close-ups"]
+    assert body[-1][0] == "test_time_control, test_time"
+    by_detail = by_warps | {"config": {"targets": {"label": "residual"}}}
+    _, body = tables(by_detail)["Close-ups"]
+    assert [row[0] for row in body[-2:]] == ["test_time", "test_time_control"]
+
+
+def test_tables_show_the_finer_size_and_perceptual_distances():
+    found = results({"baseline": 20.0}, finer_resolution=[240, 135])
+    splits = found["stages"]["baseline"]
+    splits["test"]["lpips_vgg"] = 0.25
+    splits["test_finer"] = {"psnr": 18.0}
+    header, body = tables(found)["Close-ups"]
+    assert header[1:5] == ["PSNR (dB)", "at 240 x 135", "SSIM", "LPIPS (VGG)"]
+    assert body == [["baseline", "20.00", "18.00", "0.5000", "0.2500", "1.23%"]]
+    assert len(header) == 6
+
+
+def test_stages_are_never_cut_in_a_narrow_terminal(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "50")
+    print_results(results({"test_time_control": 20.0}))
+    assert "test_time_control" in capsys.readouterr().out
+
+
+def test_a_phone_shows_a_page_without_scrolling_it_sideways(tmp_path):
+    """Wide tables, rows of panels and the configuration scroll in themselves."""
+    found = results({"baseline": 19.0, "test_time_control": 20.0}, scene="a", method="m")
+    found |= {"preset": "quick", "seed": 0, "resolution": [24, 18], "versions": {}}
+    audit = {"error": 0.01, "kept": 0.5, "leaked": 0.1, "curve": None}
+    tried = {"rgb_tolerance": 0.02, "depth_tolerance": 0.005, "coverage": 0.1}
+    tried |= {"label_psnr": 30.0, "model_psnr": 31.0}
+    found["gate"] = {"weight": 0.0, "agreement": 0.08, "left_out": [tried]}
+    found |= {"labels": {"exact depth": audit}, "left_out": None}
+    found |= {"config": {"targets": None, "name": "long " * 50}}
+    for split in found["stages"]["baseline"].values():
+        split |= {"seen_psnr": 1.0, "seen_share": 0.5, "lpips_vgg": 0.3}
+    noise = np.random.default_rng(0).integers(0, 255, (18, 24, 3), np.uint8)
+    shown = [Exhibit("a" * 40, 20.0, noise, noise, "b" * 40, noise, pixel) for pixel in (0.2, 1.3)]
+    row = side_by_side([enlarge(noise)] * 5, labels=["a title"] * 5)
+    pictures = [Picture(section, "a", row) for section in ("Close-ups", "Pseudo-labels")]
+    write_report(tmp_path / "report.html", found, shown, pictures)
+    page = (tmp_path / "report.html").read_text()
+    assert "whose pixels are 5.0 times finer" in page and "are 1.3 times as large" in page
+    parts = "Close-ups beside", "times finer", "Close-ups</h2>", "Scores</h2>", "Pseudo-labels</h2>"
+    assert sorted(parts, key=page.index) == list(parts)
+    with open_browser() as browser:
+        size = {"width": 390, "height": 800, "deviceScaleFactor": 1, "mobile": True}
+        given = {"cmd": "Emulation.setDeviceMetricsOverride", "params": size}
+        browser.call("POST", "/goog/cdp/execute", given)
+        browser.open(f"file://{tmp_path}/report.html")
+        widths = browser.run(
+            "for (const one of document.querySelectorAll('details')) one.open = true;"
+            "const width = one => document.querySelector(one).getBoundingClientRect().width;"
+            "return [document.documentElement.scrollWidth, width('.wide img'), width('.pair')]"
+        )
+    assert widths[0] == 390 and widths[1] > 800 and widths[2] < 390
+
+
+def test_the_best_the_middle_and_the_worst_view_are_shown():
+    assert best_middle_worst({"a": 1.0, "b": 5.0, "c": 3.0, "d": 2.0}) == ["b", "d", "a"]
+    assert best_middle_worst({"a": 1.0, "b": 5.0}) == ["b", "a"]
+    assert best_middle_worst({"a": 1.0}) == ["a"]
+    assert best_middle_worst({}) == []
+
+
+def camera(position, focal, height, width, roll=0.0):
+    c, s = math.cos(roll), math.sin(roll)
+    turn = [[c, -s, 0, position[0]], [s, c, 0, position[1]], [0, 0, 1, position[2]]]
+    intrinsics = jnp.array([focal, focal, width / 2, height / 2])
+    return Camera(jnp.array(turn), intrinsics, height=height, width=width)
+
+
+def test_a_photograph_is_cut_out_where_it_shows_a_close_up():
+    """Both cameras look at a wall at z = 2, on which colors are a smooth function of the place."""
+
+    def wall(view, height, width):
+        v, u = np.mgrid[:height, :width] + 0.5
+        fx, fy, cx, cy = np.asarray(view.intrinsics, np.float64)
+        pose = np.asarray(view.camtoworld, np.float64)
+        depth = 2 - pose[2, 3]
+        x, y = (u - cx) / fx * depth, (v - cy) / fy * depth
+        x, y = (pose[i, 0] * x + pose[i, 1] * y + pose[i, 3] for i in (0, 1))
+        return np.stack([np.sin(6 * x), np.cos(5 * y), np.sin(4 * (x + y))], axis=-1) / 2 + 0.5
+
+    photograph = camera((0, 0, 0), 160.0, 96, 128)
+    near = camera((0.1, -0.05, 1), 60.0, 36, 48, roll=0.3)
+    depth = jnp.full((36, 48), 1.0).at[:4].set(0)  # undefined in some rows
+    place = find_place(near, depth, photograph)
+    # A pixel is 1/60 wide on the wall, and one of the photograph 2/160.
+    assert math.sqrt(np.linalg.det(place[:, :2])) == pytest.approx(160 / 2 / 60, rel=1e-4)
+    image = wall(photograph, 96, 128)
+    coarse = cv2.resize(image, (64, 48), interpolation=cv2.INTER_AREA)
+    values = np.concatenate([image.reshape(1, -1, 3), coarse.reshape(1, -1, 3)], axis=1)
+    intrinsics = jnp.stack([photograph.intrinsics, photograph.intrinsics / 2])[None]
+    pyramid = Pyramid(jnp.asarray(values * 255, jnp.uint8), intrinsics, ((96, 128), (48, 64)))
+    for focal in (60.0, 25.0):  # the second reads the coarser level
+        view = near.replace(intrinsics=jnp.array([focal, focal, 24.0, 18.0]))
+        found = cut_out(pyramid, 0, find_place(view, depth, photograph), view)
+        inside = (found > 0).any(axis=-1)
+        error = np.abs(found / 255 - wall(view, 36, 48))[inside]
+        assert inside.mean() > 0.5 and np.median(error) < 0.01
+    assert find_place(near, jnp.zeros((36, 48)), photograph) is None
+
+
+def test_the_page_shows_the_error_of_the_last_picture_that_it_shows(tmp_path):
+    """The file has all stages, the last of them wrong everywhere; the page has the right one."""
+    view = Target("view", None, jnp.zeros((8, 240, 3)), None, None)
+    images = {(stage, "test"): {"view": view.rgb + error} for stage, error in [("a", 0), ("b", 1)]}
+    (shown,) = comparisons(tmp_path, {"test": [view]}, images, in_report=["a"])
+    assert shown.image.shape[1] == 3 * 240 + 2 * 8
+    assert shown.image[-8:, -240:].max() < 10
+    written = cv2.imread(str(tmp_path / "view.png"))
+    assert written.shape[1] == 4 * 240 + 3 * 8 and written[-1, -1].max() > 200

@@ -1,0 +1,391 @@
+import base64
+import dataclasses
+import io
+import json
+import re
+import shutil
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import PIL.Image
+import plane
+import pytest
+from tiny_runs import TINY, TINY_SURFELS
+
+from jaxcloseup.app.jobs.evaluate import evaluate_folders
+from jaxcloseup.app.jobs.run import run
+from jaxcloseup.app.methods import (
+    METHODS,
+    CoarseConfig,
+    TargetConfig,
+    WindowConfig,
+    pseudo_settings,
+)
+from jaxcloseup.app.methods.surfels import REDUCED
+from jaxcloseup.app.report.comparison import read_finished, say_which_is_best, write_comparison
+from jaxcloseup.app.run.gate import AGREEMENT, gated, verdict, weigh_labels
+from jaxcloseup.app.run.loop import TrainingError, run_stage
+from jaxcloseup.app.run.programs import Programs
+from jaxcloseup.app.run.setup import initial_points, initial_state
+from jaxcloseup.app.score.audit import blur_to_footprint
+from jaxcloseup.app.score.scores import NO_PERCEPTUAL, Target, score, summarize
+from jaxcloseup.app.store.stored_run import choose_stage, load_run_scene, read_run, restore
+from jaxcloseup.app.view.approach import FRAMES
+from jaxcloseup.artifacts.checkpoints import Checkpoints
+from jaxcloseup.artifacts.images import to_uint8
+from jaxcloseup.artifacts.surfel_ply import read_surfels
+from jaxcloseup.captures.load import load_scene
+from jaxcloseup.fields.contract import Rendering
+from jaxcloseup.io.files import write_json
+from jaxcloseup.labels.make import label_sources
+from jaxcloseup.photos.views import camera_at
+from jaxcloseup.training.steps import init_state
+
+
+@pytest.fixture(scope="session")
+def finished(capture_folder, tmp_path_factory):
+    """The results and the folder of one tiny run."""
+    output_dir = tmp_path_factory.mktemp("run")
+    return run_tiny(capture_folder, output_dir), output_dir
+
+
+def run_tiny(capture_folder, output_dir):
+    # Libraries under a run (optax's schedules) mix integers and floats.
+    with jax.numpy_dtype_promotion("standard"):
+        scene = load_scene(str(capture_folder))
+        names = {"method": "nerf", "preset": "tiny"}
+        return run(scene, TINY, 0, output_dir, names=names, save_every=3)
+
+
+def assert_log_is_history(output_dir, history):
+    lines = list(map(json.loads, (output_dir / "stats" / "train.jsonl").read_text().splitlines()))
+    assert [line["stage"] for line in lines] == [s for s in history for _ in history[s]]
+    said = [
+        {key: value for key, value in line.items() if key not in ("steps_per_second", "seconds")}
+        for line in lines
+    ]
+    assert said == [{"stage": stage, **entry} for stage in history for entry in history[stage]]
+    assert all(line["steps_per_second"] > 0 and line["seconds"] > 0 for line in lines)
+
+
+def test_a_run_scores_every_stage_on_every_split(finished):
+    results, output_dir = finished
+    assert json.loads((output_dir / "results.json").read_text()) == results
+    assert results["resolution"] == [plane.WIDTH, plane.HEIGHT]
+    for stage in ("baseline", "control", "closeup", "test_time_control", "test_time", "detail"):
+        for split in ("test", "test_far"):
+            scores = results["stages"][stage][split]
+            assert scores["psnr"] == pytest.approx(scores["views"]["0"]["psnr"])
+            assert scores["ssim"] is not None
+            assert scores["lpips_vgg"] is None
+            assert scores["lpips_vgg_reason"]
+        assert results["seconds"][stage] > 0
+    assert results["stages"]["control"] != results["stages"]["closeup"]
+    assert results["detail"]["stage"] == "closeup" and results["detail"]["divisor"] == 1
+    assert (output_dir / "detail" / "closeup.npz").exists()
+    assert_log_is_history(output_dir, results["history"])
+
+
+def test_a_run_leaves_what_it_takes_to_render_it(finished, capture_folder):
+    results, output_dir = finished
+    manifest = json.loads((output_dir / "manifest.json").read_text())
+    assert manifest["finished"] and manifest["seconds"]["closeup"] == results["seconds"]["closeup"]
+    assert manifest["config"] == results["config"] and manifest["versions"]["device"]
+    assert manifest["scene"] == str(capture_folder.resolve())
+    record = read_run(output_dir)
+    assert record.preset == TINY
+    assert record.stages == ["baseline", "closeup", "control", "test_time", "test_time_control"]
+    assert choose_stage(record, None) == "closeup"
+    with jax.numpy_dtype_promotion("standard"):
+        scene = load_run_scene(record)
+        programs, state = restore(record, scene, "closeup")
+        image = programs.render(state, camera_at(scene.test.cameras, 0)).rgb
+    saved = cv2.imread(str(output_dir / "renders" / "closeup" / "test" / "rgb" / "0.png"))
+    np.testing.assert_allclose(to_uint8(image), saved[..., ::-1], atol=1)
+
+
+def test_surfels_run_through_all_stages_from_random_points(capture_folder, tmp_path, capsys):
+    """A coarse model becomes finer, and learns from windows of photographs twice as large."""
+    coarse = CoarseConfig(dataclasses.replace(TINY_SURFELS.field, capacity=500), steps=20)
+    steps = {"downscale": 2, "score_downscale": 1, "coarse": coarse, "windows": WindowConfig()}
+    steps["targets"] = TargetConfig("residual", lr_scale=2.0)
+    fine = dataclasses.replace(TINY_SURFELS.field, capacity=800, selective_adam=True)
+    preset = dataclasses.replace(TINY_SURFELS, field=fine, **steps)
+    stages = ["closeup", "test_time"]
+    with jax.numpy_dtype_promotion("standard"):
+        scene = load_scene(str(capture_folder), downscale=2)
+        names = {"method": "surfels", "preset": "tiny"}
+        results = run(scene, preset, 0, tmp_path, names=names, to_run=stages)
+    said = capsys.readouterr().out
+    assert "windows of photographs of 32 x 24 pixels, their own size" in said
+    assert "growing to" not in said
+    parts = [tuple(map(int, found)) for found in re.findall(r"^\[(\d+)/(\d+)\] ", said, re.M)]
+    assert parts[0][0] == 1 and parts[-1][0] == parts[-1][1]  # the report is the last one
+    assert parts == sorted(parts, key=lambda part: part[0]) and len(set(parts)) > 8
+    assert "\n[1/" in said and "compiling the steps" in said and "writing the report" in said
+    assert results["history"]["coarse_baseline"][-1]["step"] == 20
+    assert json.loads((tmp_path / "results.json").read_text()) == results
+    stages = results["stages"]
+    use_labels = results["gate"]["weight"] > 0
+    # Without labels, control takes the place of closeup.
+    assert ("control" in stages) == (not use_labels)
+    assert {"baseline", "closeup", "test_time"} <= set(stages)
+    assert stages["baseline"]["test"]["psnr"] > 10
+    assert results["resolution"] == [16, 12] and results["finer_resolution"] == [32, 24]
+    assert stages["baseline"]["test_finer"]["psnr"] > 10
+    assert stages["baseline"]["test_finer"]["psnr"] != stages["baseline"]["test"]["psnr"]
+    assert len(results["gate"]["left_out"]) == 6
+    if not use_labels:
+        assert stages["closeup"] == stages["control"]
+    # Target views learn from renders with detail, which the gate of warps does not concern.
+    latest = "closeup" if use_labels else "control"
+    assert (tmp_path / "detail" / f"{latest}.npz").exists()
+    assert [entry["step"] for entry in results["history"]["test_time"]] == [1, 2]
+    assert "test_time_control" not in stages
+    assert "left-out photographs" in (tmp_path / "report.html").read_text()
+    for stage in stages:
+        splats = read_surfels(tmp_path / "splats" / f"{stage}.ply")
+        assert len(splats.means) == 800  # new surfels took the rows that the coarse ones left
+
+
+def test_windows_of_reduced_photographs_are_these(capture_folder):
+    scene = load_scene(str(capture_folder), downscale=2)
+    preset = dataclasses.replace(TINY_SURFELS, windows=WindowConfig(finest=2), downscale=2)
+    assert Programs(preset, scene).photographs is scene.train
+
+
+def test_a_nerf_may_learn_from_rays_of_larger_photographs(capture_folder, capsys):
+    with jax.numpy_dtype_promotion("standard"):
+        scene = load_scene(str(capture_folder), downscale=2)
+        preset = dataclasses.replace(TINY, windows=WindowConfig(), downscale=2)
+        programs = Programs(preset, scene)
+        photographs = programs.photographs
+        assert "learning from pixels of photographs of 32 x 24 pixels" in capsys.readouterr().out
+        assert photographs.pyramid.sizes == ((24, 32), (12, 16))
+        state, metrics = programs.run(
+            "photographs", initial_state(programs, 0), photographs, count=2
+        )
+    assert state.step == 2 and metrics["skipped"] == 0 and np.isfinite(metrics["loss"])
+    assert METHODS["nerf"].presets["quick"].windows.finest == 8  # reduced photographs alone
+
+
+def test_no_step_is_taken_on_a_truncated_image(capture_folder, capsys):
+    """The same steps with too little room and with plenty end alike."""
+    states = []
+    for capacity in (1800, 3600):
+        raster = dataclasses.replace(TINY_SURFELS.field.raster, capacity=capacity)
+        field = dataclasses.replace(TINY_SURFELS.field, raster=raster)
+        with jax.numpy_dtype_promotion("standard"):
+            scene = load_scene(str(capture_folder))
+            programs = Programs(dataclasses.replace(TINY_SURFELS, field=field), scene)
+            points = initial_points(jax.random.key(1), scene, count=500)
+            bound = {"field": programs.field, "optimizer": programs.optimizer}
+            state = init_state(jax.random.key(0), *points, **bound)
+            after, metrics = programs.run("photographs", state, scene.train, count=3)
+        assert "overflow" not in metrics
+        states.append(after)
+    assert "growing to 2 times the preset's" in capsys.readouterr().out
+    assert states[0].step == states[1].step == 3
+    for small, large in zip(*(jax.tree.leaves(s.params) for s in states), strict=True):
+        np.testing.assert_allclose(small, large, atol=1e-5)
+
+
+def test_a_large_image_is_rendered_in_quarters(capture_folder):
+    """An image of odd size, twice as wide as what has a program of its own, has no seams."""
+    with jax.numpy_dtype_promotion("standard"):
+        scene = load_scene(str(capture_folder))
+        programs = Programs(TINY, scene)
+        state = initial_state(programs, 0)
+        camera = camera_at(scene.train.cameras, 1)
+        times = 4 + 3 / camera.width
+        size = {"height": 4 * camera.height + 1, "width": 4 * camera.width + 3}
+        camera = camera.replace(intrinsics=times * camera.intrinsics, **size)
+        whole = programs.field.render(state.params, state.buffers, camera, None, None)
+        seen = programs.render(state, camera)
+    assert np.std(whole.rgb) > 0.01
+    for name in ("rgb", "depth", "alpha"):
+        np.testing.assert_allclose(getattr(seen, name), getattr(whole, name), atol=1e-4)
+
+
+@pytest.mark.parametrize("off", [1.0, 1.02, 1.3])
+def test_labels_weigh_what_they_deserve(off):
+    """With exact depth labels are right; the further depth is off, the fewer of them agree."""
+    positions = (-0.6, -0.2, 0.2, 0.6)
+    cameras = [plane.camera_above(x, 0.1 * x, 3.0, tilt=0.1 * x) for x in positions]
+    views, depths = plane.make_views(cameras)
+
+    def render(camera):
+        rgb, depth, _ = plane.photograph(camera)
+        depth = jnp.asarray(off * depth, jnp.float32)
+        return Rendering(jnp.full(rgb.shape, 0.5), depth, jnp.ones(depth.shape))
+
+    settings = pseudo_settings(REDUCED.labels)
+    found = weigh_labels(label_sources(views, off * depths), render, settings)
+    changed = gated(REDUCED.labels, found)
+    low, high = AGREEMENT
+    expected = np.clip((found["agreement"] - low) / (high - low), 0, 1)
+    assert found["weight"] == pytest.approx(expected)
+    assert changed.label_loss_weight == pytest.approx(expected * settings.label_loss_weight)
+    changed = changed.replace(label_loss_weight=settings.label_loss_weight)
+    jax.tree.map(np.testing.assert_array_equal, changed, settings)
+    assert found["agreement"] == found["left_out"][0]["coverage"]
+    assert found["left_out"][-1]["model_psnr"] < 15
+    if off == 1.0:
+        assert found["left_out"][-1]["label_psnr"] > 30
+        assert found["weight"] > 0
+    if off == 1.3:
+        assert found["weight"] == 0
+    assert ("labels are not used" in verdict(found)) == (found["weight"] == 0)
+
+
+def test_a_saved_render_reproduces_its_score(finished, capture_folder):
+    results, output_dir = finished
+    image = cv2.imread(str(output_dir / "renders" / "closeup" / "test" / "rgb" / "0.png"))
+    truth = cv2.imread(str(capture_folder / "test" / "0.png"))
+    expected = results["stages"]["closeup"]["test"]["psnr"]
+    np.testing.assert_allclose(cv2.PSNR(image, truth), expected, atol=1e-3)
+    folders = (output_dir / "renders" / of / "test" / "rgb" for of in ("closeup", "truth"))
+    again = evaluate_folders(*folders, None, NO_PERCEPTUAL)
+    assert again["psnr"] == pytest.approx(expected, abs=1e-3)
+
+
+def test_a_run_leaves_pictures_and_a_page_without_links(finished):
+    _, output_dir = finished
+    for picture in ("compare/0.png", "compare/test_far_0.png", "labels/virtual_0.png"):
+        assert cv2.imread(str(output_dir / picture)) is not None
+    depth = cv2.imread(str(output_dir / "renders" / "baseline" / "test" / "depth" / "0.png"))
+    assert depth.shape == (plane.HEIGHT, plane.WIDTH, 3)
+    page = (output_dir / "report.html").read_text()
+    assert "src='data:image/webp" in page
+    assert page.index("Close-ups have a PSNR") < page.index("type=range") < page.index("<table")
+    assert len(page) < 3e6
+    animation = (output_dir / "dolly.webp").read_bytes()
+    assert base64.b64encode(animation).decode() in page
+    with PIL.Image.open(io.BytesIO(animation)) as shown:
+        assert shown.size == (plane.WIDTH, plane.HEIGHT)
+        assert shown.n_frames == 2 * FRAMES - 2  # there and back
+    # SVG names its namespaces by addresses, which nobody follows.
+    links = re.findall(r"(?:src|href)=['\"]([^'\"]*)", page)
+    assert links
+    assert all(link.startswith(("data:", "#")) for link in links)
+
+
+def test_finished_runs_can_be_compared(finished, tmp_path):
+    _, output_dir = finished
+    other = shutil.copytree(output_dir, tmp_path / "other")
+    runs = read_finished([output_dir, other])
+    write_comparison(tmp_path / "both", runs)
+    page = (tmp_path / "both" / "report.html").read_text()
+    assert "as good as" in say_which_is_best(runs) and page.count("type=range") == 2
+    assert [run.stage for run in runs] == ["detail", "detail"]
+
+
+def test_a_run_cut_off_and_resumed_ends_the_same(
+    finished, capture_folder, tmp_path, monkeypatch, capsys
+):
+    """Cut off in the middle of a stage, and once more between two stages."""
+    results, _ = finished
+    save = Checkpoints.save
+    for saves in (4, 8):
+        left = iter(range(saves))
+
+        def save_some(self, *args, left=left):
+            if next(left, None) is None:
+                raise KeyboardInterrupt
+            save(self, *args)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Checkpoints, "save", save_some)
+            with pytest.raises(KeyboardInterrupt):
+                run_tiny(capture_folder, tmp_path)
+    again = run_tiny(capture_folder, tmp_path)
+    assert "resumed" in capsys.readouterr().out
+    assert again["stages"] == results["stages"]
+    assert again["history"] == results["history"]
+    assert_log_is_history(tmp_path, results["history"])
+
+
+def test_training_that_is_no_longer_finite_stops_with_what_was_good(capture_folder, tmp_path):
+    with jax.numpy_dtype_promotion("standard"):
+        scene = load_scene(str(capture_folder))
+        programs = Programs(TINY, scene)
+        points = scene.points, scene.rgb
+        key = jax.random.key(0)
+        state = init_state(key, *points, field=programs.field, optimizer=programs.optimizer)
+        broken = scene.train.replace(rgb=jnp.full(scene.train.rgb.shape, jnp.nan))
+        checkpoints = Checkpoints(tmp_path, {"scene": "plane"})
+        good, calls, run = [], [], programs.run
+
+        def breaks_in_the_second_and_after_four(kind, state, views, *, count):
+            calls.append(count)
+            broke = len(calls) == 2 or len(calls) > 4
+            now = run(kind, state, broken if broke else views, count=count)
+            if not broke:
+                good.append(now[0])
+            return now
+
+        programs.run = breaks_in_the_second_and_after_four
+        message = r"stopped after 8 good .* kept in .* not finite in each of the next 10:"
+        with pytest.raises(TrainingError, match=message):
+            run_stage(
+                "baseline",
+                programs,
+                "photographs",
+                state,
+                scene.train,
+                steps=20,
+                checkpoints=checkpoints,
+                save_every=1000,
+            )
+        step, kept, progress = Checkpoints(tmp_path, {"scene": "plane"}).load("baseline", state)
+    assert [entry["skipped"] for entry in progress["history"]] == [0, 2, 0, 0]
+    assert step == 8 and calls == [2] * 9
+    jax.tree.map(np.testing.assert_array_equal, kept.params, good[-1].params)
+
+
+def test_numbers_that_are_not_finite_become_null(tmp_path):
+    write_json(tmp_path / "results.json", {"a": [float("nan"), 1.5], "b": {"c": float("inf")}})
+    text = (tmp_path / "results.json").read_text()
+    assert json.loads(text) == {"a": [None, 1.5], "b": {"c": None}}
+
+
+def test_a_perfect_render_has_no_psnr_but_a_reason():
+    rgb = jnp.full((16, 16, 3), 0.5)
+    ones = jnp.ones((16, 16))
+    result = score(Rendering(rgb, ones, ones), Target("0", None, rgb, ones, ones * 3))
+    assert result["psnr"] is None
+    assert result["psnr_reason"] == "equals the truth"
+    assert result["ssim"] == pytest.approx(1)
+
+
+def test_scores_ignore_padding_and_say_what_is_missing():
+    rgb = jax.random.uniform(jax.random.key(0), (24, 32, 3))
+    weight = jnp.ones((24, 32)).at[:, 20:].set(0)
+    spoilt = jnp.where(weight[..., None] > 0, rgb, 1 - rgb)
+    seen = jnp.zeros((24, 32), jnp.int32).at[:, :5].set(2)
+    target = Target("0", None, rgb, weight, seen)
+    noisy = jnp.clip(spoilt + 0.1, 0, 1)
+    result = score(Rendering(noisy, seen, seen), target)
+    expected = cv2.PSNR(*(np.asarray(x[:, :20] * 255).round() for x in (noisy, rgb)), 255)
+    np.testing.assert_allclose(result["psnr"], expected, atol=1e-3)
+    assert result["coverage_seen1"] == pytest.approx(0.25)
+    assert result["psnr_seen3"] is None
+    assert result["psnr_seen3_reason"]
+    summary = summarize({"0": result})
+    assert summary["psnr_seen3"] is None
+    assert summary["psnr_seen3_reason"] == result["psnr_seen3_reason"]
+
+
+@pytest.mark.parametrize("footprint", [2.0, 5.0])
+def test_blur_has_the_variance_of_the_source_pixel(footprint):
+    image = np.zeros((61, 61, 3), np.float32)
+    image[30, 30] = 1
+    blurred = blur_to_footprint(image, np.full((61, 61), footprint))[..., 0]
+    offset = np.arange(61) - 30
+    assert blurred.sum() == pytest.approx(1, abs=1e-3)
+    variance = (blurred.sum(axis=0) * offset**2).sum()
+    # A box of the pixel's width and a tent of twice that, less the image's own pixel.
+    expected = footprint**2 / 12 + footprint**2 / 6 - 1 / 12
+    assert variance == pytest.approx(expected, rel=0.15)

@@ -1,0 +1,360 @@
+"""Sweeps: arms are runs of their own, together; neither a failing one nor a stop costs others."""
+
+import csv
+import dataclasses
+import functools
+import json
+import os
+import pathlib
+import shutil
+import socket
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from absl import flags
+from absl.testing import flagsaver
+from conftest import QUICKLY
+from tiny_runs import TINY, TINY_MIP, TINY_SURFELS
+
+from jaxcloseup.app.cli import sweep
+from jaxcloseup.app.report.pictures import comparisons
+from jaxcloseup.app.report.tables import paired_bootstrap, rows, write_sweep
+from jaxcloseup.app.run.programs import Programs
+from jaxcloseup.app.run.setup import initial_points, start_labels
+from jaxcloseup.app.sweep import arm_training as sweep_stages
+from jaxcloseup.app.sweep.arm_training import run_sweep, stack_arms
+from jaxcloseup.app.sweep.arms import make_arm
+from jaxcloseup.captures.load import load_scene
+from jaxcloseup.training.steps import init_state
+
+
+ARMS = ["control", "labels", "diverse", "rgb_tolerance=0.5+magnification=2:3"]
+TINY_STEPS = dataclasses.replace(
+    TINY, field=dataclasses.replace(TINY.field, target_steps=2), closeup_steps=2
+)
+
+
+@functools.cache
+def begin(preset, capture_folder):
+    """Programs, the start of labels after a few steps, and the settings of each arm."""
+    scene = load_scene(str(capture_folder))
+    programs = Programs(preset, scene)
+    points = initial_points(jax.random.key(1), scene)
+    state = init_state(
+        jax.random.key(0), *points, field=programs.field, optimizer=programs.optimizer
+    )
+    state, _ = programs.run("photographs", state, scene.train, count=3)
+    start = start_labels(programs, state, seed=0)
+    return programs, start, [make_arm(name, preset).settings for name in ARMS]
+
+
+# SSIM's derivative jumps where a window is flat, on whichever side of 0 rounding falls.
+TINY_SMOOTH = dataclasses.replace(
+    TINY_SURFELS, field=dataclasses.replace(TINY_SURFELS.field, ssim_weight=0.0)
+)
+
+
+def assert_same_step(arm, alone, before):
+    """Gradients agree to 1e-4 of the largest, and parameters with a clear gradient to 1e-5.
+
+    Adam divides by the gradient's size: of what is only rounding it makes a whole step.
+    """
+
+    def compare(new, old, new_moment, old_moment):
+        new_moment, old_moment = np.asarray(new_moment), np.asarray(old_moment)
+        largest = np.abs(old_moment).max()
+        np.testing.assert_allclose(new_moment, old_moment, rtol=0, atol=1e-4 * largest)
+        clear = np.abs(old_moment) > 0.01 * largest
+        np.testing.assert_allclose(
+            np.asarray(new)[clear], np.asarray(old)[clear], rtol=1e-5, atol=1e-5
+        )
+
+    jax.tree.map(compare, arm.params, alone.params, arm.opt_state[0].mu, alone.opt_state[0].mu)
+    changed = jax.tree.map(lambda x, y: float(jnp.abs(x - y).max()), alone.params, before.params)
+    assert max(jax.tree.leaves(changed)) > 1e-3
+
+
+TINY_SMOOTH_MIP = dataclasses.replace(
+    TINY_MIP, field=dataclasses.replace(TINY_MIP.field, ssim_weight=0.0)
+)
+
+
+@pytest.mark.parametrize(
+    "preset", [TINY_STEPS, TINY_SMOOTH, TINY_SMOOTH_MIP], ids=lambda p: p.method
+)
+def test_an_arm_is_the_run_alone(preset, capture_folder):
+    with jax.numpy_dtype_promotion("standard"):
+        programs, start, arms = begin(preset, capture_folder)
+        state, sources = start
+        states, *data = stack_arms(arms, [start] * len(arms), len(jax.devices()))
+        together, metrics = programs.run("arms", states, sources.views, *data, count=1)
+        for i, settings in enumerate(arms):
+            if ARMS[i] == "control":
+                alone, _ = programs.run("photographs", state, sources.views, count=1)
+            else:
+                data = sources.views, sources, settings
+                alone, _ = programs.run("random_closeups", state, *data, count=1)
+            arm = jax.tree.map(lambda leaf, i=i: leaf[i], together.replace(step=alone.step[None]))
+            assert_same_step(arm.replace(step=alone.step), alone, state)
+            assert int(together.step) == int(alone.step)
+    assert not any(metrics["skipped"])
+    different = [float(jnp.abs(x[0] - x[2]).max()) for x in jax.tree.leaves(together.params)]
+    assert max(different) > 1e-4  # control and diverse
+    assert len(jax.devices()) == 8  # four arms, and four copies of the last
+    for leaf in jax.tree.leaves(together.params):
+        assert len({shard.device for shard in leaf.addressable_shards}) == len(jax.devices())
+
+
+def test_an_arm_that_diverges_takes_no_other_down(capture_folder, capsys):
+    with jax.numpy_dtype_promotion("standard"):
+        programs, start, arms = begin(TINY_STEPS, capture_folder)
+        broken = arms[1].replace(label_loss_weight=jnp.float32(jnp.nan))
+        both = []
+        for second in (arms[1], broken):
+            settings = [arms[0], second, arms[2]]
+            states, *data = stack_arms(settings, [start] * 3, len(jax.devices()))
+            both.append(programs.run("arms", states, start.sources.views, *data, count=2))
+    (healthy, _), (after, metrics) = both
+    assert metrics["skipped"][:3] == [0, 2, 0]  # then copies of the last, one a device
+    assert "skipped, not finite" in capsys.readouterr().out
+    for i in (0, 2):
+        pick = functools.partial(jax.tree.map, lambda leaf, i=i: leaf[i])
+        jax.tree.map(np.testing.assert_array_equal, pick(after.params), pick(healthy.params))
+    first = jax.tree.map(lambda leaf: leaf[1], after.params)
+    jax.tree.map(np.testing.assert_array_equal, first, start.state.params)
+
+
+def sweep_tiny(scene, folder, arms=("baseline", "control", "diverse", "test_time"), seeds=2, **kw):
+    kw |= {"names": {"method": "nerf", "preset": "tiny"}, "max_parallel": 3}
+    with jax.numpy_dtype_promotion("standard"):
+        return run_sweep(scene, TINY_STEPS, arms, seeds, folder, **kw)
+
+
+def test_a_sweep_cut_off_and_resumed_ends_the_same(capture_folder, tmp_path, monkeypatch, capsys):
+    scene = load_scene(str(capture_folder))
+    programs = Programs(TINY_STEPS, scene)  # compiled once for both
+    monkeypatch.setattr(sweep_stages, "Programs", lambda preset, scene: programs)
+    render, rendered_by = programs.render, set()
+
+    def render_and_note(state, *camera):
+        rendered_by.add(len(jax.tree.leaves(state.params)[0].devices()))
+        return render(state, *camera)
+
+    monkeypatch.setattr(programs, "render", render_and_note)
+    whole = sweep_tiny(scene, tmp_path / "sweep").scores
+    assert rendered_by == {1} and len(jax.devices()) == 8  # devices
+    assert list(whole) == ["baseline", "control", "diverse", "test_time"]
+    assert all(list(of_arm) == ["0", "1"] for of_arm in whole.values())
+    psnr = {arm: whole[arm]["0"]["splits"]["test"]["psnr"] for arm in whole}
+    assert len({psnr["baseline"], psnr["control"], psnr["diverse"]}) == 3
+    other = whole["control"]["1"]["splits"]["test"]["psnr"]
+    assert psnr["control"] != other
+
+    for stage in ("arms_1", "test_time_0", "test_time_1"):  # as if stopped after the first arms
+        shutil.rmtree(tmp_path / "sweep" / stage)
+    capsys.readouterr()
+    compare = tmp_path / "compare"
+    again = sweep_tiny(scene, tmp_path / "sweep")
+    assert again.scores == whole
+    pictures = comparisons(compare, again.shown, again.images)
+    assert capsys.readouterr().out.count("resumed") == 3  # both baselines and the first arms
+
+    # Truth, four arms and the error of the last, of the one close-up and the one ordinary view.
+    assert [picture.section for picture in pictures] == ["Close-ups", "Ordinary views"]
+    assert len(list(compare.iterdir())) == 2
+    truth = np.asarray(scene.test.rgb[0]).repeat(8, axis=0).repeat(8, axis=1)  # at least 240 wide
+    height, width = truth.shape[:2]
+    starts = [(width + 8) * i for i in range(6)]
+    panels = [pictures[0].image[-height:, x : x + width].astype(int) for x in starts]
+    np.testing.assert_array_equal(panels[0], truth)
+    assert np.abs(panels[1] - panels[3]).max() > 0  # baseline and diverse
+
+    about = {"method": "nerf", "preset": "tiny"}
+    write_sweep(tmp_path, {scene.name: whole}, about, pictures)
+    table = list(csv.DictReader((tmp_path / "table.csv").read_text().splitlines()))
+    assert [row["arm"] for row in table[:4]] == list(whole)
+    expected = np.mean([psnr["control"], other])
+    assert float(table[1]["psnr"]) == pytest.approx(expected)
+    assert json.loads((tmp_path / "sweep.json").read_text())["scenes"][scene.name] == whole
+    assert "test_time" in (tmp_path / "table.md").read_text()
+    page = (tmp_path / "report.html").read_text()
+    assert "95 %" in page and page.count("<img") == 2
+
+
+def result(values):
+    views = {str(i): {"psnr": v, "ssim": 0.5} for i, v in enumerate(values)}
+    return {"skipped": 1, "splits": {"test": {"views": views}}}
+
+
+def test_rows_are_means_over_everything_and_gains_are_paired():
+    scenes = {
+        "a": {
+            "control": {"0": result([10.0, 30.0]), "1": result([12.0, 32.0])},
+            "better": {"0": result([11.0, 31.0]), "1": result([13.0, 33.0])},
+        },
+        "b": {
+            "control": {"0": result([20.0, None]), "1": result([20.0, None])},
+            "better": {"0": result([23.0, 5.0]), "1": result([23.0, 5.0])},
+        },
+    }
+    control, better = rows(scenes)
+    assert control.psnr == pytest.approx((10 + 30 + 12 + 32 + 20 + 20) / 6)
+    assert control.spread == pytest.approx(np.std([20, 64 / 3], ddof=1))
+    assert control.gain is None
+    # Views of which control knows nothing do not count: 1, 1 and 3 dB.
+    assert better.gain == pytest.approx(5 / 3)
+    assert better.low == pytest.approx(1)
+    assert better.high == pytest.approx(3)
+    assert better.skipped == 4
+    assert (control.count, better.count) == (6, 8)
+    # A seed that lacks a view is no other seed's equal.
+    del scenes["a"]["better"]["1"]["splits"]["test"]["views"]["1"]
+    assert rows(scenes)[1].spread is None
+
+
+def test_a_sweep_whose_arms_all_failed_has_no_pictures(tmp_path):
+    assert comparisons(tmp_path, {"test": [None]}, {}) == []
+
+
+def test_a_single_view_has_no_interval():
+    assert paired_bootstrap([np.array([0.3, 0.4])]) == (None, None)
+
+
+def test_the_interval_is_that_of_the_mean():
+    noise = np.random.default_rng(1).normal(0.3, 1.0, 400)
+    low, high = paired_bootstrap([np.array([x]) for x in noise])
+    half = 1.96 * noise.std() / np.sqrt(400)
+    assert low == pytest.approx(noise.mean() - half, abs=0.03)
+    assert high == pytest.approx(noise.mean() + half, abs=0.03)
+
+
+@pytest.fixture
+def parsed_flags():
+    flags.FLAGS(["sweep"])
+    with flagsaver.flagsaver(compilation_cache=""):
+        yield
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"arms": ["control", "control"]}, "--arms=control,control must name one or more"),
+        ({"scenes": []}, "--scenes= must name one or more"),
+        ({"arms": ["warm"]}, "--arms=warm: warm is neither an arm"),
+        ({"method": "nerf", "arms": ["label_loss_weight=0.3"]}, "this preset pools the losses"),
+        ({"method": "nerf", "arms": ["expected_depth=1"]}, "nerf has no setting expected_depth"),
+        ({"arms": ["expected_depth=2"]}, "expected_depth must be true or false or none"),
+        ({"arms": ["depth_error=-1"]}, "depth_error is a share"),
+        ({"set": ["capacity=0"]}, "--set=capacity=0: capacity must be between 1 and 100000000"),
+        ({"arms": ["label=warp+depth_error=0+expected_depth=1"]}, "do not go together"),
+        ({"scenes": ["nowhere"]}, "nowhere"),
+    ],
+)
+def test_flags_that_make_no_sense_are_one_sentence(parsed_flags, tmp_path, changes, message):
+    out = str(tmp_path / "out")
+    with (
+        flagsaver.flagsaver(output_dir=out, **changes),
+        pytest.raises(SystemExit, match=message),
+    ):
+        sweep.main(["sweep"])
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_arm_may_have_labels_from_the_other_depth(capture_folder, tmp_path):
+    scene = load_scene(str(capture_folder))
+    arms = ["diverse", "expected_depth=0", "expected_depth=1"]
+    names = {"method": "surfels", "preset": "tiny"}
+    labels = dataclasses.replace(TINY_SMOOTH.labels, label_loss_weight=0.5)
+    preset = dataclasses.replace(TINY_SMOOTH, labels=labels)
+    with jax.numpy_dtype_promotion("standard"):
+        found = run_sweep(scene, preset, arms, 1, tmp_path, names=names).scores
+    as_ever, median, expected = (found[arm]["0"]["splits"]["test"]["psnr"] for arm in arms)
+    assert as_ever == median
+    assert as_ever != expected
+
+
+HOSTS = """
+jax.distributed.initialize("127.0.0.1:" + sys.argv[2], 2, int(sys.argv[3]))
+assert len(jax.devices()) == 2 * len(jax.local_devices())
+folder = pathlib.Path(sys.argv[1])
+scene = test_sweep.load_scene(str(folder / "capture"))
+found = test_sweep.sweep_tiny(scene, folder / "sweep", ("control", "diverse"), 1).scores
+(folder / ("host" + sys.argv[3] + ".json")).write_text(json.dumps(found))
+"""
+
+
+def start(script, *arguments):
+    """A Python of its own, on one device, that has what is compiled already."""
+    tests = pathlib.Path(__file__).parents[1]
+    environment = os.environ | {
+        "JAX_PLATFORMS": "cpu",
+        "XLA_FLAGS": f"{QUICKLY} --xla_force_host_platform_device_count=1",
+        "PYTHONPATH": os.pathsep.join([str(tests.parent), str(tests)]),
+        "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir,
+    }
+    imports = "import json, pathlib, sys, jax, test_sweep; from tiny_runs import write_plane"
+    return subprocess.Popen(
+        [sys.executable, "-c", f"{imports}\n{script}", *map(str, arguments)],
+        env=environment,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def finish(process):
+    _, error = process.communicate(timeout=600)
+    assert process.returncode == 0, error[-2000:]
+
+
+def test_arms_are_spread_over_hosts(capture_folder, tmp_path):
+    """Two processes that know each other end with what one ends with; the first one writes."""
+    (tmp_path / "capture").symlink_to(capture_folder)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    scene = load_scene(str(capture_folder))
+    whole = sweep_tiny(scene, tmp_path / "alone", ("control", "diverse"), 1).scores
+    for process in [start(HOSTS, tmp_path, port, i) for i in range(2)]:
+        finish(process)
+    hosts = [json.loads((tmp_path / f"host{i}.json").read_text()) for i in range(2)]
+    assert hosts[0] == hosts[1]
+    for arm, by_seed in whole.items():
+        for seed, result in by_seed.items():
+            for split, metrics in result["splits"].items():
+                found = hosts[0][arm][seed]["splits"][split]["psnr"]
+                assert found == pytest.approx(metrics["psnr"], abs=1e-2)
+    # What the first host kept, one host alone can go on from, and the other way round.
+    kept, alone = (
+        {path.relative_to(folder) for path in folder.glob("*/*")}
+        for folder in (tmp_path / "sweep", tmp_path / "alone")
+    )
+    assert kept == alone
+
+
+@pytest.mark.parametrize(
+    "hosts",
+    [
+        {"coordinator": "127.0.0.1:1"},
+        {"num_processes": 2, "process_id": 0},
+        {"coordinator": "127.0.0.1:1", "num_processes": 2, "process_id": 2},
+    ],
+)
+def test_hosts_need_all_three_flags(parsed_flags, tmp_path, hosts):
+    with (
+        flagsaver.flagsaver(output_dir=str(tmp_path / "out"), **hosts),
+        pytest.raises(SystemExit, match="several hosts need --coordinator, --num_processes and"),
+    ):
+        sweep.main(["sweep"])
+
+
+def test_hosts_need_one_folder(parsed_flags):
+    hosts = {"coordinator": "127.0.0.1:1", "num_processes": 2, "process_id": 1}
+    with (
+        flagsaver.flagsaver(output_dir=None, **hosts),
+        pytest.raises(SystemExit, match="give --output_dir"),
+    ):
+        sweep.main(["sweep"])

@@ -1,0 +1,87 @@
+"""A capture of photographs along and across: pictures have their own size, without padding."""
+
+from types import SimpleNamespace
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tiny_capture import frame, write_image, write_json
+
+from jaxcloseup.app.jobs.evaluate import evaluate_folders
+from jaxcloseup.app.report.pictures import comparisons
+from jaxcloseup.app.score.renders import write_renders, write_truth
+from jaxcloseup.app.score.scores import NO_PERCEPTUAL, evaluate, targets_by_split
+from jaxcloseup.app.view import frames
+from jaxcloseup.app.view.camera_paths import orbit, view_shots
+from jaxcloseup.captures.load import load_scene
+from jaxcloseup.fields.contract import Rendering
+
+
+ALONG, ACROSS = (32, 24), (24, 32)  # width, height
+SIZES = {"a": ALONG, "b": ACROSS}
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """Two photographs of a split, of random pixels; twice as large in their files."""
+    rng = np.random.default_rng(0)
+    for split in ("train", "test"):
+        for name, (width, height) in SIZES.items():
+            pixels = rng.integers(0, 256, (2 * height, 2 * width, 3), np.uint8)
+            write_image(tmp_path / split / f"{name}.png", pixels)
+        lens = {name: {"w": 2 * w, "h": 2 * h, "cx": w, "cy": h} for name, (w, h) in SIZES.items()}
+        listed = [frame(f"{split}/{name}.png", **lens[name]) for name in SIZES]
+        write_json(tmp_path / f"transforms_{split}.json", listed)
+    return load_scene(tmp_path, downscale=2)
+
+
+def render(camera):
+    """White where a photograph is, and black in the padding."""
+    side = camera.height, camera.width
+    width, height = (round(2 * float(center)) for center in camera.intrinsics[2:])
+    rgb = jnp.zeros((*side, 3)).at[:height, :width].set(1)
+    return Rendering(rgb, 2 * jnp.ones(side), jnp.ones(side), aux=(jnp.ones(7),))
+
+
+def picture(path):
+    image = cv2.imread(str(path))
+    return image, image.shape[1::-1]
+
+
+def test_padding_is_neither_scored_nor_written(scene, tmp_path):
+    assert scene.train.rgb.shape[1:3] == (32, 32)
+    assert scene.camera("test", 1).width == 24 and scene.sizes("train") == [ALONG, ACROSS]
+    targets = targets_by_split(scene, jnp.ones((2, 32, 32)), None, render, finer=1)
+    scores, seen = evaluate(render, targets["test"])
+    write_truth(tmp_path / "truth", targets)
+    write_renders(tmp_path / "renders", seen, scene)
+    for name, size in SIZES.items():
+        for folder in ("renders/rgb", "renders/depth", "truth/test/rgb"):
+            assert picture(tmp_path / folder / f"{name}.png")[1] == size
+        assert picture(tmp_path / "truth" / "test_finer" / "rgb" / f"{name}.png")[1] == (
+            2 * size[0],
+            2 * size[1],
+        )
+        assert picture(tmp_path / "renders/rgb" / f"{name}.png")[0].all()
+    folders = str(tmp_path / "renders" / "rgb"), str(tmp_path / "truth" / "test" / "rgb")
+    again = evaluate_folders(*folders, None, NO_PERCEPTUAL)
+    assert again["psnr"] == pytest.approx(scores["psnr"], abs=1e-4)
+
+    images = {("baseline", "test"): {name: one.rgb for name, one in seen.items()}}
+    (along, across) = comparisons(tmp_path / "compare", {"test": targets["test"]}, images)
+    assert along.image.shape[0] < across.image.shape[0]
+
+
+def test_views_are_rendered_at_their_own_size(scene, tmp_path):
+    programs = SimpleNamespace(scene=scene, render=lambda state, camera: render(camera))
+    frames.render_shots(tmp_path, programs, None, view_shots(scene, "test"), sources=None)
+    for name, size in SIZES.items():
+        for kind in ("rgb", "depth"):
+            image, found = picture(tmp_path / kind / f"{name}.png")
+            assert found == size and image.all(axis=-1).all()
+
+
+def test_an_orbit_has_the_size_of_the_first_photograph(scene):
+    cameras = orbit(scene, 2).cameras
+    assert (cameras.width, cameras.height) == ALONG

@@ -1,0 +1,139 @@
+"""Numbers that float32 cannot hold, alone or beside a capture's others."""
+
+import re
+
+import numpy as np
+import pytest
+from tiny_capture import POSE, frame, paper_capture, vertices, write_image, write_json, write_ply
+from tiny_models import colmap_capture, llff_capture, llff_rows
+
+from jaxcloseup.captures.depth_range import near_far_from_cameras
+from jaxcloseup.captures.load import SceneError, load_scene
+from jaxcloseup.captures.scale import plausible
+from jaxcloseup.photos.scene import NearFarWarning, PointsWarning
+
+
+@pytest.fixture
+def capture(tmp_path):
+    return paper_capture(tmp_path)
+
+
+def moved(*position):
+    pose = POSE.copy()
+    pose[:3, 3] = position
+    return pose.tolist()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"transform_matrix": moved(1e300, 0, 0)},
+            "transform_matrix holds a value that is not fin",
+        ),
+        ({"transform_matrix": moved(1e30, 0, 0)}, "camera lies 1e+30 from the origin, too far"),
+        (
+            {"transform_matrix": moved(5e6, 2, 3)},
+            "camera lies 5e+06 from the origin of a scene 9 l",
+        ),
+        ({"fx": 1e39}, "fx is too large for 32 bits, 1e+39: correct it"),
+        ({"fx": 1e-50}, "fx must be greater than 0, got 1e-50"),
+        (
+            {"fx": 1e31},
+            "a focal length of 1e+31 pixels is not between 0.01 and 10000 times the lon",
+        ),
+        ({"fy": 0.01}, "a focal length of 0.01 pixels is not between"),
+        ({"fx": 1e31, "k1": 0.1}, "a focal length of 1e+31 pixels is not between"),
+        ({"fx": 1e31, "w": 8, "h": 6}, "a focal length of 1e+31 pixels is not between"),
+        ({"cx": 1e39}, "cx is too large for 32 bits"),
+        (
+            {"cy": -1e6},
+            "the principal point 4, -1e+06 lies more than 100 times the longer side out",
+        ),
+    ],
+)
+def test_cameras_that_float32_cannot_hold(capture, changes, message):
+    frames = [frame("train/a.png"), frame("train/b.png", **changes)]
+    write_json(capture / "transforms_train.json", frames)
+    with pytest.raises(SceneError, match=re.escape(message)) as error:
+        load_scene(capture)
+    assert "train/b.png" in str(error.value)
+
+
+def test_lenses_of_cached_photographs_are_checked(capture):
+    load_scene(capture, downscale=2)
+    frames = [frame("train/a.png"), frame("train/b.png", fx=1e31)]
+    write_json(capture / "transforms_train.json", frames)
+    with pytest.raises(SceneError, match="a focal length of"):
+        load_scene(capture, downscale=2)
+
+
+@pytest.mark.parametrize("given", [{"near": 1e-30}, {"far": 1e30}, {"far": 1e39}])
+def test_depths_that_float32_cannot_hold(capture, given):
+    write_json(capture / "transforms_train.json", [frame("train/a.png")], **given)
+    with pytest.raises(SceneError, match=r"must lie between 1e-12 and 1e\+12|too large for 32"):
+        load_scene(capture)
+
+
+def test_coordinates_of_a_map_need_another_origin(tmp_path):
+    """All cameras are far away, at a spread of a few units."""
+    rows = llff_rows(3)[0]
+    llff_capture(tmp_path)
+    rows[:, 3] += 4e6
+    np.save(tmp_path / "poses_bounds.npy", rows)
+    with pytest.raises(SceneError, match="shift the origin to the cameras"):
+        load_scene(tmp_path)
+    rows[:, 3] -= 4e6 - 1e4
+    np.save(tmp_path / "poses_bounds.npy", rows)
+    assert len(load_scene(tmp_path).train) == 2
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-15])
+@pytest.mark.parametrize("count", [1, 3])
+def test_cameras_at_one_place_load(tmp_path, count, noise):
+    frames = []
+    for i in range(count):
+        write_image(tmp_path / f"{i}.png")
+        frames.append(frame(f"{i}.png", transform_matrix=moved(50 + noise * i, 20, noise * i)))
+    write_json(tmp_path / "transforms_train.json", frames, near=None, far=None)
+    with pytest.warns(NearFarWarning):
+        scene = load_scene(tmp_path)
+    np.testing.assert_allclose([scene.near, scene.far], [0.1, 100])
+    assert near_far_from_cameras(np.asarray(scene.train.cameras.camtoworld)) == (0.1, 100)
+
+
+def test_stray_points_are_dropped(capture):
+    rows = vertices(count=9)
+    rows["y"][2], rows["y"][3], rows["y"][4] = 1e300, 1e30, 1e9
+    rows["y"][5] = 1e3
+    write_ply(capture / "points3d.ply", rows)
+    with (
+        pytest.warns(PointsWarning, match="1 of 9 points are not finite and were dropped"),
+        pytest.warns(PointsWarning, match="ply: 2 of 8 points are not finite, or 100000 times"),
+    ):
+        points = load_scene(capture).points
+    np.testing.assert_allclose(points[:, 1], np.delete(rows["y"], [2, 3, 4]), rtol=1e-6)
+
+
+def test_stray_points_of_a_model_are_dropped_from_what_photographs_see(tmp_path):
+    pytest.importorskip("pycolmap")
+    colmap_capture(tmp_path, 10, depths=[8.0, 8.2, 8.4, 8.6, 4.0, 8.8, 9.0, 9.2, 9.4, 9.6])
+    whole = load_scene(tmp_path, split="closest")
+    table = tmp_path / "sparse/0/points3D.txt"
+    lines = table.read_text().splitlines()
+    for line, x in ((2, "1e300"), (4, "-1e20")):
+        words = lines[line].split()
+        lines[line] = " ".join([words[0], x, *words[2:]])
+    table.write_text("\n".join(lines))
+    with pytest.warns(PointsWarning, match=r"points3D\.txt: 2 of 5 points are not finite, or"):
+        scene = load_scene(tmp_path, split="closest")
+    np.testing.assert_array_equal(scene.points, whole.points[[0, 2, 4]])
+    np.testing.assert_array_equal(scene.rgb, whole.rgb[[0, 2, 4]])
+    assert scene.metadata["times_nearer"] == whole.metadata["times_nearer"]
+
+
+def test_positions_whose_square_is_too_large_for_a_float():
+    points = np.array([[0.0, 0, 0], [1, 1, 1], [1e39, 0, 0]])
+    with pytest.warns(PointsWarning, match="1 of 3 points"):  # and no warning of an overflow
+        keep = plausible("a file", points, np.array([[0.0, 0, 0], [0, 0, 1], [1e306, 0, 0]]))
+    assert keep.tolist() == [True, True, False]

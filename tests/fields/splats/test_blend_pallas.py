@@ -1,0 +1,115 @@
+"""The Pallas kernels, interpreted: against the NumPy splatter, and against the loops of jax.lax."""
+
+import dataclasses
+import functools
+import logging
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from splat_scenes import (
+    CONFIG,
+    COUNT,
+    NEAR,
+    OUTPUTS,
+    SCENES,
+    SPLATS,
+    oracle,
+    random_scene,
+    render,
+    to_camera,
+    to_surfels,
+)
+
+from jaxcloseup.fields.splats import RasterizeConfig, blending
+from jaxcloseup.fields.splats import blend_pallas as gpu_kernel
+from jaxcloseup.fields.splats.splat_math import PAYLOAD
+from jaxcloseup.fields.splats.tiling import tile_lists
+
+
+KERNEL = dataclasses.replace(CONFIG, compositor="kernel")
+
+
+@pytest.mark.parametrize("name", SPLATS)
+def test_images_agree_with_the_oracle(name):
+    expected = oracle(SPLATS[name])
+    images = render(to_surfels(SPLATS[name]), to_camera(), config=KERNEL)
+    assert images["overflow"] == 0
+    for output in expected:
+        np.testing.assert_allclose(images[output], expected[output], atol=2e-5, rtol=0)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def pullback(surfels, cotangents, config):
+    def images(surfels):
+        found = render(surfels, to_camera(), config=config)
+        return {name: found[name] for name in cotangents}
+
+    return jax.vjp(images, surfels)[1](cotangents)[0]
+
+
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("output", OUTPUTS)
+def test_the_derivative_of_each_output_is_that_of_the_loops(name, output):
+    surfels = to_surfels(SCENES[name])
+    rng = np.random.default_rng(0)
+    cotangents = {
+        each: jnp.asarray(rng.normal(size=image.shape) * (each == output), jnp.float32)
+        for each, image in oracle(SCENES[name]).items()
+    }
+    expected, found = (pullback(surfels, cotangents, config) for config in (CONFIG, KERNEL))
+    for leaf in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
+        a, b = np.asarray(getattr(expected, leaf)), np.asarray(getattr(found, leaf))
+        np.testing.assert_allclose(b, a, rtol=2e-4, atol=2e-5 * max(np.abs(a).max(), 1e-3))
+
+
+def test_a_batch_of_images_is_each_image():
+    # Their lists are one after another, with room between them.
+    scenes = [to_surfels(random_scene(seed)) for seed in (0, 5)]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *scenes)
+    shapes = {name: oracle(SCENES["in front"])[name].shape for name in OUTPUTS}
+    cotangents = {name: jnp.full(shape, 0.5) for name, shape in shapes.items()}
+    found = jax.vmap(lambda surfels: pullback(surfels, cotangents, KERNEL))(stacked)
+    for i, surfels in enumerate(scenes):
+        expected = pullback(surfels, cotangents, KERNEL)
+        for a, b in zip(jax.tree.leaves(expected), jax.tree.leaves(found), strict=True):
+            assert np.abs(a).max() > 0
+            np.testing.assert_allclose(b[i], a, rtol=1e-4, atol=1e-5 * np.abs(a).max())
+
+
+@pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated")
+def test_kernels_become_programs_of_a_gpu():
+    # Triton's part of the compiler needs no GPU; what follows it does.
+    count, height, width = COUNT, 16, 16
+    box = jnp.tile(jnp.array([[0.0, 0.0, width, height]]), (count, 1))
+    lists = tile_lists(box, jnp.ones(count), height=height, width=width, tile=8, capacity=256)
+    table = jnp.zeros((count, PAYLOAD + 6))
+
+    def both(table, lists):
+        *sums, trace = gpu_kernel.forward(CONFIG, table, lists)
+        return gpu_kernel.backward(CONFIG, table, lists, trace, tuple(sums))
+
+    gpu = jax.sharding.AbstractDevice("NVIDIA H100", num_cores=None, platform="cuda")
+    mesh = jax.sharding.AbstractMesh((), (), abstract_device=gpu)
+    with jax.sharding.use_abstract_mesh(mesh):
+        lowered = jax.jit(both).trace(table, lists).lower(lowering_platforms=("cuda",))
+    assert lowered.as_text().count("triton") >= 3
+
+
+def test_a_gpu_that_cannot_run_them_falls_back_to_loops_and_says_so(monkeypatch, caplog):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")  # but there is none to compile for
+    blending._kernels_compile.cache_clear()
+    config = RasterizeConfig(capacity=1024, near=NEAR, chunk=4, block=3)
+    surfels = to_surfels(SCENES["in front"])
+    with caplog.at_level(logging.WARNING):
+        found = [render(surfels, to_camera(), config=config)["rgb"] for _ in range(2)]
+    blending._kernels_compile.cache_clear()
+    said = [record.getMessage() for record in caplog.records if "blended" in record.getMessage()]
+    assert len(said) == 1 and "\n" not in said[0]
+    np.testing.assert_allclose(found[0], oracle(SCENES["in front"])["rgb"], atol=2e-5)
+
+
+def test_other_names_are_no_compositors():
+    with pytest.raises(ValueError, match="compositor"):
+        RasterizeConfig(compositor="cuda")

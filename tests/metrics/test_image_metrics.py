@@ -1,0 +1,163 @@
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+
+from jaxcloseup.metrics.image_metrics import cc_psnr, fit_colors, psnr, quantize, ssim
+
+
+METRICS = {"psnr": psnr, "ssim": ssim, "cc_psnr": cc_psnr}
+
+
+@pytest.fixture
+def pair():
+    """A smooth image and a noisy copy of it, 14x17."""
+    rng = np.random.default_rng(0)
+    image = cv2.resize(rng.uniform(0.1, 0.9, (4, 5, 3)), (17, 14), interpolation=cv2.INTER_CUBIC)
+    noisy = image + 0.1 * rng.normal(size=image.shape)
+    return tuple(np.clip(i, 0, 1).astype(np.float32) for i in (image, noisy))
+
+
+@pytest.fixture
+def weight():
+    return np.random.default_rng(1).uniform(0, 1, (14, 17)).astype(np.float32)
+
+
+def test_quantize_is_what_a_png_holds(pair, tmp_path):
+    image = np.array([[[-0.1, 1.2, 0.5], [0.499 / 255, 0.501 / 255, 254.4 / 255]]], np.float32)
+    expected = np.array([[[0, 255, 128], [0, 1, 254]]]) / 255
+    np.testing.assert_allclose(quantize(image), expected, rtol=1e-6)
+    stored = np.asarray(jnp.round(quantize(pair[1]) * 255).astype(jnp.uint8))
+    cv2.imwrite(str(tmp_path / "a.png"), stored)
+    loaded = cv2.imread(str(tmp_path / "a.png")).astype(np.float32) / 255
+    np.testing.assert_allclose(loaded, quantize(pair[1]), rtol=2e-7)
+
+
+def test_psnr_closed_forms():
+    image = jnp.full((3, 4, 3), 0.25)
+    np.testing.assert_allclose(psnr(image, image + 0.1), 20, rtol=1e-5)
+    np.testing.assert_allclose(psnr(image, image + 0.5), -20 * np.log10(0.5), rtol=1e-5)
+    assert psnr(image, image) == jnp.inf
+    # Half of the pixels differ by 0.1, and they have three quarters of the weight.
+    target = image.at[:, :2].add(0.1)
+    weight = jnp.ones((3, 4)).at[:, :2].set(3)
+    np.testing.assert_allclose(psnr(image, target), 20 + 10 * np.log10(2), rtol=1e-5)
+    np.testing.assert_allclose(
+        psnr(image, target, weight=weight), 20 + 10 * np.log10(4 / 3), rtol=1e-5
+    )
+    assert psnr(image, target, weight=jnp.ones((3, 4)).at[:, :2].set(0)) == jnp.inf
+
+
+def test_psnr_agrees_with_opencv(pair):
+    a, b = (np.asarray(jnp.round(quantize(i) * 255).astype(jnp.uint8)) for i in pair)
+    np.testing.assert_allclose(psnr(*map(quantize, pair)), cv2.PSNR(a, b), rtol=1e-5)
+
+
+def test_ssim_agrees_with_the_oracle(pair, weight):
+    expected = reference.ssim_map(*pair)
+    assert expected.mean() < 0.95
+    np.testing.assert_allclose(ssim(*pair), expected.mean(), atol=1e-5)
+    centers = weight[5:-5, 5:-5]
+    np.testing.assert_allclose(
+        ssim(*pair, weight=weight),
+        (expected.mean(-1) * centers).sum() / centers.sum(),
+        atol=1e-5,
+    )
+
+
+def test_ssim_closed_forms(pair):
+    np.testing.assert_allclose(ssim(pair[0], pair[0]), 1, atol=1e-6)
+    a, b = jnp.full((11, 11, 3), 0.2), jnp.full((11, 11, 3), 0.6)
+    expected = (2 * 0.2 * 0.6 + 1e-4) / (0.2**2 + 0.6**2 + 1e-4)  # nothing but luminance differs
+    np.testing.assert_allclose(ssim(a, b), expected, rtol=1e-4)
+
+
+def test_cc_psnr_undoes_an_affine_change(pair):
+    matrix = np.array([[0.7, 0.1, 0], [0, 0.6, 0.1], [0.05, 0, 0.8]], np.float32)
+    changed = pair[0] @ matrix.T + np.float32(0.05)
+    assert psnr(changed, pair[0]) < 25
+    assert cc_psnr(changed, pair[0]) > 90
+
+
+def test_cc_psnr_agrees_with_least_squares(pair, weight):
+    image, target = pair[0] * np.array([0.5, 0.8, 1.0], np.float32), pair[1]
+    rows = np.concatenate([image, np.ones((14, 17, 1))], -1).reshape(-1, 4)
+    scale = np.sqrt(weight.reshape(-1, 1).astype(np.float64))
+    fit = np.linalg.lstsq(rows * scale, target.reshape(-1, 3) * scale, rcond=None)[0]
+    squared = (np.clip(rows @ fit, 0, 1) - target.reshape(-1, 3)) ** 2
+    expected = -10 * np.log10((squared.mean(-1) * weight.ravel()).sum() / weight.sum())
+    result = cc_psnr(image, target, weight=weight)
+    np.testing.assert_allclose(result, expected, rtol=1e-4)
+    assert result > psnr(image, target, weight=weight) + 1
+
+
+@pytest.mark.parametrize("ridge", [1e-4, 0.1, 1e6])
+def test_a_ridge_holds_colors_back(pair, weight, ridge):
+    """The oracle is least squares with extra rows for the distance from the identity."""
+    image, target = (np.asarray(x, np.float64).reshape(-1, 3) for x in pair)
+    share = weight.ravel() / weight.sum()
+    mean = share @ image
+    rows = np.concatenate([image - mean, np.ones((len(image), 1))], -1) * np.sqrt(share)[:, None]
+    rows = np.concatenate([rows, np.sqrt(ridge) * np.eye(4)])
+    no_change = np.concatenate([np.eye(3), mean[None]])
+    wanted = np.concatenate([target * np.sqrt(share)[:, None], np.sqrt(ridge) * no_change])
+    fit = np.linalg.lstsq(rows, wanted, rcond=None)[0]
+    matrix, offset = fit_colors(*pair, weight, ridge=ridge)
+    np.testing.assert_allclose(matrix, fit[:3], atol=2e-4)
+    np.testing.assert_allclose(offset, fit[3] - mean @ fit[:3], atol=2e-4)
+
+
+def test_cc_psnr_of_degenerate_colors(pair):
+    gray = jnp.repeat(pair[0][..., :1], 3, axis=-1)
+    assert cc_psnr(gray, 0.5 * gray) > 100  # nothing but rounding is left
+    flat = jnp.full_like(gray, 0.3)
+    expected = -10 * np.log10(((pair[1] - pair[1].mean((0, 1))) ** 2).mean())
+    np.testing.assert_allclose(cc_psnr(flat, pair[1]), expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", METRICS)
+def test_zero_weight_everywhere_gives_nan(pair, weight, name):
+    assert jnp.isnan(METRICS[name](*pair, weight=np.zeros_like(weight)))
+
+
+@pytest.mark.parametrize("name", METRICS)
+def test_pixels_of_weight_zero_do_not_count(pair, weight, name):
+    image, target = pair
+    outside = weight < 0.5
+    changed = np.where(outside[..., None], np.float32(0.5), image)
+    if name != "ssim":  # a window reads its neighbors, whatever they weigh
+        np.testing.assert_allclose(
+            METRICS[name](changed, target, weight=np.where(outside, np.float32(0), weight)),
+            METRICS[name](image, target, weight=np.where(outside, np.float32(0), weight)),
+            rtol=1e-4,
+        )
+    np.testing.assert_allclose(
+        METRICS[name](image, target, weight=np.full_like(weight, 0.1)),
+        METRICS[name](image, target),
+        rtol=1e-5,
+    )
+
+
+@pytest.mark.parametrize("name", METRICS)
+def test_jit_and_vmap(pair, weight, name):
+    images = np.stack([pair[0], pair[0] ** 2, pair[0] * np.float32(0.5)])
+    targets, weights = np.stack([pair[1]] * 3), np.stack([weight, weight * 2, np.ones_like(weight)])
+    batched = jax.jit(jax.vmap(lambda a, b, w: METRICS[name](a, b, weight=w)))
+    single = [
+        METRICS[name](a, b, weight=w) for a, b, w in zip(images, targets, weights, strict=True)
+    ]
+    np.testing.assert_allclose(batched(images, targets, weights), single, rtol=1e-4)
+
+
+def test_wrong_inputs_are_refused(pair, weight):
+    with pytest.raises(ValueError, match="SSIM needs 11 pixels a side"):
+        ssim(pair[0][:10], pair[1][:10])
+    for metric in METRICS.values():
+        with pytest.raises(AssertionError):
+            metric(pair[0], pair[1][:, :16])
+        with pytest.raises(AssertionError):
+            metric(*pair, weight=weight[:13])
+        with pytest.raises(AssertionError):
+            metric(*((i * 255).astype(np.uint8) for i in pair))
