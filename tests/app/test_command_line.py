@@ -189,8 +189,9 @@ def test_a_folder_that_another_process_trains_in_is_refused(
         pytest.raises(SystemExit) as error,
     ):
         module.main(["run"])
+    name = module.__name__.rpartition(".")[2]
     assert error.value.code == (
-        f"experiments.{module.__name__.rpartition('.')[2]}: --output_dir={tmp_path} is in use by the process {os.getpid()}: wait "
+        f"experiments.{name}: --output_dir={tmp_path} is in use by the process {os.getpid()}: wait "
         "until it ends, or name another folder"
     )
     assert not list((tmp_path / "checkpoints").iterdir())
