@@ -28,10 +28,12 @@ _CACHE = "JAXCLOSEUP_TEST_CACHE"
 def pytest_configure(config):
     """Keep compiled programs for all processes of this run: many tests need the same ones.
 
-    What else is kept between runs must not come from the user's cache, nor go there.
+    What else is kept between runs must not come from the user's cache, nor go there. A folder in
+    the environment variable JAXCLOSEUP_TEST_CACHE keeps the programs for later runs too.
     """
     if not hasattr(config, "workerinput"):
-        os.environ[_CACHE] = os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp()
+        os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp()
+        os.environ.setdefault(_CACHE, os.environ["XDG_CACHE_HOME"])
     jax.config.update("jax_compilation_cache_dir", os.environ[_CACHE])
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
@@ -47,7 +49,7 @@ def pytest_collection_modifyitems(items):
 def pytest_unconfigure(config):
     """Remove them."""
     if not hasattr(config, "workerinput"):
-        shutil.rmtree(os.environ.pop(_CACHE))
+        shutil.rmtree(os.environ.pop("XDG_CACHE_HOME"))
 
 
 MOST_MAPS = 30_000  # of the 65,530 that Linux lets a process have; every program takes several

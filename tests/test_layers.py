@@ -31,7 +31,7 @@ ROOMS = {
     "methods": {"progress"},
     "score": {"methods", "progress"},
     "store": {"methods", "run"},
-    "run": {"methods", "score", "progress", "store", "cli"},
+    "run": {"methods", "score", "progress"},
     "sweep": {"methods", "score", "progress", "run"},
     "report": {"methods", "score", "run", "store"},
     "view": {"methods", "score", "progress", "run", "store"},

@@ -11,10 +11,10 @@ import plane
 
 from jaxcloseup.app.methods import gaussians, mip_gaussians
 from jaxcloseup.app.methods.nerf import QUICK
+from jaxcloseup.app.methods.settings import plain_config
 from jaxcloseup.app.methods.surfels import REDUCED
+from jaxcloseup.app.run.manifest import about_scene, write_manifest
 from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.run.settings import plain_config
-from jaxcloseup.app.store.manifest import about_scene, write_manifest
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.fields.splats import RasterizeConfig

@@ -21,13 +21,13 @@ import numpy as np
 import jaxcloseup
 from experiments.benchmarks import nerf, splats, sweep
 from experiments.benchmarks.timing import interleaved_medians
-from jaxcloseup.app.cli.names import STAGES
 from jaxcloseup.app.methods import Preset, surfels
 from jaxcloseup.app.methods.nerf import QUICK as NERF_QUICK
 from jaxcloseup.app.run.fine_tuning import fine_tune
 from jaxcloseup.app.run.kept_detail import detail_finder
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.setup import Training, identity_of, initial_state, start_labels
+from jaxcloseup.app.run.stage_names import STAGES
 from jaxcloseup.app.run.stages import run_stages
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.captures.load import load_scene

@@ -11,7 +11,7 @@ import plane
 import pytest
 from tiny_capture import single_file
 
-from jaxcloseup.app.store.manifest import write_dataparser_transforms
+from jaxcloseup.app.run.manifest import write_dataparser_transforms
 from jaxcloseup.app.view import camera_paths
 from jaxcloseup.app.view.camera_paths import (
     CameraError,

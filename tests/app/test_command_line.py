@@ -17,12 +17,13 @@ from tiny_runs import TINY
 
 from jaxcloseup.app.cli import chosen as training_flags
 from jaxcloseup.app.cli import main as command
-from jaxcloseup.app.cli import names, sweep
 from jaxcloseup.app.cli import run as program
+from jaxcloseup.app.cli import sweep
 from jaxcloseup.app.cli import training_flags as define_flags
 from jaxcloseup.app.cli.start import LOCK, check_unused, lock_output_dir
 from jaxcloseup.app.methods import METHODS
-from jaxcloseup.app.run.settings import plain_config, settings_of
+from jaxcloseup.app.methods.settings import plain_config, settings_of
+from jaxcloseup.app.run import stage_names as names
 from jaxcloseup.app.sweep.arms import KINDS
 from jaxcloseup.fields.splats.adaptive import AdaptiveConfig
 from jaxcloseup.photos.scene import SceneError

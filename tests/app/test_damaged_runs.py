@@ -12,18 +12,18 @@ from tiny_runs import KEPT
 
 from jaxcloseup.app.cli import render, sweep
 from jaxcloseup.app.methods import METHODS
-from jaxcloseup.app.run import setup
-from jaxcloseup.app.run.logs import TrainLog
-from jaxcloseup.app.run.loop import TrainingError
-from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.run.settings import (
+from jaxcloseup.app.methods.settings import (
     BOUNDS,
     check_value,
     plain_config,
     settings_of,
     with_settings,
 )
-from jaxcloseup.app.store.manifest import write_manifest
+from jaxcloseup.app.run import setup
+from jaxcloseup.app.run.logs import TrainLog
+from jaxcloseup.app.run.loop import TrainingError
+from jaxcloseup.app.run.manifest import write_manifest
+from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.store.stored_config import preset_from_config
 from jaxcloseup.app.store.stored_run import RunError, read_run
 from jaxcloseup.artifacts.checkpoints import CheckpointError, Checkpoints

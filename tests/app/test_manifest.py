@@ -11,8 +11,8 @@ from absl.testing import flagsaver
 
 from jaxcloseup.app.cli import sweep as program
 from jaxcloseup.app.jobs import sweep
-from jaxcloseup.app.store import manifest
-from jaxcloseup.app.store.manifest import about_scene, git_commit, hash_data
+from jaxcloseup.app.run import manifest
+from jaxcloseup.app.run.manifest import about_scene, git_commit, hash_data
 from jaxcloseup.app.sweep.arm_training import SweepOutcome
 from jaxcloseup.captures.load import load_scene
 

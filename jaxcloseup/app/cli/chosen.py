@@ -11,7 +11,7 @@ from absl import flags
 
 from jaxcloseup.app.cli.start import CHECKPOINTS, check_unused
 from jaxcloseup.app.methods import METHODS, Preset
-from jaxcloseup.app.run.settings import describe_settings, with_settings
+from jaxcloseup.app.methods.settings import describe_settings, with_settings
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.metrics.image_metrics import SSIM_TAPS
 from jaxcloseup.photos.scene import Scene, SceneError

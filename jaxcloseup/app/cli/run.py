@@ -11,8 +11,8 @@ scored. The scene is a built-in one or a folder.
 from absl import flags
 
 from jaxcloseup.app.cli import training_flags as define_flags
-from jaxcloseup.app.cli.names import STAGES
 from jaxcloseup.app.cli.start import job
+from jaxcloseup.app.run.stage_names import STAGES
 
 
 flags.adopt_module_key_flags(define_flags)  # these are in --help too

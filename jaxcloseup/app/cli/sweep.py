@@ -11,8 +11,8 @@ of its own, and one table has them all.
 from absl import flags
 
 from jaxcloseup.app.cli import training_flags as define_flags
-from jaxcloseup.app.cli.names import ARMS
 from jaxcloseup.app.cli.start import job
+from jaxcloseup.app.run.stage_names import ARMS
 
 
 FLAGS = flags.FLAGS

@@ -6,7 +6,7 @@
 from absl import flags
 
 from jaxcloseup.app.cli import set_flag
-from jaxcloseup.app.cli.names import METHODS, PRESETS
+from jaxcloseup.app.run.stage_names import METHODS, PRESETS
 from jaxcloseup.captures.choices import ALPHA_MODES, FORMATS, SPLITS
 
 

@@ -14,17 +14,17 @@ from jaxcloseup.app import progress
 from jaxcloseup.app.cli import chosen as training_flags
 from jaxcloseup.app.cli.start import lock_output_dir, prepare_to_stop, set_up
 from jaxcloseup.app.methods import Preset
+from jaxcloseup.app.methods.settings import plain_config
 from jaxcloseup.app.report.page import Picture
 from jaxcloseup.app.report.pictures import comparisons
 from jaxcloseup.app.report.tables import print_sweep, write_sweep
 from jaxcloseup.app.run.logs import TrainLog, check_tensorboard
 from jaxcloseup.app.run.loop import TrainingError
+from jaxcloseup.app.run.manifest import NAME as MANIFEST
+from jaxcloseup.app.run.manifest import about_scene, versions, write_manifest
 from jaxcloseup.app.run.plan import in_words
 from jaxcloseup.app.run.programs import HOSTS_WAIT
-from jaxcloseup.app.run.settings import plain_config
 from jaxcloseup.app.score.scores import Perceptual, find_perceptual
-from jaxcloseup.app.store.manifest import NAME as MANIFEST
-from jaxcloseup.app.store.manifest import about_scene, versions, write_manifest
 from jaxcloseup.app.store.stored_run import RunError, read_fields
 from jaxcloseup.app.sweep.arm_training import run_sweep
 from jaxcloseup.app.sweep.arms import make_arm

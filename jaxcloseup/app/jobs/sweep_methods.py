@@ -20,7 +20,7 @@ from jaxcloseup.app.cli.start import CHECKPOINTS, LOCK, lock_output_dir, prepare
 from jaxcloseup.app.jobs.sweep import check_flags
 from jaxcloseup.app.methods import METHODS
 from jaxcloseup.app.report.method_tables import read_method, write_methods
-from jaxcloseup.app.store.manifest import NAME as MANIFEST
+from jaxcloseup.app.run.manifest import NAME as MANIFEST
 from jaxcloseup.io.files import read_object
 
 

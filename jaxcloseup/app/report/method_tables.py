@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from jaxcloseup.app.run.manifest import NAME as MANIFEST
 from jaxcloseup.app.score.ladder import PREFIX, rungs_of
 from jaxcloseup.app.score.metrics_text import SPLIT_TITLES
-from jaxcloseup.app.store.manifest import NAME as MANIFEST
 from jaxcloseup.io.files import read_object, write_file, write_json
 
 

@@ -19,9 +19,9 @@ import numpy as np
 
 import jaxcloseup
 from jaxcloseup.app import progress
+from jaxcloseup.app.run.manifest import hash_data
 from jaxcloseup.app.run.programs import Programs, describe_photographs
 from jaxcloseup.app.run.residuals import render_residuals, reproduced
-from jaxcloseup.app.store.manifest import hash_data
 from jaxcloseup.detail.add import Detail, Detailed, add_detail
 from jaxcloseup.detail.weights import known_weights
 from jaxcloseup.fields.contract import Rendering

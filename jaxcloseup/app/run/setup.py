@@ -14,12 +14,12 @@ import numpy as np
 import jaxcloseup
 from jaxcloseup.app import progress
 from jaxcloseup.app.methods import LabelConfig, Preset, pseudo_settings
+from jaxcloseup.app.methods.settings import plain_config
 from jaxcloseup.app.run.kept_detail import FindDetail, detailed_views
 from jaxcloseup.app.run.logs import TrainLog
 from jaxcloseup.app.run.loop import TrainingError, run_stage
+from jaxcloseup.app.run.manifest import hash_data, hash_targets
 from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.run.settings import plain_config
-from jaxcloseup.app.store.manifest import hash_data, hash_targets
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.fields.splats.surfels import random_points

@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcloseup.app.cli.names import STAGES
 from jaxcloseup.app.run.fine_tuning import target_data
 from jaxcloseup.app.run.gate import gated, lets_in, weigh
 from jaxcloseup.app.run.kept_detail import FindDetail, detail_finder, detail_path, detailed
@@ -24,6 +23,7 @@ from jaxcloseup.app.run.setup import (
     start_labels,
     timed,
 )
+from jaxcloseup.app.run.stage_names import STAGES
 from jaxcloseup.app.score.audit import audit_labels, left_out_curve
 from jaxcloseup.app.score.expected_errors import compare_errors
 from jaxcloseup.app.score.renders import write_truth

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from jaxcloseup.app.methods import METHODS, Preset
-from jaxcloseup.app.run.settings import check_value, is_plain, plain_config
+from jaxcloseup.app.methods.settings import check_value, is_plain, plain_config
 
 
 def preset_from_config(

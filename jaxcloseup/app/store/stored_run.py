@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 
 from jaxcloseup.app.methods import Preset
+from jaxcloseup.app.methods.settings import with_settings
+from jaxcloseup.app.run import manifest
 from jaxcloseup.app.run.loop import TrainingError
 from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.run.settings import with_settings
 from jaxcloseup.app.run.setup import state_shapes
-from jaxcloseup.app.store import manifest
 from jaxcloseup.app.store.stored_config import preset_from_config
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.captures.load import load_scene

@@ -5,7 +5,7 @@ import sys
 
 from absl import flags
 
-from jaxcloseup.app.run.settings import describe_settings
+from jaxcloseup.app.methods.settings import describe_settings
 from jaxcloseup.app.store.stored_run import (
     RunError,
     StoredRun,

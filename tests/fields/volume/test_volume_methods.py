@@ -14,8 +14,8 @@ from test_sweep import assert_same_step
 from tiny_runs import TINY
 
 from jaxcloseup.app.methods import METHODS
+from jaxcloseup.app.methods.settings import plain_config
 from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.run.settings import plain_config
 from jaxcloseup.app.run.setup import initial_state
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.captures.load import load_scene
