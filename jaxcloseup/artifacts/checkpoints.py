@@ -97,15 +97,12 @@ class Checkpoints:
                 "disk and resume the run from the previous checkpoint."
             ) from error
 
-    def load(
-        self, stage: str, like: Any, *, stored_as: Mapping[str, str] | None = None
-    ) -> tuple[int, Any, dict[str, Any]] | None:
+    def load(self, stage: str, like: Any) -> tuple[int, Any, dict[str, Any]] | None:
         """Load a stage's newest step, state and progress, or None if it has no checkpoint.
 
         Args:
           stage: name of the stage.
           like: pytree with the structure, shapes and types of the state.
-          stored_as: names of fields in `like` whose checkpoint has other names, to these.
 
         Raises:
           CheckpointError: the checkpoint cannot be read, its bytes were changed, or its state
@@ -123,7 +120,7 @@ class Checkpoints:
         try:
             found = manager.restore(step, args=items)
             plain = jax.tree_util.tree_map_with_path(
-                lambda path, leaf: _follow(found["state"], path, leaf, stored_as or {}),
+                lambda path, leaf: _follow(found["state"], path, leaf),
                 _plain(like),
             )
             progress = _checked(plain, found["progress"])
@@ -218,11 +215,10 @@ def _checksum(plain, progress):
     return value
 
 
-def _follow(tree, path, like, stored_as):
-    """The leaf of nested dicts and lists that lies at a pytree's path, under other names."""
+def _follow(tree, path, like):
+    """Return the leaf of nested dicts and lists that lies at a pytree's path."""
     for key in path:
         name = jax.tree_util.keystr((key,), simple=True)
-        name = stored_as.get(name, name)
         try:
             tree = tree[int(name)] if isinstance(tree, list | tuple) else tree[name]
         except (KeyError, IndexError):

@@ -2,8 +2,6 @@
 
 import dataclasses
 import json
-import pathlib
-import shutil
 
 import cv2
 import jax
@@ -24,9 +22,6 @@ from jaxcloseup.app.run.setup import LabelStart
 from jaxcloseup.app.store.stored_config import preset_from_config
 from jaxcloseup.app.store.stored_run import RunError, change_settings, load_run_scene, read_run
 from jaxcloseup.captures.load import load_scene
-
-
-OLD_RUN = pathlib.Path(__file__).parents[1] / "data" / "run_0_1_0"  # and its capture
 
 
 @pytest.fixture
@@ -245,23 +240,6 @@ def test_a_setting_that_a_run_lacks_has_its_default():
     del stored["field"]["ssim_weight"], stored["labels"]["look_at"]
     preset, absent = preset_from_config(stored)
     assert preset == KEPT and absent == {"ssim_weight": 0.2, "look_at": False}
-
-
-def test_a_run_of_version_0_1_0_renders_as_it_did(render, tmp_path, capsys):
-    stored = shutil.copytree(OLD_RUN / "run", tmp_path / "run")
-    out = render(run=str(stored), data=str(OLD_RUN / "capture"), views="test", support=False)
-    said = capsys.readouterr().out
-    assert "version 0.1.0 had no such settings; it renders with " in said
-    for absent in ("antialias=False", "coarse=None", "label=warp", "look_at=False"):
-        assert absent in said
-    image, as_it_was = (
-        cv2.imread(str(file)).astype(int)
-        for file in (out / "rgb" / "0.png", OLD_RUN / "baseline_test_0.png")
-    )
-    assert np.abs(image - as_it_was).max() <= 1  # machines round differently
-    preset = read_run(stored).preset
-    assert preset.field.color_ridge == 0.01 and preset.field.steps_per_target == 2
-    assert preset.train.label_rule == "paper" and preset.labels.label_loss_weight == 0.05
 
 
 def test_settings_change_what_is_fine_tuned(kept):

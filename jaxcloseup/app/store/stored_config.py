@@ -1,4 +1,4 @@
-"""Presets from the JSON of stored runs, including those that earlier versions stored."""
+"""Rebuild presets from the JSON of stored runs."""
 
 import dataclasses
 import math
@@ -10,17 +10,14 @@ from jaxcloseup.app.methods import METHODS, Preset
 from jaxcloseup.app.methods.settings import check_value, is_plain, plain_config
 
 
-def preset_from_config(
-    stored: Mapping[str, Any], method: str | None = None
-) -> tuple[Preset, dict[str, Any]]:
-    """The preset whose `plain_config` a run stored.
+def preset_from_config(stored: Mapping[str, Any]) -> tuple[Preset, dict[str, Any]]:
+    """Return the preset whose `plain_config` a run stored.
 
     A setting that the run's version lacked has its default: every setting that is added later must
     do by default what programs did before.
 
     Args:
       stored: the configuration in the run's JSON.
-      method: the run's method, which version 0.1.0 stored beside the configuration.
 
     Returns:
       The preset, and the absent settings by name with the values they have.
@@ -30,7 +27,7 @@ def preset_from_config(
         the field.
     """
     if "method" not in stored:
-        stored = from_version_0_1(stored, method)
+        raise ValueError("config lacks method")
     if stored["method"] not in list(METHODS):  # which may be anything
         raise ValueError(f"there is no method {stored['method']}")
     records: dict[str, set[type]] = {}
@@ -107,67 +104,3 @@ def _plain(value):
 
 def _names(record):
     return {field.name for field in dataclasses.fields(record)}
-
-
-# Settings of version 0.1.0 under the names that they have now.
-_FIELD_NAMES = {
-    "colour_ridge": "color_ridge",
-    "regularise_from": "regularize_from",
-    "means_rate": "means_lr",
-    "decay_steps": "means_lr_steps",
-    "late_rate": "late_lr_scale",
-    "sh_rate": "sh_lr",
-    "opacity_rate": "opacity_lr",
-    "scale_rate": "scale_lr",
-    "rotation_rate": "rotation_lr",
-}
-_LABEL_NAMES = {"label_share": "label_loss_weight"} | {
-    name: name
-    for name in (
-        *("magnification", "max_angle", "anchor_tolerance", "rgb_tolerance", "depth_tolerance"),
-        *("forward_label", "leave_out_source", "source_tolerance"),
-    )
-}
-_NERF_NAMES = {
-    "learning_rate": "initial_lr",
-    "decay_rate": "lr_decay",
-    "decay_steps": "lr_decay_steps",
-    "normalise": "normalize",
-    "test_time_steps": "target_steps",
-}
-_LABEL_RULES = {
-    (False, False, False): "paper",
-    (False, False, True): "pooled",
-    (True, True, True): "released",
-}
-
-
-def from_version_0_1(stored: Mapping[str, Any], method: str | None) -> dict[str, Any]:
-    """The configuration of a run of version 0.1.0 in today's form.
-
-    Raises:
-      ValueError: it is not of that version.
-    """
-    try:
-        field, train = dict(stored["field"]), stored["train"]
-        if method == "surfels":
-            field = {_FIELD_NAMES.get(name, name): value for name, value in field.items()}
-            field["steps_per_target"] = stored["test_time_steps"]
-        else:
-            field |= {new: stored[old] for old, new in _NERF_NAMES.items()}
-        quirks = "perturbed_depth", "undivided_depth", "pooled_loss"
-        return {
-            "method": method,
-            "field": field,
-            "train": {
-                **{name: train[name] for name in ("num_rays", "num_label_rays")},
-                "label_rule": _LABEL_RULES[tuple(train[name] for name in quirks)],
-            },
-            "labels": {new: stored[old] for old, new in _LABEL_NAMES.items()},
-            **{
-                name: stored[name]
-                for name in ("baseline_steps", "closeup_steps", "downscale", "gated")
-            },
-        }
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"config lacks {error.args[0]}") from None

@@ -25,10 +25,6 @@ from jaxcloseup.training.steps import TrainState
 
 # Which stage is rendered by default: the first of these that a run has.
 _BY_DEFAULT = ("closeup", "control", "baseline")
-# Names of a state's arrays that version 0.1.0 spelled otherwise.
-_OLD_NAMES = {"regularize": "regularise", "image_offset": "probe"}
-
-
 # What rendering needs of the files of a run.
 _FIELDS = {
     manifest.NAME: {"scene": str, "load_options": dict, "data_sha256": str},
@@ -87,7 +83,7 @@ def read_run(folder: pathlib.Path) -> StoredRun:
         )
     version = identity.get("version")
     try:
-        preset, absent = preset_from_config(identity["config"], identity.get("method"))
+        preset, absent = preset_from_config(identity["config"])
     except ValueError as error:
         raise RunError(
             f"--run={folder} was trained by version {version}, whose configuration this version "
@@ -182,9 +178,8 @@ def restore(run: StoredRun, scene: Scene, stage: str) -> tuple[Programs, TrainSt
             "other shapes, so train anew with these settings, or leave them out"
         )
     like = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    old = _OLD_NAMES if str(run.identity.get("version", "")).startswith("0.1.") else {}
     checkpoints = Checkpoints(run.folder / "checkpoints", run.identity)
-    found = checkpoints.load(stage, like, stored_as=old)
+    found = checkpoints.load(stage, like)
     if found is None:
         raise RunError(f"--stage={stage}: {run.folder} has no state of it")
     step, state, progress = found
