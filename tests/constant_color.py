@@ -8,7 +8,7 @@ import optax
 
 from jaxcloseup.app.methods import LabelConfig, Method, Preset
 from jaxcloseup.fields.contract import RadianceField, Rendering
-from jaxcloseup.training.steps import TrainConfig
+from jaxcloseup.training.config import TrainConfig
 
 
 @dataclasses.dataclass(frozen=True)

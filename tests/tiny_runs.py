@@ -18,7 +18,8 @@ from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.fields.splats import RasterizeConfig
-from jaxcloseup.training.steps import TrainConfig, init_state
+from jaxcloseup.training.config import TrainConfig
+from jaxcloseup.training.steps import init_state
 
 
 TINY = dataclasses.replace(

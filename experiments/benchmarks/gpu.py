@@ -32,7 +32,7 @@ from jaxcloseup.app.run.stages import run_stages
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.fields.splats import RasterizeConfig
-from jaxcloseup.fields.volume.nerf import NerfConfig
+from jaxcloseup.fields.volume.config import NerfConfig
 
 
 REPEATS = 5

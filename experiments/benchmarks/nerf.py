@@ -13,7 +13,9 @@ import jax.numpy as jnp
 import optax
 
 from experiments.benchmarks.timing import interleaved_medians
-from jaxcloseup.fields.volume.nerf import NerfConfig, nerf
+from jaxcloseup.fields.volume.config import NerfConfig
+from jaxcloseup.fields.volume.nerf import nerf
+from jaxcloseup.fields.volume.networks import rays_in_cache
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.photos.views import Batch
 from jaxcloseup.training.loss import rendered_loss
@@ -35,7 +37,7 @@ def run() -> None:
     for dtype in DTYPES:
         config = dataclasses.replace(FULL, compute_dtype=dtype)
         calls["ceiling", dtype] = product(dtype, ROWS)
-        calls["pieces", dtype] = product(dtype, min(ROWS, 128 * FULL.rays_at_once))
+        calls["pieces", dtype] = product(dtype, min(ROWS, 128 * _rays_at_once(FULL)))
         calls["step", dtype], megabytes["step", dtype] = training_step(config)
         calls["again", dtype], megabytes["again", dtype] = training_step(config, recompute=True)
         calls["image", dtype], megabytes["image", dtype] = depth_image(config)
@@ -112,7 +114,7 @@ def training_step(config: NerfConfig, *, recompute: bool = False, num_rays: int 
     cameras = jax.tree.map(lambda x: jnp.tile(x, (num_rays,) + (1,) * x.ndim), CAMERA)
     pixels = IMAGE * jax.random.uniform(key_pixels, (num_rays, 2))
     batch = Batch(cameras, pixels, jax.random.uniform(key_rgb, (num_rays, 3)), jnp.ones(num_rays))
-    chunk = None if recompute else config.rays_at_once
+    chunk = None if recompute else _rays_at_once(config)
 
     def step(params, opt_state, key):
         loss = functools.partial(rendered_loss, field=field, chunk=chunk)
@@ -135,3 +137,7 @@ def compiled(function: Callable, *args):
     executable = jax.jit(function).lower(*args).compile()
     memory = executable.memory_analysis().temp_size_in_bytes / 1e6
     return functools.partial(executable, *args), memory
+
+
+def _rays_at_once(config: NerfConfig) -> int:
+    return rays_in_cache(config.num_coarse + config.num_fine, config.width)

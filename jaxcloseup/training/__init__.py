@@ -6,8 +6,9 @@ from jaxcloseup.lazy import lazy_names
 __all__, __getattr__, __dir__ = lazy_names(
     __name__,
     {
+        "config": "TrainConfig",
         "steps": (
-            "TrainState TrainConfig init_state train_step pseudo_step closeup_step "
+            "TrainState init_state train_step pseudo_step closeup_step "
             "labeled_step run_steps render_depths"
         ),
         "loss": "judge rendered_loss",

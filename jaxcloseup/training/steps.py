@@ -5,7 +5,6 @@ Without it, a step whose field compiles its rendering itself, as that of surfels
 compiled parts, and all kinds of steps share them.
 """
 
-import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -27,6 +26,7 @@ from jaxcloseup.labels.make import (
 from jaxcloseup.labels.rules import LABEL_RULES, add_label_loss, label_depth
 from jaxcloseup.photos.views import Batch, Views
 from jaxcloseup.photos.windows import Windows
+from jaxcloseup.training.config import TrainConfig
 from jaxcloseup.training.loss import rendered_loss
 from jaxcloseup.training.sampling import (
     Spread,
@@ -58,24 +58,6 @@ class TrainState:
     buffers: Any
     opt_state: Any
     key: jax.Array
-
-
-@dataclasses.dataclass(frozen=True)
-class TrainConfig:
-    """How much one step looks at.
-
-    Attributes:
-      num_rays: pixels of photographs in a step; None takes one whole photograph.
-      num_label_rays: labeled pixels in a step; None takes the whole virtual image.
-      label_rule: a name in `LABEL_RULES`. Whole virtual images always add both losses.
-      num_windows: how often a step draws all this: photographs or their windows, and labels. The
-        mean gradient of the draws moves the parameters.
-    """
-
-    num_rays: int | None = 1024
-    num_label_rays: int | None = 1024
-    label_rule: str = "paper"
-    num_windows: int = 1
 
 
 def init_state(

@@ -25,7 +25,7 @@ from jaxcloseup.app.methods import METHODS
 from jaxcloseup.app.methods.settings import plain_config, settings_of
 from jaxcloseup.app.run import stage_names as names
 from jaxcloseup.app.sweep.arms import KINDS
-from jaxcloseup.fields.splats.adaptive import AdaptiveConfig
+from jaxcloseup.fields.splats.config import AdaptiveConfig
 from jaxcloseup.photos.scene import SceneError
 
 

@@ -18,6 +18,7 @@ from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.labels.make import label_sources
 from jaxcloseup.photos.views import sample_image, sample_pixels
+from jaxcloseup.training.config import TrainConfig
 from jaxcloseup.training.sampling import (
     draw_keys,
     in_a_loop,
@@ -25,7 +26,7 @@ from jaxcloseup.training.sampling import (
     over_devices,
     sample_closeup,
 )
-from jaxcloseup.training.steps import TrainConfig, closeup_step, init_state, train_step
+from jaxcloseup.training.steps import closeup_step, init_state, train_step
 
 
 DRAWS = 8

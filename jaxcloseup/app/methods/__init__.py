@@ -18,8 +18,8 @@ from jaxcloseup.app.methods.method import (
     Preset,
     TargetConfig,
     WindowConfig,
-    pseudo_settings,
 )
+from jaxcloseup.labels.config import pseudo_settings
 
 
 METHODS: dict[str, Method] = {

@@ -4,8 +4,7 @@ import dataclasses
 
 from jaxcloseup.app.methods import surfels
 from jaxcloseup.app.methods.method import Preset, TargetConfig
-from jaxcloseup.fields.splats.adaptive import AdaptiveConfig
-from jaxcloseup.fields.splats.config import GaussianConfig
+from jaxcloseup.fields.splats.config import AdaptiveConfig, GaussianConfig
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,8 +10,9 @@ from jaxcloseup.app.methods.volumes import (
     DepthConfig,
     volumetric,
 )
-from jaxcloseup.fields.volume.mipnerf import MipNerfConfig, mipnerf
-from jaxcloseup.training.steps import TrainConfig
+from jaxcloseup.fields.volume.config import MipNerfConfig
+from jaxcloseup.fields.volume.mipnerf import mipnerf
+from jaxcloseup.training.config import TrainConfig
 
 
 @dataclasses.dataclass(frozen=True)

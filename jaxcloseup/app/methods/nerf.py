@@ -14,9 +14,10 @@ from jaxcloseup.app.methods.volumes import (
     unit_cube,
 )
 from jaxcloseup.fields.contract import RadianceField
-from jaxcloseup.fields.volume.nerf import NerfConfig, nerf
+from jaxcloseup.fields.volume.config import NerfConfig
+from jaxcloseup.fields.volume.nerf import nerf
 from jaxcloseup.photos.scene import Scene
-from jaxcloseup.training.steps import TrainConfig
+from jaxcloseup.training.config import TrainConfig
 
 
 @dataclasses.dataclass(frozen=True)

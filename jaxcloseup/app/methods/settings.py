@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from jaxcloseup.app.methods import METHODS, Method, Preset
-from jaxcloseup.fields.splats.rasterize import COMPOSITORS
+from jaxcloseup.fields.splats.config import COMPOSITORS
 from jaxcloseup.labels.rules import LABEL_RULES
 
 

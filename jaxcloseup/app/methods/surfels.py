@@ -23,12 +23,14 @@ from jaxcloseup.app.methods.method import (
 from jaxcloseup.artifacts.surfel_ply import write_surfels
 from jaxcloseup.artifacts.viewer_gaussians import as_gaussians
 from jaxcloseup.fields.contract import RadianceField, Rendering
-from jaxcloseup.fields.splats.adaptive import AdaptiveConfig
-from jaxcloseup.fields.splats.config import SurfelConfig
+from jaxcloseup.fields.splats.config import (
+    AdaptiveConfig,
+    McmcConfig,
+    RasterizeConfig,
+    SurfelConfig,
+)
 from jaxcloseup.fields.splats.control import replace_surfels
 from jaxcloseup.fields.splats.filters import sampling_intervals, smoothed
-from jaxcloseup.fields.splats.mcmc import McmcConfig
-from jaxcloseup.fields.splats.rasterize import RasterizeConfig
 from jaxcloseup.fields.splats.refinement import join_surfels, replace_least, surfels_where_wrong
 from jaxcloseup.fields.splats.splat_field import (
     SurfelBuffers,
@@ -43,7 +45,8 @@ from jaxcloseup.labels.rules import label_depth
 from jaxcloseup.photos.pyramids import Pyramid
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.views import Views, camera_at, to_float
-from jaxcloseup.training.steps import TrainConfig, TrainState
+from jaxcloseup.training.config import TrainConfig
+from jaxcloseup.training.steps import TrainState
 
 
 @dataclasses.dataclass(frozen=True)

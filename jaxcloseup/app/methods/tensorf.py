@@ -10,8 +10,9 @@ from jaxcloseup.app.methods.volumes import (
     DepthConfig,
     volumetric,
 )
-from jaxcloseup.fields.volume.tensorf import TensorfConfig, tensorf
-from jaxcloseup.training.steps import TrainConfig
+from jaxcloseup.fields.volume.config import TensorfConfig
+from jaxcloseup.fields.volume.tensorf import tensorf
+from jaxcloseup.training.config import TrainConfig
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,9 +10,9 @@ from jaxcloseup.app.methods.volumes import (
     DepthConfig,
     volumetric,
 )
-from jaxcloseup.fields.volume.hash_grid import HashGridConfig
-from jaxcloseup.fields.volume.zipnerf import ZipNerfConfig, zipnerf
-from jaxcloseup.training.steps import TrainConfig
+from jaxcloseup.fields.volume.config import HashGridConfig, ZipNerfConfig
+from jaxcloseup.fields.volume.zipnerf import zipnerf
+from jaxcloseup.training.config import TrainConfig
 
 
 @dataclasses.dataclass(frozen=True)

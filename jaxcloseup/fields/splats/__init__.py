@@ -6,14 +6,13 @@ from jaxcloseup.lazy import lazy_names
 __all__, __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "adaptive": "AdaptiveConfig OffsetSurfels",
-        "config": "GaussianConfig SurfelConfig",
+        "adaptive": "OffsetSurfels",
+        "config": "AdaptiveConfig GaussianConfig McmcConfig RasterizeConfig SurfelConfig",
         "density": "DensityControl density_control",
         "ellipsoids": "project_ellipsoids",
         "filters": "sampling_intervals smoothed",
-        "mcmc": "McmcConfig",
         "projection": "Discs project_discs surfel_columns to_camera",
-        "rasterize": "Footprints RasterizeConfig SplatImage",
+        "rasterize": "Footprints SplatImage",
         "refinement": "join_surfels surfels_where_wrong",
         "regularizers": "depth_to_normal normal_inconsistency scale_free_distortion",
         "render": "SurfelAux render_surfels",

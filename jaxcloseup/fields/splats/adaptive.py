@@ -17,42 +17,12 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
+from jaxcloseup.fields.splats.config import AdaptiveConfig
 from jaxcloseup.fields.splats.control import DensityControl, is_due, replace_surfels
 from jaxcloseup.fields.splats.surfels import Surfels
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.geometry.numerics import matmul, safe_norm
 from jaxcloseup.geometry.rotations import quaternion_to_matrix
-
-
-@dataclasses.dataclass(frozen=True)
-class AdaptiveConfig:
-    """When surfels are added and removed; lengths are in extents of the capture.
-
-    Attributes:
-      every: steps between refinements.
-      start: the first refinement comes after this step.
-      stop: the last refinement and the last reset come before this step.
-      gradient: a surfel is cloned or split where its mean 2-D gradient is at least this: the norm
-        of the loss's gradient with respect to the image of its center, in units of half an image,
-        averaged over the views in which it is not 0.
-      small: a surfel up to this scale is cloned; a larger one is split.
-      shrink: factor by which the halves of a split surfel are smaller.
-      min_opacity: fainter surfels are removed.
-      huge: larger surfels are removed after the first reset, unless they are split.
-      reset_every: steps between resets of the opacities.
-      reset_opacity: largest opacity after a reset.
-    """
-
-    every: int = 100
-    start: int = 500
-    stop: int = 15_000
-    gradient: float = 2e-4
-    small: float = 0.01
-    shrink: float = 1.6
-    min_opacity: float = 0.05
-    huge: float = 0.1
-    reset_every: int = 3000
-    reset_opacity: float = 0.01
 
 
 @struct.dataclass

@@ -1,11 +1,100 @@
-"""Configurations of fields of splats: discs, and volumetric Gaussians."""
+"""Configurations of splat fields, their rasterizer and density controls; no JAX is imported."""
 
 import dataclasses
 from collections.abc import Hashable
 from typing import ClassVar
 
-from jaxcloseup.fields.splats.mcmc import McmcConfig
-from jaxcloseup.fields.splats.rasterize import RasterizeConfig
+
+COMPOSITORS = ("auto", "loops", "kernel")
+
+
+@dataclasses.dataclass(frozen=True)
+class McmcConfig:
+    """When and how many surfels move.
+
+    Attributes:
+      every: steps between relocations.
+      start: the first relocation comes after this step.
+      stop: the last relocation, and the last growth, comes before this step.
+      growth: largest factor by which one relocation multiplies the number of living surfels.
+      min_opacity: a surfel that is no more opaque than this is dead.
+      noise: strength of the position noise, relative to the learning rate of the means; 0 is none.
+    """
+
+    every: int = 100
+    start: int = 500
+    stop: int = 25_000
+    growth: float = 1.05
+    min_opacity: float = 0.005
+    noise: float = 5e5
+
+
+@dataclasses.dataclass(frozen=True)
+class AdaptiveConfig:
+    """When surfels are added and removed; lengths are in extents of the capture.
+
+    Attributes:
+      every: steps between refinements.
+      start: the first refinement comes after this step.
+      stop: the last refinement and the last reset come before this step.
+      gradient: a surfel is cloned or split where its mean 2-D gradient is at least this: the norm
+        of the loss's gradient with respect to the image of its center, in units of half an image,
+        averaged over the views in which it is not 0.
+      small: a surfel up to this scale is cloned; a larger one is split.
+      shrink: factor by which the halves of a split surfel are smaller.
+      min_opacity: fainter surfels are removed.
+      huge: larger surfels are removed after the first reset, unless they are split.
+      reset_every: steps between resets of the opacities.
+      reset_opacity: largest opacity after a reset.
+    """
+
+    every: int = 100
+    start: int = 500
+    stop: int = 15_000
+    gradient: float = 2e-4
+    small: float = 0.01
+    shrink: float = 1.6
+    min_opacity: float = 0.05
+    huge: float = 0.1
+    reset_every: int = 3000
+    reset_opacity: float = 0.01
+
+
+@dataclasses.dataclass(frozen=True)
+class RasterizeConfig:
+    """Static settings of the rasterizer; the sizes change no image whose pairs fit.
+
+    Attributes:
+      capacity: largest number of pairs of splats and the tiles that their boxes touch. `overflow`
+        counts the pairs beyond it, which are those of the farthest splats; render again with a
+        larger capacity.
+      near: positive z-depth in world units; nothing nearer is drawn.
+      antialias: convolve surfels with the pixel, see `project_discs`.
+      tile: side of a tile in pixels; None: by the image's size, see `for_image`.
+      chunk: number of a tile's splats that loops evaluate at once; None: 8.
+      block: largest number of tiles that loops evaluate at once; None: by the platform.
+      compositor: "loops" blends by `jax.lax`, with chunks and blocks; "kernel" by Pallas kernels,
+        which other platforms than GPUs interpret, slowly; "auto" by kernels on a GPU that runs
+        them, else by loops.
+
+    Raises:
+      ValueError: there is no such compositor.
+    """
+
+    capacity: int = 2**18
+    near: float = 0.01
+    antialias: bool = False
+    tile: int | None = None
+    chunk: int | None = None
+    block: int | None = None
+    compositor: str = "auto"
+
+    def __post_init__(self) -> None:
+        """Check the compositor's name."""
+        if self.compositor not in COMPOSITORS:
+            raise ValueError(
+                f'RasterizeConfig.compositor must be one of {COMPOSITORS}, not "{self.compositor}"'
+            )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,9 +4,10 @@ from collections.abc import Callable, Hashable
 
 import jax
 
-from jaxcloseup.fields.splats.adaptive import AdaptiveConfig, adaptive_control
+from jaxcloseup.fields.splats.adaptive import adaptive_control
+from jaxcloseup.fields.splats.config import AdaptiveConfig, McmcConfig
 from jaxcloseup.fields.splats.control import DensityControl
-from jaxcloseup.fields.splats.mcmc import McmcConfig, mcmc_control
+from jaxcloseup.fields.splats.mcmc import mcmc_control
 
 
 __all__ = ["DensityControl", "density_control"]

@@ -4,12 +4,12 @@ Surfels that have faded move onto opaque ones, which share their light with the 
 noise moves all surfels a little, faint ones most. No array changes shape.
 """
 
-import dataclasses
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 
+from jaxcloseup.fields.splats.config import McmcConfig
 from jaxcloseup.fields.splats.control import DensityControl, is_due, replace_surfels
 from jaxcloseup.fields.splats.surfels import Surfels
 from jaxcloseup.geometry.numerics import safe_divide
@@ -18,27 +18,6 @@ from jaxcloseup.geometry.rotations import quaternion_to_matrix
 
 MAX_COPIES = 51  # largest number of coincident surfels that one surfel becomes at once
 _MAX_OPACITY = 1 - 1e-6
-
-
-@dataclasses.dataclass(frozen=True)
-class McmcConfig:
-    """When and how many surfels move.
-
-    Attributes:
-      every: steps between relocations.
-      start: the first relocation comes after this step.
-      stop: the last relocation, and the last growth, comes before this step.
-      growth: largest factor by which one relocation multiplies the number of living surfels.
-      min_opacity: a surfel that is no more opaque than this is dead.
-      noise: strength of the position noise, relative to the learning rate of the means; 0 is none.
-    """
-
-    every: int = 100
-    start: int = 500
-    stop: int = 25_000
-    growth: float = 1.05
-    min_opacity: float = 0.005
-    noise: float = 5e5
 
 
 def mcmc_control(

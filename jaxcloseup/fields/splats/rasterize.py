@@ -15,51 +15,14 @@ from flax import struct
 from jax import lax
 
 from jaxcloseup.fields.splats.blending import blend_tiles
+from jaxcloseup.fields.splats.config import RasterizeConfig
 from jaxcloseup.fields.splats.splat_math import pack
 from jaxcloseup.fields.splats.tile_test import reaches
 from jaxcloseup.fields.splats.tiling import tile_lists
 from jaxcloseup.geometry.numerics import safe_divide
 
 
-COMPOSITORS = ("auto", "loops", "kernel")
 _SMALL = 2**17  # pixels of an image that is best cut into small tiles
-
-
-@dataclasses.dataclass(frozen=True)
-class RasterizeConfig:
-    """Static settings of the rasterizer; the sizes change no image whose pairs fit.
-
-    Attributes:
-      capacity: largest number of pairs of splats and the tiles that their boxes touch. `overflow`
-        counts the pairs beyond it, which are those of the farthest splats; render again with a
-        larger capacity.
-      near: positive z-depth in world units; nothing nearer is drawn.
-      antialias: convolve surfels with the pixel, see `project_discs`.
-      tile: side of a tile in pixels; None: by the image's size, see `for_image`.
-      chunk: number of a tile's splats that loops evaluate at once; None: 8.
-      block: largest number of tiles that loops evaluate at once; None: by the platform.
-      compositor: "loops" blends by `jax.lax`, with chunks and blocks; "kernel" by Pallas kernels,
-        which other platforms than GPUs interpret, slowly; "auto" by kernels on a GPU that runs
-        them, else by loops.
-
-    Raises:
-      ValueError: there is no such compositor.
-    """
-
-    capacity: int = 2**18
-    near: float = 0.01
-    antialias: bool = False
-    tile: int | None = None
-    chunk: int | None = None
-    block: int | None = None
-    compositor: str = "auto"
-
-    def __post_init__(self) -> None:
-        """Check the compositor's name."""
-        if self.compositor not in COMPOSITORS:
-            raise ValueError(
-                f'RasterizeConfig.compositor must be one of {COMPOSITORS}, not "{self.compositor}"'
-            )
 
 
 def for_image(config: RasterizeConfig, *, height: int, width: int) -> RasterizeConfig:

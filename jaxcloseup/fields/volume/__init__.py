@@ -8,24 +8,22 @@ __all__, __getattr__, __dir__ = lazy_names(
     {
         "compositing": "Composite composite composite_intervals",
         "cones": "Moments frustum_gaussians frustum_moments frustum_samples integrated_encoding",
+        "config": ("HashGridConfig MipNerfConfig NerfConfig NgpConfig TensorfConfig ZipNerfConfig"),
         "coordinates": "contract contraction_scale spaced unspaced",
         "depth_supervision": "DepthSupervision Sightings depth_divergence mean_divergence",
         "encodings": "positional_encoding",
-        "hash_grid": "HashGridConfig grid_rows hash_features init_hash_grid",
+        "hash_grid": "grid_rows hash_features init_hash_grid",
         "interpolation": "weighted_rows",
         "intervals": "Histogram IntervalConfig Round interval_field",
-        "mipnerf": "MipNerfConfig",
-        "nerf": "NerfConfig",
         "networks": (
             "Raw apply_mlp apply_network dense exponential_density init_mlp init_network "
             "rays_in_cache"
         ),
-        "ngp": "NgpConfig",
         "rays": "Rays Traced VolumeAux photometric_loss ray_field",
         "regularizers": "antialiased_proposal_penalty distortion proposal_penalty",
         "renderer": "Samples VolumeConfig volume_field",
         "samplers": "importance interval_quantiles resample stratified widen",
-        "tensorf": "TensorfBuffers TensorfConfig factor_products",
-        "zipnerf": "ZipNerfConfig downweighted_features mean_squares",
+        "tensorf": "TensorfBuffers factor_products",
+        "zipnerf": "downweighted_features mean_squares",
     },
 )

@@ -4,14 +4,12 @@ Levels of cubic grids, each finer than the last by one factor, hold trained feat
 vertices. A grid with more vertices than a level has entries shares these by a hash.
 """
 
-import dataclasses
-import math
-
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcloseup.fields.volume.config import HashGridConfig
 from jaxcloseup.fields.volume.interpolation import weighted_rows
 from jaxcloseup.geometry.numerics import matmul
 
@@ -19,46 +17,6 @@ from jaxcloseup.geometry.numerics import matmul
 _PRIMES = (1, 2_654_435_761, 805_459_861)  # eq. 4
 _INITIAL = 1e-4  # features begin uniform within this of 0
 _CORNERS = np.array(list(np.ndindex(2, 2, 2)), np.uint32)  # [8, 3]
-
-
-@dataclasses.dataclass(frozen=True)
-class HashGridConfig:
-    """Sizes of the encoding; the defaults are the paper's for radiance fields.
-
-    Attributes:
-      levels: number of grids.
-      features: trained numbers at each vertex.
-      log2_entries: base-2 logarithm of the most entries that one level has.
-      coarsest: cells along each side of the first grid.
-      finest: cells along each side of the last grid.
-    """
-
-    levels: int = 16
-    features: int = 2
-    log2_entries: int = 19
-    coarsest: int = 16
-    finest: int = 2048
-
-    @property
-    def resolutions(self) -> tuple[int, ...]:
-        """Cells along each side of every level, eq. 2 and 3."""
-        steps = max(1, self.levels - 1)
-        growth = math.log(self.finest / self.coarsest) / steps
-        # Rounding must not take a cell from a level that is a whole number of them.
-        return tuple(
-            math.floor(self.coarsest * math.exp(level * growth) + 1e-6)
-            for level in range(self.levels)
-        )
-
-    @property
-    def entries(self) -> tuple[int, ...]:
-        """Entries of every level: its vertices, if they fit."""
-        return tuple(min((n + 1) ** 3, 2**self.log2_entries) for n in self.resolutions)
-
-    @property
-    def size(self) -> int:
-        """Number of features of an encoded position."""
-        return self.levels * self.features
 
 
 def init_hash_grid(key: jax.Array, config: HashGridConfig) -> jax.Array:

@@ -1,6 +1,5 @@
 """mip-NeRF: a NeRF that sees cones, by one network in both passes (Barron et al., ICCV 2021)."""
 
-import dataclasses
 import functools
 from typing import Any
 
@@ -9,6 +8,7 @@ import jax.numpy as jnp
 
 from jaxcloseup.fields.contract import RadianceField
 from jaxcloseup.fields.volume.cones import frustum_gaussians, integrated_encoding
+from jaxcloseup.fields.volume.config import MipNerfConfig
 from jaxcloseup.fields.volume.depth_supervision import DepthSupervision
 from jaxcloseup.fields.volume.encodings import positional_encoding
 from jaxcloseup.fields.volume.intervals import IntervalConfig, Round, interval_field
@@ -19,39 +19,6 @@ from jaxcloseup.fields.volume.samplers import widen
 
 
 _PADDING = 0.001  # colors reach this far beyond [0, 1], so that the loss can reach 0 and 1
-
-
-@dataclasses.dataclass(frozen=True)
-class MipNerfConfig:
-    """The network and its samples; the defaults are the paper's.
-
-    Attributes:
-      depth: number of layers of the trunk.
-      width: width of the trunk's layers.
-      skip_after: index of the trunk's layer after which the encoded position enters again.
-      position_octaves: octaves of the integrated positional encoding.
-      direction_octaves: octaves of the positional encoding of view directions.
-      direction_width: width of the layer that sees the view direction.
-      num_coarse: intervals per ray of the coarse pass.
-      num_fine: intervals per ray of the fine pass.
-      coarse_weight: weight of the coarse colors in the loss.
-      spacing: exponent of the coarse pass's spacing, see `spaced`.
-      background: gray level in [0, 1] behind the scene; None adds nothing, which is black.
-      chunk: rays rendered at once; None leaves the choice to `rays_in_cache`.
-    """
-
-    depth: int = 8
-    width: int = 256
-    skip_after: int = 4
-    position_octaves: int = 16
-    direction_octaves: int = 4
-    direction_width: int = 128
-    num_coarse: int = 128
-    num_fine: int = 128
-    coarse_weight: float = 0.1
-    spacing: float = 1.0
-    background: float | None = None
-    chunk: int | None = None
 
 
 def mipnerf(

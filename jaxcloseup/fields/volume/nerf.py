@@ -1,54 +1,16 @@
 """NeRF: a coarse and a fine network, volume rendered (Mildenhall et al., ECCV 2020)."""
 
-import dataclasses
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from jaxcloseup.fields.contract import RadianceField
+from jaxcloseup.fields.volume.config import NerfConfig
 from jaxcloseup.fields.volume.depth_supervision import DepthSupervision
 from jaxcloseup.fields.volume.encodings import positional_encoding
 from jaxcloseup.fields.volume.networks import apply_network, init_network, rays_in_cache
 from jaxcloseup.fields.volume.renderer import Samples, VolumeConfig, volume_field
-
-
-@dataclasses.dataclass(frozen=True)
-class NerfConfig:
-    """The network and its sampling; the defaults are the original's.
-
-    Attributes:
-      depth: number of layers of the trunk.
-      width: width of the trunk's layers.
-      skip_after: index of the trunk's layer after which the encoded position enters again.
-      position_octaves: octaves of the positional encoding of positions.
-      direction_octaves: octaves of the positional encoding of view directions.
-      direction_width: width of the layer that sees the view direction.
-      num_coarse: stratified samples per ray of the coarse network.
-      num_fine: importance samples per ray; the fine network sees these and the coarse ones.
-      density_noise: standard deviation of noise on raw densities, if the rendering has a key.
-      background: gray level in [0, 1] behind the scene; None adds nothing, which is black.
-      chunk: rays rendered at once; None leaves the choice to `rays_at_once`.
-      compute_dtype: "float32" or "bfloat16" for the operands of the network's products.
-    """
-
-    depth: int = 8
-    width: int = 256
-    skip_after: int = 4
-    position_octaves: int = 10
-    direction_octaves: int = 4
-    direction_width: int = 128
-    num_coarse: int = 64
-    num_fine: int = 64
-    density_noise: float = 1.0
-    background: float | None = None
-    chunk: int | None = None
-    compute_dtype: str = "float32"
-
-    @property
-    def rays_at_once(self) -> int:
-        """Rays to render, or to differentiate, at once."""
-        return self.chunk or rays_in_cache(self.num_coarse + self.num_fine, self.width)
 
 
 def nerf(
@@ -96,7 +58,7 @@ def nerf(
         num_coarse=config.num_coarse,
         num_fine=config.num_fine,
         background=config.background,
-        chunk=config.rays_at_once,
+        chunk=config.chunk or rays_in_cache(config.num_coarse + config.num_fine, config.width),
     )
     return volume_field(
         volume,

@@ -5,17 +5,17 @@ whose shapes are static. Where it takes spherical harmonics of directions, these
 NeRF's.
 """
 
-import dataclasses
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from jaxcloseup.fields.contract import RadianceField
+from jaxcloseup.fields.volume.config import HashGridConfig, NgpConfig
 from jaxcloseup.fields.volume.coordinates import contract
 from jaxcloseup.fields.volume.depth_supervision import DepthSupervision
 from jaxcloseup.fields.volume.encodings import positional_encoding
-from jaxcloseup.fields.volume.hash_grid import HashGridConfig, hash_features, init_hash_grid
+from jaxcloseup.fields.volume.hash_grid import hash_features, init_hash_grid
 from jaxcloseup.fields.volume.intervals import IntervalConfig, Round, interval_field
 from jaxcloseup.fields.volume.networks import apply_mlp, exponential_density, init_mlp
 from jaxcloseup.fields.volume.rays import Rays
@@ -24,46 +24,6 @@ from jaxcloseup.fields.volume.renderer import Samples
 
 
 _GEOMETRY = 16  # outputs of the density network; the first is the logarithm of density
-_FINE = HashGridConfig()
-_PROPOSAL = HashGridConfig(levels=5, log2_entries=17, finest=256)
-
-
-@dataclasses.dataclass(frozen=True)
-class NgpConfig:
-    """The encodings, networks and samples.
-
-    Attributes:
-      grid: the encoding of what is rendered.
-      proposal: the encoding of the proposals' densities, which all proposals share.
-      width: width of hidden layers.
-      proposal_width: width of the proposals' hidden layer.
-      color_layers: hidden layers of the color network; that of density has one.
-      direction_octaves: octaves of the positional encoding of view directions.
-      num_coarse: intervals per ray of the first proposal.
-      num_middle: intervals per ray of the second proposal; 0: there is none.
-      num_fine: intervals per ray that are rendered.
-      spacing: exponent of the first round's spacing, see `spaced`.
-      contracted: draw what lies outside the unit ball into a ball of radius 2; else positions
-        outside the unit cube are those of its surface.
-      distortion_weight: weight of mip-NeRF 360's distortion.
-      background: gray level in [0, 1] behind the scene; None adds nothing, which is black.
-      chunk: rays rendered at once.
-    """
-
-    grid: HashGridConfig = _FINE
-    proposal: HashGridConfig = _PROPOSAL
-    width: int = 64
-    proposal_width: int = 16
-    color_layers: int = 2
-    direction_octaves: int = 4
-    num_coarse: int = 256
-    num_middle: int = 96
-    num_fine: int = 48
-    spacing: float = 1.0
-    contracted: bool = False
-    distortion_weight: float = 0.0
-    background: float | None = None
-    chunk: int = 2**15
 
 
 def ngp(

@@ -6,8 +6,6 @@ skips empty space by an alpha mask, a first round looks at densities alone, and 
 where the first saw something; both see the same factors.
 """
 
-import dataclasses
-import math
 from typing import Any
 
 import jax
@@ -16,6 +14,7 @@ import numpy as np
 from flax import struct
 
 from jaxcloseup.fields.contract import RadianceField
+from jaxcloseup.fields.volume.config import TensorfConfig
 from jaxcloseup.fields.volume.depth_supervision import DepthSupervision
 from jaxcloseup.fields.volume.encodings import positional_encoding
 from jaxcloseup.fields.volume.interpolation import weighted_rows
@@ -35,57 +34,6 @@ class TensorfBuffers:
     """Vertices along each side of the grid, `[]` int32."""
 
     vertices: jax.Array
-
-
-@dataclasses.dataclass(frozen=True)
-class TensorfConfig:
-    """The decomposition, its growth, and the samples; the defaults are near the paper's.
-
-    Attributes:
-      coarsest: vertices along each side of the first grid.
-      finest: vertices along each side of the last grid.
-      growths: how often the grid grows, by about one factor.
-      grow_every: steps from one growth to the next.
-      density_components: products whose sum makes density, of each mode.
-      color_components: products that make appearance, of each mode.
-      appearance: features that the color network gets.
-      width: width of its two hidden layers.
-      octaves: octaves of the positional encodings of view directions and of appearance.
-      density_shift: added to the sum of products before softplus.
-      density_scale: density per field unit where softplus is 1.
-      sparsity_weight: weight of the mean absolute density factor.
-      smoothness_weight: weight of the mean squared difference of neighboring factors.
-      num_coarse: intervals per ray of the first round.
-      num_fine: intervals per ray that are rendered.
-      spacing: exponent of the first round's spacing, see `spaced`.
-      background: gray level in [0, 1] behind the scene; None adds nothing, which is black.
-      chunk: rays rendered at once.
-    """
-
-    coarsest: int = 128
-    finest: int = 300
-    growths: int = 5
-    grow_every: int = 1500
-    density_components: int = 16
-    color_components: int = 48
-    appearance: int = 27
-    width: int = 128
-    octaves: int = 2
-    density_shift: float = -10.0
-    density_scale: float = 25.0
-    sparsity_weight: float = 8e-5
-    smoothness_weight: float = 0.1
-    num_coarse: int = 512
-    num_fine: int = 128
-    spacing: float = 1.0
-    background: float | None = None
-    chunk: int = 2**12
-
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """Vertices along each side after 0, 1, ... growths: even steps of their logarithm."""
-        steps = np.linspace(math.log(self.coarsest), math.log(self.finest), self.growths + 1)
-        return tuple(max(2, round(size)) for size in np.exp(steps).tolist())
 
 
 def tensorf(

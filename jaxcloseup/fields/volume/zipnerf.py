@@ -5,7 +5,6 @@ Gaussian counts less. The paper also hands the networks how much each level coun
 which is not done here; densities are exponential as in Instant-NGP, which learns faster at first.
 """
 
-import dataclasses
 import functools
 import itertools
 from typing import Any
@@ -16,10 +15,11 @@ import numpy as np
 
 from jaxcloseup.fields.contract import RadianceField
 from jaxcloseup.fields.volume.cones import frustum_samples
+from jaxcloseup.fields.volume.config import HashGridConfig, ZipNerfConfig
 from jaxcloseup.fields.volume.coordinates import contract, contraction_scale
 from jaxcloseup.fields.volume.depth_supervision import DepthSupervision
 from jaxcloseup.fields.volume.encodings import positional_encoding
-from jaxcloseup.fields.volume.hash_grid import HashGridConfig, hash_features, init_hash_grid
+from jaxcloseup.fields.volume.hash_grid import hash_features, init_hash_grid
 from jaxcloseup.fields.volume.intervals import IntervalConfig, Round, interval_field
 from jaxcloseup.fields.volume.networks import apply_mlp, exponential_density, init_mlp
 from jaxcloseup.fields.volume.regularizers import antialiased_proposal_penalty, distortion
@@ -28,52 +28,6 @@ from jaxcloseup.fields.volume.renderer import Samples
 
 _GEOMETRY = 16  # outputs of the density network; the first is the logarithm of density
 _PULSES = (0.03, 0.003)  # half widths of the blur of the interlevel loss, of each proposal
-_GRID = HashGridConfig(levels=10, features=4, log2_entries=21, coarsest=16, finest=8192)
-_PROPOSAL = HashGridConfig(levels=6, features=1, log2_entries=21, coarsest=16, finest=512)
-
-
-@dataclasses.dataclass(frozen=True)
-class ZipNerfConfig:
-    """The encodings, networks and samples; the defaults are near the paper's.
-
-    Attributes:
-      grid: the encoding of what is rendered.
-      proposal: the encoding of each proposal's densities.
-      width: width of hidden layers.
-      color_layers: hidden layers of the color network; those of density have one.
-      direction_octaves: octaves of the positional encoding of view directions.
-      num_coarse: intervals per ray of the first proposal.
-      num_middle: intervals per ray of the second proposal; 0: there is none.
-      num_fine: intervals per ray that are rendered.
-      proposal_points: Gaussians of each interval of a proposal; the paper has 6.
-      points: Gaussians of each interval that is rendered; the paper has 6.
-      spacing: exponent of the first round's spacing, see `spaced`.
-      contracted: draw what lies outside the unit ball into a ball of radius 2; else positions
-        outside the unit cube are those of its surface.
-      proposal_weight: weight of the anti-aliased interlevel loss.
-      distortion_weight: weight of mip-NeRF 360's distortion.
-      decay_weight: weight of the mean square of each level's features.
-      background: gray level in [0, 1] behind the scene; None adds nothing, which is black.
-      chunk: rays rendered at once.
-    """
-
-    grid: HashGridConfig = _GRID
-    proposal: HashGridConfig = _PROPOSAL
-    width: int = 64
-    color_layers: int = 3
-    direction_octaves: int = 4
-    num_coarse: int = 64
-    num_middle: int = 64
-    num_fine: int = 32
-    proposal_points: int = 6
-    points: int = 6
-    spacing: float = -1.5
-    contracted: bool = True
-    proposal_weight: float = 0.01
-    distortion_weight: float = 0.01
-    decay_weight: float = 0.1
-    background: float | None = None
-    chunk: int = 2**14
 
 
 def zipnerf(

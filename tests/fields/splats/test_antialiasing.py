@@ -18,7 +18,7 @@ from splat_scenes import (
     to_surfels,
 )
 
-from jaxcloseup.fields.splats.rasterize import RasterizeConfig
+from jaxcloseup.fields.splats.config import RasterizeConfig
 
 
 def test_antialiased_images_agree_with_convolved_discs():

@@ -13,7 +13,8 @@ from jaxcloseup.fields.splats import McmcConfig, RasterizeConfig, sampling_inter
 from jaxcloseup.fields.splats.config import GaussianConfig
 from jaxcloseup.fields.splats.splat_field import surfel_field, surfel_optimizer
 from jaxcloseup.photos.views import camera_at
-from jaxcloseup.training.steps import TrainConfig, init_state, run_steps, train_step
+from jaxcloseup.training.config import TrainConfig
+from jaxcloseup.training.steps import init_state, run_steps, train_step
 
 
 EVERY, STEPS = 10, 35  # relocations come at 20 and 30

@@ -8,7 +8,8 @@ from reference_splats import rotation_of
 from splat_scenes import COUNT, HEIGHT, NEAR, WIDTH, random_scene, render, to_camera, to_surfels
 
 from jaxcloseup.fields.splats import RasterizeConfig
-from jaxcloseup.fields.splats.mcmc import McmcConfig, add_position_noise, relocate, split_opacity
+from jaxcloseup.fields.splats.config import McmcConfig
+from jaxcloseup.fields.splats.mcmc import add_position_noise, relocate, split_opacity
 
 
 CONFIG = McmcConfig(growth=1.5)

@@ -27,7 +27,8 @@ from splat_scenes import (
     to_surfels,
 )
 
-from jaxcloseup.fields.splats.rasterize import RasterizeConfig, for_image
+from jaxcloseup.fields.splats.config import RasterizeConfig
+from jaxcloseup.fields.splats.rasterize import for_image
 from jaxcloseup.geometry.rotations import euler_to_matrix
 
 

@@ -13,7 +13,7 @@ from splat_scenes import random_scene, to_camera, to_surfels
 
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.fields.splats import RasterizeConfig
-from jaxcloseup.fields.splats.mcmc import McmcConfig
+from jaxcloseup.fields.splats.config import McmcConfig
 from jaxcloseup.fields.splats.splat_field import (
     SurfelConfig,
     camera_extent,
@@ -24,7 +24,8 @@ from jaxcloseup.fields.splats.splat_field import (
 from jaxcloseup.fields.splats.surfels import random_points
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.metrics.image_metrics import psnr
-from jaxcloseup.training.steps import TrainConfig, init_state, run_steps, train_step
+from jaxcloseup.training.config import TrainConfig
+from jaxcloseup.training.steps import init_state, run_steps, train_step
 
 
 STEPS = 200

@@ -9,8 +9,9 @@ import pytest
 import reference
 
 from jaxcloseup.fields.contract import Rendering
+from jaxcloseup.fields.volume.config import NerfConfig
 from jaxcloseup.fields.volume.encodings import positional_encoding
-from jaxcloseup.fields.volume.nerf import NerfConfig, nerf
+from jaxcloseup.fields.volume.nerf import nerf
 from jaxcloseup.fields.volume.networks import apply_network, init_network
 from jaxcloseup.fields.volume.rays import VolumeAux
 from jaxcloseup.geometry.cameras import Camera, pixel_grid

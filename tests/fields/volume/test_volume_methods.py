@@ -20,11 +20,11 @@ from jaxcloseup.app.run.setup import initial_state
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.fields.volume import intervals
-from jaxcloseup.fields.volume.hash_grid import HashGridConfig
-from jaxcloseup.fields.volume.mipnerf import MipNerfConfig, mipnerf
-from jaxcloseup.fields.volume.ngp import NgpConfig, ngp
+from jaxcloseup.fields.volume.config import HashGridConfig, MipNerfConfig, NgpConfig, ZipNerfConfig
+from jaxcloseup.fields.volume.mipnerf import mipnerf
+from jaxcloseup.fields.volume.ngp import ngp
 from jaxcloseup.fields.volume.tensorf import TensorfBuffers, TensorfConfig, factor_products, tensorf
-from jaxcloseup.fields.volume.zipnerf import ZipNerfConfig, zipnerf
+from jaxcloseup.fields.volume.zipnerf import zipnerf
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.training.steps import TrainState, train_step
 
