@@ -40,7 +40,7 @@ def pytest_configure(config):
 
 def pytest_collection_modifyitems(items):
     """Begin with the files that take longest, so that no process waits for one at the end."""
-    first = ["test_sweep", "test_run", "test_render", "test_procedural", "test_rasterize"]
+    first = ["test_sweep", "test_run", "test_render", "test_drawn_scenes", "test_rasterize"]
     first += ["test_gpu_bench", "test_volume_methods"]
     ranks = {name: rank for rank, name in enumerate(first)}
     items.sort(key=lambda item: ranks.get(item.path.stem, len(first)))

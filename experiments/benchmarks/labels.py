@@ -19,7 +19,7 @@ from jaxcloseup.app.report.pictures import label_pictures
 from jaxcloseup.app.score.audit import audit_labels, resolved_by_photographs
 from jaxcloseup.app.score.scores import exact_depths
 from jaxcloseup.captures.load import load_scene
-from jaxcloseup.drawn_scenes.drawn import PROCEDURAL_SCENES
+from jaxcloseup.drawn_scenes.drawn import DRAWN_SCENES
 from jaxcloseup.labels.make import label_sources
 from jaxcloseup.metrics.image_metrics import psnr
 from jaxcloseup.photos.scene import Scene
@@ -39,7 +39,7 @@ def run() -> None:
     """Print error and shares kept and leaked by scene and mask, and write pictures of labels."""
     print(f"labels from exact depth at 1/{DOWNSCALE} of the full size")
     print(f"{'scene':>8}  {'mask':<22}  {'error':>6}  {'kept':>6}  {'leaked':>6}")
-    for name in PROCEDURAL_SCENES:
+    for name in DRAWN_SCENES:
         scene = load_scene(name, downscale=DOWNSCALE)
         scene = dataclasses.replace(scene, train=jax.device_put(scene.train))
         exact = exact_depths(scene, scene.train.cameras)

@@ -4,11 +4,11 @@ import pathlib
 
 from jaxcloseup.captures import ALPHA_MODES, FORMATS, SPLITS, Reading, load_capture
 from jaxcloseup.captures.splits import spread
-from jaxcloseup.drawn_scenes import PROCEDURAL_SCENES, procedural_scene
+from jaxcloseup.drawn_scenes import DRAWN_SCENES, draw_scene
 from jaxcloseup.photos.scene import Scene, SceneError, SceneWarning, Surface, keep_photographs
 
 
-__all__ = ["PROCEDURAL_SCENES", "Scene", "SceneError", "SceneWarning", "Surface", "load_scene"]
+__all__ = ["DRAWN_SCENES", "Scene", "SceneError", "SceneWarning", "Surface", "load_scene"]
 
 _DEFAULT_ZOOM = 4
 
@@ -57,7 +57,7 @@ def load_scene(
     and absurdly far points are dropped with a warning (see `captures/scale.py` for the bounds).
 
     Args:
-      name_or_path: one of `PROCEDURAL_SCENES`, or a folder; `./table` always names a folder.
+      name_or_path: one of `DRAWN_SCENES`, or a folder; `./table` always names a folder.
       downscale: positive integer factor by which to shrink photographs, by averaging areas. For 2,
         4 and 8 the loader uses `images_2`, `images_4` and `images_8` beside `images` if they hold
         every photograph. It caches what it shrinks in `$XDG_CACHE_HOME/jaxcloseup/photographs`.
@@ -101,7 +101,7 @@ def load_scene(
     reading = Reading(downscale, zoom, background, half_pixel, alpha_mode, invert_masks)
     path = pathlib.Path(name_or_path)
     if len(path.parts) == 1 and str(name_or_path) == path.name:
-        if path.name in PROCEDURAL_SCENES:
+        if path.name in DRAWN_SCENES:
             capture_options = {
                 "split": split != "given",
                 "format": format is not None,
@@ -113,12 +113,12 @@ def load_scene(
                     f"{path} is a built-in scene with its own split and no masks: leave out "
                     f"{given[0]}."
                 )
-            scene = procedural_scene(path.name, downscale=downscale)
+            scene = draw_scene(path.name, downscale=downscale)
             return keep_photographs(scene, spread(scene.name, len(scene.train), photographs))
         if not path.exists():
             raise SceneError(
                 f"{path} is neither a folder nor a built-in scene: choose one of "
-                f"{', '.join(PROCEDURAL_SCENES)}, or give the path of a capture."
+                f"{', '.join(DRAWN_SCENES)}, or give the path of a capture."
             )
     return load_capture(path, reading, format=format, split=split, photographs=photographs)
 

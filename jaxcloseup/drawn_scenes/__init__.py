@@ -1,6 +1,6 @@
 """Built-in scenes, drawn by ray casting, with exact depth at any pose."""
 
-from jaxcloseup.drawn_scenes.drawn import PROCEDURAL_SCENES, procedural_scene
+from jaxcloseup.drawn_scenes.drawn import DRAWN_SCENES, draw_scene
 
 
-__all__ = ["PROCEDURAL_SCENES", "procedural_scene"]
+__all__ = ["DRAWN_SCENES", "draw_scene"]

@@ -23,7 +23,7 @@ import numpy as np
 from jaxcloseup.drawn_scenes import shading
 from jaxcloseup.drawn_scenes.builtin import SCENES
 from jaxcloseup.drawn_scenes.lighting import bake_light
-from jaxcloseup.drawn_scenes.modeling import build_world, turn
+from jaxcloseup.drawn_scenes.modeling import build_world
 from jaxcloseup.drawn_scenes.planning import (
     FOCAL,
     HEIGHT,
@@ -38,7 +38,7 @@ from jaxcloseup.photos.scene import Scene, Surface
 from jaxcloseup.photos.views import Views, camera_at
 
 
-PROCEDURAL_SCENES: tuple[str, ...] = tuple(SCENES)
+DRAWN_SCENES: tuple[str, ...] = tuple(SCENES)
 NUM_TRAIN, NUM_TEST, NUM_FAR = 60, 12, 8
 _SAMPLES = 8  # rays per pixel
 _SOURCES = (
@@ -47,34 +47,21 @@ _SOURCES = (
 )
 
 
-def procedural_scene(
-    name: str,
-    *,
-    downscale: int = 1,
-    noise: float = 0.0,
-    exposure_jitter: float = 0.0,
-    pose_noise: float = 0.0,
-) -> Scene:
-    """Load a built-in scene like a capture, with its exact surface at any pose.
+def draw_scene(name: str, *, downscale: int = 1) -> Scene:
+    """Draw a built-in scene, or load it from the cache, with its exact surface at any pose.
 
     World units are meters and z is up. Full size is 960 x 540; sizes round up, and focal lengths
-    scale with the exact ratio. The three realism options affect only the training photographs.
+    scale with the exact ratio.
 
     Args:
-      name: one of `PROCEDURAL_SCENES`.
+      name: one of `DRAWN_SCENES`.
       downscale: positive integer divisor of the image size.
-      noise: standard deviation of sensor noise, in color units.
-      exposure_jitter: standard deviation of the logarithm of each photograph's exposure.
-      pose_noise: standard deviation of the error of training positions (meters) and angles
-        (radians).
 
     Raises:
       ValueError: the name is unknown, or `downscale` is not a positive integer.
     """
     if name not in SCENES:
-        raise ValueError(
-            f"no built-in scene {name!r}: choose one of {', '.join(PROCEDURAL_SCENES)}"
-        )
+        raise ValueError(f"no built-in scene {name!r}: choose one of {', '.join(DRAWN_SCENES)}")
     if downscale < 1 or downscale != int(downscale):
         raise ValueError(f"downscale must be a positive integer, got {downscale}")
     width, height = -(-WIDTH // downscale), -(-HEIGHT // downscale)
@@ -84,17 +71,12 @@ def procedural_scene(
         rgb = jnp.asarray(capture[f"{split}_rgb"])
         cameras = _cameras(capture[f"{split}_poses"], width, height)
         splits[split] = Views(cameras, rgb, jnp.ones(rgb.shape[:3], jnp.float32))
-    degraded = bool(noise or exposure_jitter or pose_noise)
-    if degraded:
-        splits["train"] = _degrade(
-            splits["train"], _rng(name, 2), noise, exposure_jitter, pose_noise
-        )
 
     def surface(camera: Camera) -> Surface:
         return _render_surface(_world(name), camera)
 
     def photographs_at(factor: int, split: str = "train") -> tuple[Views, list[tuple[int, int]]]:
-        finer = procedural_scene(name, downscale=factor)
+        finer = draw_scene(name, downscale=factor)
         return getattr(finer, split), finer.sizes(split)
 
     return Scene(
@@ -114,7 +96,7 @@ def procedural_scene(
             "subjects": capture["subjects"].tolist(),
         },
         surface=surface,
-        photographs_at=None if degraded else photographs_at,
+        photographs_at=photographs_at,
     )
 
 
@@ -239,18 +221,3 @@ def _sparse_points(
     found = np.isfinite(depth)
     points = poses[view, :, 3] + np.where(found, depth, 0)[:, None] * directions
     return points[found].astype(np.float32), rgb[view, y, x][found].astype(np.float32) / 255
-
-
-def _degrade(
-    views: Views, rng: np.random.Generator, noise: float, exposure_jitter: float, pose_noise: float
-) -> Views:
-    """Degrade photographs and poses as a hand-held camera and its calibration would."""
-    poses, rgb = np.array(views.cameras.camtoworld, np.float64), np.array(views.rgb)
-    for pose, image in zip(poses, rgb, strict=True):
-        pose[:, :3] = pose[:, :3] @ turn(*np.rad2deg(pose_noise * rng.normal(size=3)))
-        pose[:, 3] += pose_noise * rng.normal(size=3)
-        exposed = image * np.exp(exposure_jitter * rng.normal())
-        grainy = exposed + 255 * noise * rng.normal(size=image.shape)
-        image[:] = np.round(np.clip(grainy, 0, 255))
-    cameras = views.cameras.replace(camtoworld=jnp.asarray(poses, jnp.float32))
-    return views.replace(cameras=cameras, rgb=jnp.asarray(rgb))

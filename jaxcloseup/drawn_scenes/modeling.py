@@ -1,4 +1,4 @@
-"""Building blocks of the procedural scenes: solids with finishes, assembled into a `World`.
+"""Building blocks of the built-in scenes: solids with finishes, assembled into a `World`.
 
 World units are meters and z is up. Sizes are full extents (diameters, not radii).
 """

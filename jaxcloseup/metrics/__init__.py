@@ -7,6 +7,6 @@ __all__, __getattr__, __dir__ = lazy_names(
     __name__,
     {
         "image_metrics": "quantize psnr ssim cc_psnr fit_colors change_colors",
-        "lpips": "LpipsError LpipsWeights layer_shapes load_lpips",
+        "perceptual": "LpipsError LpipsWeights layer_shapes load_lpips lpips",
     },
 )

@@ -293,12 +293,12 @@ def test_missing_near_far_is_estimated(capture, given):
 
 
 def test_names_of_built_in_scenes(monkeypatch, tmp_path, capture):
-    monkeypatch.setattr(scenes, "PROCEDURAL_SCENES", ("table", "room"))
+    monkeypatch.setattr(scenes, "DRAWN_SCENES", ("table", "room"))
 
     def drawn(name, *, downscale):
         return types.SimpleNamespace(name=name, downscale=downscale, train=range(3))
 
-    monkeypatch.setattr(scenes, "procedural_scene", drawn)
+    monkeypatch.setattr(scenes, "draw_scene", drawn)
     scene = load_scene("table", downscale=2)
     assert (scene.name, scene.downscale) == ("table", 2)
     with pytest.raises(SceneError, match=r"tabel is neither .* choose one of table, room"):

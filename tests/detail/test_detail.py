@@ -21,7 +21,7 @@ from jaxcloseup.app.run.residuals import _enlarge
 from jaxcloseup.app.run.setup import label_closeups, label_targets, start_labels
 from jaxcloseup.app.score.scores import targets_by_split
 from jaxcloseup.app.store.stored_run import load_run_scene, read_run, restore
-from jaxcloseup.captures.load import PROCEDURAL_SCENES, SceneError, load_scene
+from jaxcloseup.captures.load import DRAWN_SCENES, SceneError, load_scene
 from jaxcloseup.detail import weights as detail_weights
 from jaxcloseup.detail.add import FEATURES
 from jaxcloseup.detail.weights import (
@@ -135,7 +135,7 @@ def test_a_scene_is_judged_by_a_network_that_never_saw_it(tmp_path, monkeypatch)
 
 def test_all_built_in_scenes_taught_the_weights_that_come_with_the_package():
     names, weights = detail_weights._read_known()
-    assert sorted(names) == sorted(PROCEDURAL_SCENES)
+    assert sorted(names) == sorted(DRAWN_SCENES)
     for networks in (weights.mixing, weights.errors):
         assert networks.center.shape == networks.scale.shape == (len(names), FEATURES)
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(networks))

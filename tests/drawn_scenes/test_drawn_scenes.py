@@ -34,7 +34,7 @@ def cache(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def scene(cache):
-    return loading.procedural_scene("counter", downscale=DOWNSCALE)
+    return loading.draw_scene("counter", downscale=DOWNSCALE)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def truth(scene):
     return [(i, scene.surface(camera_at(scene.train.cameras, i))) for i in range(0, 60, 3)]
 
 
-@pytest.mark.parametrize("name", loading.PROCEDURAL_SCENES)
+@pytest.mark.parametrize("name", loading.DRAWN_SCENES)
 def test_cameras(name, monkeypatch):
     """Cameras stand in free space; close-ups are near, rotated and seen by training views."""
     monkeypatch.setattr(modeling, "draw_texture", lambda name: np.zeros((1024, 1024, 3)))
@@ -180,33 +180,6 @@ def test_zoom_agrees_with_the_plain_view_and_shows_more(scene, truth):
     assert np.mean(hidden) > 3 * np.mean(errors)
 
 
-def test_realism_affects_only_training_photographs(scene):
-    options = {"noise": 0.05, "exposure_jitter": 0.1, "pose_noise": 0.01}
-    real, again = (
-        loading.procedural_scene("counter", downscale=DOWNSCALE, **options) for _ in range(2)
-    )
-    jax.tree.map(np.testing.assert_array_equal, real.train, again.train)
-    jax.tree.map(np.testing.assert_array_equal, real.test, scene.test)
-    jax.tree.map(np.testing.assert_array_equal, real.test_far, scene.test_far)
-    np.testing.assert_array_equal(real.points, scene.points)
-    plain, noisy = (s.train.rgb.astype(jnp.float32) / 255 for s in (scene, real))
-    unclipped = (plain > 0.2) & (plain < 0.7)
-    ratio = np.where(unclipped, noisy / jnp.where(unclipped, plain, 1), np.nan)
-    exposure = np.log(np.nanmean(ratio, axis=(1, 2, 3)))
-    assert 0.07 < exposure.std() < 0.13
-    residual = noisy - plain * np.exp(exposure)[:, None, None, None].astype(np.float32)
-    assert 0.045 < np.asarray(residual)[np.asarray(unclipped)].std() < 0.055
-    before, after = scene.train.cameras, real.train.cameras
-    np.testing.assert_array_equal(before.intrinsics, after.intrinsics)
-    assert 0.008 < np.std(before.position - after.position) < 0.012
-    rotation = np.asarray(after.rotation)
-    np.testing.assert_allclose(
-        rotation @ rotation.swapaxes(1, 2), np.tile(np.eye(3), (60, 1, 1)), atol=1e-5
-    )
-    turned = np.trace(rotation @ np.asarray(before.rotation).swapaxes(1, 2), axis1=1, axis2=2)
-    assert 0.01 < np.arccos(np.clip((turned - 1) / 2, -1, 1)).mean() < 0.025
-
-
 def test_fewer_photographs_are_the_same_ones(scene):
     """The finer ones are of the same views, and the points lie in two of their pictures."""
     fewer = load_scene("counter", downscale=DOWNSCALE, photographs=2)
@@ -241,7 +214,7 @@ def test_the_cache_is_used_and_survives_damage(scene, cache, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(loading, "_capture", must_not_run)
-        again = loading.procedural_scene("counter", downscale=DOWNSCALE)
+        again = loading.draw_scene("counter", downscale=DOWNSCALE)
     jax.tree.map(np.testing.assert_array_equal, again.train, scene.train)
 
     # Redrawing gives identical bits: textures, light, cameras, photographs and points.
@@ -250,7 +223,7 @@ def test_the_cache_is_used_and_survives_damage(scene, cache, monkeypatch):
         light.write_text("not an archive")
     loading._world.cache_clear()
     with pytest.warns(UserWarning, match="ignoring the unreadable cache file"):
-        rebuilt = loading.procedural_scene("counter", downscale=DOWNSCALE)
+        rebuilt = loading.draw_scene("counter", downscale=DOWNSCALE)
     for split in ("train", "test", "test_far"):
         jax.tree.map(np.testing.assert_array_equal, getattr(rebuilt, split), getattr(scene, split))
     np.testing.assert_array_equal(rebuilt.points, scene.points)
@@ -274,9 +247,9 @@ def test_sizes_round_up_and_focal_lengths_follow():
 
 def test_bad_requests():
     with pytest.raises(ValueError, match="no built-in scene 'cellar': choose one of counter"):
-        loading.procedural_scene("cellar")
+        loading.draw_scene("cellar")
     with pytest.raises(ValueError, match="positive integer"):
-        loading.procedural_scene("counter", downscale=0)
+        loading.draw_scene("counter", downscale=0)
 
 
 def test_a_new_camera_reuses_the_compiled_render(scene):

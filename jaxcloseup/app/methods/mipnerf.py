@@ -11,7 +11,7 @@ from jaxcloseup.app.methods.volumes import (
     volumetric,
 )
 from jaxcloseup.fields.volume.config import MipNerfConfig
-from jaxcloseup.fields.volume.mipnerf import mipnerf
+from jaxcloseup.fields.volume.mipnerf import mipnerf_field
 from jaxcloseup.training.config import TrainConfig
 
 
@@ -57,4 +57,4 @@ QUICK = Preset(
     windows=WindowConfig(finest=8),
 )
 
-METHOD = volumetric(mipnerf, quick=QUICK, paper=PAPER)
+METHOD = volumetric(mipnerf_field, quick=QUICK, paper=PAPER)

@@ -15,7 +15,7 @@ from jaxcloseup.app.methods.volumes import (
 )
 from jaxcloseup.fields.contract import RadianceField
 from jaxcloseup.fields.volume.config import NerfConfig
-from jaxcloseup.fields.volume.nerf import nerf
+from jaxcloseup.fields.volume.nerf import nerf_field
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.training.config import TrainConfig
 
@@ -83,7 +83,7 @@ def make_field(config: NerfTrainingConfig, scene: Scene, growth: int) -> Radianc
     """A NeRF between the scene's near and far; nothing overflows, so `growth` says nothing."""
     del growth
     center, scale = unit_cube(scene) if config.normalize else ((0.0, 0.0, 0.0), 1.0)
-    return nerf(
+    return nerf_field(
         config,
         near=scene.near,
         far=scene.far,

@@ -11,7 +11,7 @@ from jaxcloseup.app.methods.volumes import (
     volumetric,
 )
 from jaxcloseup.fields.volume.config import HashGridConfig, NgpConfig
-from jaxcloseup.fields.volume.ngp import ngp
+from jaxcloseup.fields.volume.ngp import ngp_field
 from jaxcloseup.training.config import TrainConfig
 
 
@@ -55,4 +55,4 @@ QUICK = Preset(
     windows=WindowConfig(),
 )
 
-METHOD = volumetric(ngp, quick=QUICK, paper=PAPER)
+METHOD = volumetric(ngp_field, quick=QUICK, paper=PAPER)

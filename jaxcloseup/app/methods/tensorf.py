@@ -11,7 +11,7 @@ from jaxcloseup.app.methods.volumes import (
     volumetric,
 )
 from jaxcloseup.fields.volume.config import TensorfConfig
-from jaxcloseup.fields.volume.tensorf import tensorf
+from jaxcloseup.fields.volume.tensorf import tensorf_field
 from jaxcloseup.training.config import TrainConfig
 
 
@@ -61,4 +61,4 @@ QUICK = Preset(
     windows=WindowConfig(),
 )
 
-METHOD = volumetric(tensorf, quick=QUICK, paper=PAPER)
+METHOD = volumetric(tensorf_field, quick=QUICK, paper=PAPER)

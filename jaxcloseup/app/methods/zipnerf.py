@@ -11,7 +11,7 @@ from jaxcloseup.app.methods.volumes import (
     volumetric,
 )
 from jaxcloseup.fields.volume.config import HashGridConfig, ZipNerfConfig
-from jaxcloseup.fields.volume.zipnerf import zipnerf
+from jaxcloseup.fields.volume.zipnerf import zipnerf_field
 from jaxcloseup.training.config import TrainConfig
 
 
@@ -59,4 +59,4 @@ QUICK = Preset(
     windows=WindowConfig(),
 )
 
-METHOD = volumetric(zipnerf, quick=QUICK, paper=PAPER)
+METHOD = volumetric(zipnerf_field, quick=QUICK, paper=PAPER)

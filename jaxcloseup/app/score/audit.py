@@ -1,6 +1,6 @@
-"""Errors of pseudo-labels: against true close-ups on procedural scenes, against photographs on all.
+"""Errors of pseudo-labels: against true close-ups on built-in scenes, against photographs on all.
 
-A label cannot be sharper than its source photograph. On procedural scenes it is therefore compared
+A label cannot be sharper than its source photograph. On built-in scenes it is therefore compared
 with the true close-up, blurred to the footprint of the source's pixels. On all scenes, training
 photographs are left out one by one, labeled from the others, and compared with their labels.
 """
@@ -96,7 +96,7 @@ def audit_labels(
     render_depth: Callable[[Camera], jax.Array],
     count: int = 16,
 ) -> dict[str, Any]:
-    """Measure errors and shares of labels over random virtual close-ups of a procedural scene.
+    """Measure errors and shares of labels over random virtual close-ups of a built-in scene.
 
     Args:
       key: random key.

@@ -1,4 +1,4 @@
-"""The zoom ladder: the same points seen from nearer and nearer, on procedural scenes.
+"""The zoom ladder: the same points seen from nearer and nearer, on built-in scenes.
 
 Each held-out ordinary view gives a camera for each rung. The camera moves 1, 2, 4, 8 and 16 times
 nearer to one point of the view without turning, so only the magnification changes along the ladder.

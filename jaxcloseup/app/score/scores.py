@@ -19,7 +19,7 @@ from jaxcloseup.app.score.surface_error import (
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.metrics.image_metrics import SSIM_TAPS, cc_psnr, psnr, quantize, ssim
-from jaxcloseup.metrics.lpips import (
+from jaxcloseup.metrics.perceptual import (
     BACKBONES,
     SMALLEST,
     LpipsError,
@@ -90,7 +90,7 @@ class Target(NamedTuple):
 
 
 def exact_depths(scene: Scene, cameras: Camera) -> jax.Array:
-    """Return the exact z-depths `[V, H, W]` of stacked cameras on a procedural scene."""
+    """Return the exact z-depths `[V, H, W]` of stacked cameras on a built-in scene."""
     geometry, count = _geometry(scene.surface), cameras.intrinsics.shape[0]
 
     def depth(i):
@@ -114,7 +114,7 @@ def make_targets(
 ) -> list[Target]:
     """Return the held-out views of a split, with the number of photographs that saw each pixel.
 
-    That number needs a depth. It is exact on procedural scenes. On captures it is rendered from the
+    That number needs a depth. It is exact on built-in scenes. On captures it is rendered from the
     baseline, so that all stages are scored on the same pixels.
 
     Args:

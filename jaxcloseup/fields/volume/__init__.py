@@ -15,15 +15,18 @@ __all__, __getattr__, __dir__ = lazy_names(
         "hash_grid": "grid_rows hash_features init_hash_grid",
         "interpolation": "weighted_rows",
         "intervals": "Histogram IntervalConfig Round interval_field",
+        "mipnerf": "mipnerf_field",
+        "nerf": "nerf_field",
         "networks": (
             "Raw apply_mlp apply_network dense exponential_density init_mlp init_network "
             "rays_in_cache"
         ),
+        "ngp": "ngp_field",
         "rays": "Rays Traced VolumeAux photometric_loss ray_field",
         "regularizers": "antialiased_proposal_penalty distortion proposal_penalty",
         "renderer": "Samples VolumeConfig volume_field",
         "samplers": "importance interval_quantiles resample stratified widen",
-        "tensorf": "TensorfBuffers factor_products",
-        "zipnerf": "downweighted_features mean_squares",
+        "tensorf": "TensorfBuffers factor_products tensorf_field",
+        "zipnerf": "downweighted_features mean_squares zipnerf_field",
     },
 )

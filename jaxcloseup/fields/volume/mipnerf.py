@@ -21,7 +21,7 @@ from jaxcloseup.fields.volume.samplers import widen
 _PADDING = 0.001  # colors reach this far beyond [0, 1], so that the loss can reach 0 and 1
 
 
-def mipnerf(
+def mipnerf_field(
     config: MipNerfConfig,
     *,
     near: float,

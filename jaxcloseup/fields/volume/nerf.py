@@ -13,7 +13,7 @@ from jaxcloseup.fields.volume.networks import apply_network, init_network, rays_
 from jaxcloseup.fields.volume.renderer import Samples, VolumeConfig, volume_field
 
 
-def nerf(
+def nerf_field(
     config: NerfConfig,
     *,
     near: float,

@@ -26,7 +26,7 @@ from jaxcloseup.fields.volume.renderer import Samples
 _GEOMETRY = 16  # outputs of the density network; the first is the logarithm of density
 
 
-def ngp(
+def ngp_field(
     config: NgpConfig,
     *,
     near: float,

@@ -36,7 +36,7 @@ class TensorfBuffers:
     vertices: jax.Array
 
 
-def tensorf(
+def tensorf_field(
     config: TensorfConfig,
     *,
     near: float,

@@ -30,7 +30,7 @@ _GEOMETRY = 16  # outputs of the density network; the first is the logarithm of 
 _PULSES = (0.03, 0.003)  # half widths of the blur of the interlevel loss, of each proposal
 
 
-def zipnerf(
+def zipnerf_field(
     config: ZipNerfConfig,
     *,
     near: float,

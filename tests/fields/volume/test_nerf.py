@@ -11,7 +11,7 @@ import reference
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.fields.volume.config import NerfConfig
 from jaxcloseup.fields.volume.encodings import positional_encoding
-from jaxcloseup.fields.volume.nerf import nerf
+from jaxcloseup.fields.volume.nerf import nerf_field
 from jaxcloseup.fields.volume.networks import apply_network, init_network
 from jaxcloseup.fields.volume.rays import VolumeAux
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
@@ -40,7 +40,7 @@ def camera(x=0.3):
 
 
 def field(**changes):
-    return nerf(dataclasses.replace(TINY, **changes), near=1.0, far=3.0)
+    return nerf_field(dataclasses.replace(TINY, **changes), near=1.0, far=3.0)
 
 
 @functools.cache
@@ -94,7 +94,7 @@ def test_the_network_matches_the_oracle(key):
 
 
 def test_the_default_network_has_the_documented_shapes():
-    full = nerf(NerfConfig(), near=1.0, far=2.0)
+    full = nerf_field(NerfConfig(), near=1.0, far=2.0)
     shapes = jax.eval_shape(full.init, jax.random.key(0), *[jnp.zeros((1, 3))] * 2)[0]["fine"]
     trunk = [[w.shape for w in layer["weights"]] for layer in shapes["trunk"]]
     plain = [(256, 256)]
@@ -152,7 +152,7 @@ def test_stacked_cameras_see_their_own_pixels():
 
 def test_scaled_coordinates_move_the_network_not_the_depth():
     """A scene seen through `center` and `scale` is the same scene, transformed."""
-    moved = nerf(TINY, near=2.0, far=6.0, center=(2.0, 0.0, 4.0), scale=0.5)
+    moved = nerf_field(TINY, near=2.0, far=6.0, center=(2.0, 0.0, 4.0), scale=0.5)
     pose = camera().camtoworld.at[:, 3].set(jnp.array([2 + 2 * 0.3, 0.0, 4 - 2 * 2.0]))
     thin = jax.tree.map(jnp.copy, params())
     for network in thin.values():  # half the density, for twice the distance
@@ -277,4 +277,4 @@ def test_bfloat16_is_close():
 )
 def test_bad_settings_are_refused(near, far, config, message):
     with pytest.raises(ValueError, match=message):
-        nerf(config, near=near, far=far)
+        nerf_field(config, near=near, far=far)

@@ -21,10 +21,15 @@ from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.fields.volume import intervals
 from jaxcloseup.fields.volume.config import HashGridConfig, MipNerfConfig, NgpConfig, ZipNerfConfig
-from jaxcloseup.fields.volume.mipnerf import mipnerf
-from jaxcloseup.fields.volume.ngp import ngp
-from jaxcloseup.fields.volume.tensorf import TensorfBuffers, TensorfConfig, factor_products, tensorf
-from jaxcloseup.fields.volume.zipnerf import zipnerf
+from jaxcloseup.fields.volume.mipnerf import mipnerf_field
+from jaxcloseup.fields.volume.ngp import ngp_field
+from jaxcloseup.fields.volume.tensorf import (
+    TensorfBuffers,
+    TensorfConfig,
+    factor_products,
+    tensorf_field,
+)
+from jaxcloseup.fields.volume.zipnerf import zipnerf_field
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.training.steps import TrainState, train_step
 
@@ -86,10 +91,10 @@ VERTICES = 4  # after one growth
 CENTER, SCALE, NEAR, FAR = (0.2, -0.1, 0.3), 0.6, 0.5, 4.0
 # Each method: its configuration, what makes its field, and its oracle's rounds and spacing.
 FIELDS = {
-    "ngp": (NGP, ngp, reference.ngp),
-    "mipnerf": (MIP, mipnerf, functools.partial(reference.mipnerf, network=nerf_network)),
-    "zipnerf": (ZIP, zipnerf, reference.zipnerf),
-    "tensorf": (TENSORF, tensorf, functools.partial(reference.tensorf, vertices=VERTICES)),
+    "ngp": (NGP, ngp_field, reference.ngp),
+    "mipnerf": (MIP, mipnerf_field, functools.partial(reference.mipnerf, network=nerf_network)),
+    "zipnerf": (ZIP, zipnerf_field, reference.zipnerf),
+    "tensorf": (TENSORF, tensorf_field, functools.partial(reference.tensorf, vertices=VERTICES)),
 }
 TRAINED = [*FIELDS, "dsnerf"]
 
@@ -299,7 +304,7 @@ def test_a_batch_of_steps_is_these_steps_alone(name, capture_folder):
 def test_a_grid_that_grows_shows_the_same_scene():
     """From 3 to 5 vertices: the old ones stay, and what lies between them is on their lines."""
     config = dataclasses.replace(TENSORF, finest=5, growths=1, grow_every=4)
-    grown = tensorf(config, near=NEAR, far=FAR)
+    grown = tensorf_field(config, near=NEAR, far=FAR)
     with jax.enable_x64(True):
         shapes, _ = jax.eval_shape(grown.init, jax.random.key(0), *[jnp.zeros((1, 3))] * 2)
         numbers = np.random.default_rng(5)

@@ -17,7 +17,7 @@ import pytest
 
 from jaxcloseup.io import torch_file
 from jaxcloseup.io.torch_file import TorchFileError, read_tensors
-from jaxcloseup.metrics.lpips import (
+from jaxcloseup.metrics.perceptual import (
     BACKBONES,
     LpipsError,
     LpipsWeights,
