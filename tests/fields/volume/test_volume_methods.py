@@ -20,7 +20,13 @@ from jaxcloseup.app.run.setup import initial_state
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.fields.volume import intervals
-from jaxcloseup.fields.volume.config import HashGridConfig, MipNerfConfig, NgpConfig, ZipNerfConfig
+from jaxcloseup.fields.volume.config import (
+    HashGridConfig,
+    MipNerfConfig,
+    NgpConfig,
+    TensorfConfig,
+    ZipNerfConfig,
+)
 from jaxcloseup.fields.volume.mipnerf import mipnerf_field
 from jaxcloseup.fields.volume.ngp import ngp_field
 from jaxcloseup.fields.volume.tensorf import (
