@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from browser import open_browser
 
+from jaxcloseup.app.report.headline import conclusion, tables
 from jaxcloseup.app.report.page import Picture
 from jaxcloseup.app.report.pictures import comparisons, enlarge
-from jaxcloseup.app.report.report import print_results, write_report
+from jaxcloseup.app.report.run_page import print_results, write_report
 from jaxcloseup.app.report.showcase import Exhibit, best_middle_worst, cut_out, find_place
-from jaxcloseup.app.report.summary import conclusion, tables
 from jaxcloseup.app.score.scores import Target
 from jaxcloseup.artifacts.images import side_by_side
 from jaxcloseup.geometry.cameras import Camera

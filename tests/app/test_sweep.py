@@ -22,7 +22,7 @@ from tiny_runs import TINY, TINY_MIP, TINY_SURFELS
 
 from jaxcloseup.app.cli import sweep
 from jaxcloseup.app.report.pictures import comparisons
-from jaxcloseup.app.report.tables import paired_bootstrap, rows, write_sweep
+from jaxcloseup.app.report.sweep_tables import paired_bootstrap, rows, write_sweep
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.setup import initial_points, start_labels
 from jaxcloseup.app.sweep import arm_training as sweep_stages

@@ -13,7 +13,7 @@ from jaxcloseup.app.report.comparison import (
     say_which_is_best,
     write_comparison,
 )
-from jaxcloseup.app.report.report import print_tables
+from jaxcloseup.app.report.run_page import print_tables
 from jaxcloseup.app.store.stored_run import RunError
 
 

@@ -17,7 +17,7 @@ from jaxcloseup.app.methods import Preset
 from jaxcloseup.app.methods.settings import plain_config
 from jaxcloseup.app.report.page import Picture
 from jaxcloseup.app.report.pictures import comparisons
-from jaxcloseup.app.report.tables import print_sweep, write_sweep
+from jaxcloseup.app.report.sweep_tables import print_sweep, write_sweep
 from jaxcloseup.app.run.logs import TrainLog, check_tensorboard
 from jaxcloseup.app.run.loop import TrainingError
 from jaxcloseup.app.run.manifest import NAME as MANIFEST

@@ -11,10 +11,10 @@ import numpy as np
 
 from jaxcloseup.app.methods.settings import GROUPS
 from jaxcloseup.app.report.audits import zoom_plots
+from jaxcloseup.app.report.headline import tables, than
 from jaxcloseup.app.report.page import figure, folded, head, score_tables, slider, table
-from jaxcloseup.app.report.report import rows
+from jaxcloseup.app.report.run_page import rows
 from jaxcloseup.app.report.showcase import best_middle_worst
-from jaxcloseup.app.report.summary import tables, than
 from jaxcloseup.app.score.metrics_text import FINER, SPLIT_TITLES
 from jaxcloseup.app.store.stored_run import RunError, read_fields
 from jaxcloseup.captures.photo_files import read_image

@@ -7,10 +7,10 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxcloseup.app.report.headline import best_stage
 from jaxcloseup.app.report.pictures import comparisons, label_pictures
-from jaxcloseup.app.report.report import write_report
+from jaxcloseup.app.report.run_page import write_report
 from jaxcloseup.app.report.showcase import Exhibit, exhibits
-from jaxcloseup.app.report.summary import best_stage
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.setup import Training, timed
 from jaxcloseup.app.run.stages import Outcome

@@ -17,6 +17,7 @@ from jaxcloseup.app.report.audits import (
     labels_table,
     zoom_plots,
 )
+from jaxcloseup.app.report.headline import best_stage, conclusion, tables
 from jaxcloseup.app.report.page import (
     Picture,
     figure,
@@ -28,7 +29,6 @@ from jaxcloseup.app.report.page import (
     table,
 )
 from jaxcloseup.app.report.showcase import Exhibit
-from jaxcloseup.app.report.summary import best_stage, conclusion, tables
 from jaxcloseup.app.score.metrics_text import COLUMNS, SPLIT_TITLES, format_metric
 from jaxcloseup.io.files import write_file
 
