@@ -24,7 +24,9 @@ import jax
 import numpy as np
 from mutations import mutate
 from tiny_capture import (
+    colmap_capture,
     frame,
+    llff_capture,
     paper_capture,
     single_file,
     vertices,
@@ -32,7 +34,6 @@ from tiny_capture import (
     write_json,
     write_ply,
 )
-from tiny_models import colmap_capture, llff_capture
 
 from jaxcloseup.app.run.logs import TrainLog
 from jaxcloseup.app.run.programs import Programs

@@ -106,3 +106,36 @@ def keep_run(folder, capture_folder):
     for stage in ("baseline", "closeup"):
         checkpoints.save(stage, 3, state, {"history": [], "growth": 1})
     return folder
+
+
+def path_file(folder, **changes):
+    """Write a camera path of two cameras; a change to None leaves the field out."""
+    pose = np.eye(4)
+    pose[:3] = plane.camera_above(0.3, 0.1, 2.0, tilt=0.2).camtoworld
+    pose[:3, 1:3] *= -1  # OpenCV to OpenGL
+    entry = {"camera_to_world": pose.ravel().tolist(), "fov": 40, "aspect": 4 / 3}
+    fields = {
+        "camera_type": "perspective",
+        "render_height": 24,
+        "render_width": 32,
+        "camera_path": [entry, entry | {"fov": 20.0}],
+        "fps": 24,
+        "seconds": 2.0,
+    }
+    for key, value in changes.items():
+        target = fields if key in fields else fields["camera_path"][1]
+        target.pop(key) if value is None else target.update({key: value})
+    file = folder / "path.json"
+    file.write_text(json.dumps(fields))
+    return file
+
+
+def copy_of(kept, folder, name, change):
+    """A run without states whose file `name` is changed."""
+    (folder / "checkpoints" / "closeup" / "3").mkdir(parents=True)
+    for file in ("manifest.json", "checkpoints/run.json"):
+        fields = json.loads((kept / file).read_text())
+        if file == name:
+            fields = change(fields)
+        (folder / file).write_text(fields if isinstance(fields, str) else json.dumps(fields))
+    return str(folder)

@@ -7,9 +7,20 @@ import warnings
 
 import numpy as np
 import pytest
-from tiny_capture import HEIGHT, WIDTH, frame, paper_capture, single_file, write_image
+from tiny_capture import (
+    HEIGHT,
+    WIDTH,
+    colmap_capture,
+    frame,
+    image_line,
+    llff_capture,
+    llff_rows,
+    paper_capture,
+    single_file,
+    write_image,
+    write_model,
+)
 from tiny_capture import write_json as write_frames
-from tiny_models import colmap_capture, image_line, llff_capture, llff_rows, write_model
 
 from jaxcloseup.captures import photo_files as images
 from jaxcloseup.captures.load import SceneError, load_scene

@@ -10,6 +10,7 @@ import numpy as np
 import plane
 import pytest
 from tiny_capture import single_file
+from tiny_runs import path_file
 
 from jaxcloseup.app.run.manifest import write_dataparser_transforms
 from jaxcloseup.app.view import camera_paths
@@ -24,28 +25,6 @@ from jaxcloseup.app.view.orientation import up_direction
 from jaxcloseup.captures.load import SceneError, load_scene
 from jaxcloseup.geometry.cameras import Camera, pixels_to_points, points_to_pixels
 from jaxcloseup.photos.views import camera_at
-
-
-def path_file(folder, **changes):
-    """Write a camera path of two cameras; a change to None leaves the field out."""
-    pose = np.eye(4)
-    pose[:3] = plane.camera_above(0.3, 0.1, 2.0, tilt=0.2).camtoworld
-    pose[:3, 1:3] *= -1  # OpenCV to OpenGL
-    entry = {"camera_to_world": pose.ravel().tolist(), "fov": 40, "aspect": 4 / 3}
-    fields = {
-        "camera_type": "perspective",
-        "render_height": 24,
-        "render_width": 32,
-        "camera_path": [entry, entry | {"fov": 20.0}],
-        "fps": 24,
-        "seconds": 2.0,
-    }
-    for key, value in changes.items():
-        target = fields if key in fields else fields["camera_path"][1]
-        target.pop(key) if value is None else target.update({key: value})
-    file = folder / "path.json"
-    file.write_text(json.dumps(fields))
-    return file
 
 
 def test_a_camera_path_has_the_cameras_that_nerfstudio_shows(tmp_path):

@@ -7,8 +7,7 @@ import shutil
 import pytest
 from absl import flags
 from absl.testing import flagsaver
-from test_render import copy_of
-from tiny_runs import KEPT
+from tiny_runs import KEPT, copy_of
 
 from jaxcloseup.app.cli import render, sweep
 from jaxcloseup.app.methods import METHODS

@@ -10,8 +10,7 @@ import plane
 import pytest
 from absl import flags
 from absl.testing import flagsaver
-from test_camera_paths import path_file
-from tiny_runs import KEPT
+from tiny_runs import KEPT, copy_of, path_file
 
 from jaxcloseup.app.cli import render as program
 from jaxcloseup.app.methods import METHODS
@@ -169,17 +168,6 @@ def test_a_folder_that_holds_something_is_refused(render, tmp_path):
     (tmp_path / "out" / "a").write_text("")
     with pytest.raises(SystemExit, match="already exists and is not empty"):
         render(views="test")
-
-
-def copy_of(kept, folder, name, change):
-    """A run without states whose file `name` is changed."""
-    (folder / "checkpoints" / "closeup" / "3").mkdir(parents=True)
-    for file in ("manifest.json", "checkpoints/run.json"):
-        fields = json.loads((kept / file).read_text())
-        if file == name:
-            fields = change(fields)
-        (folder / file).write_text(fields if isinstance(fields, str) else json.dumps(fields))
-    return str(folder)
 
 
 @pytest.mark.parametrize(

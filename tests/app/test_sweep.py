@@ -19,6 +19,7 @@ from absl import flags
 from absl.testing import flagsaver
 from conftest import QUICKLY
 from tiny_runs import TINY, TINY_MIP, TINY_SURFELS
+from tiny_training import assert_same_step
 
 from jaxcloseup.app.cli import sweep
 from jaxcloseup.app.report.pictures import comparisons
@@ -56,26 +57,6 @@ def begin(preset, capture_folder):
 TINY_SMOOTH = dataclasses.replace(
     TINY_SURFELS, field=dataclasses.replace(TINY_SURFELS.field, ssim_weight=0.0)
 )
-
-
-def assert_same_step(arm, alone, before):
-    """Gradients agree to 1e-4 of the largest, and parameters with a clear gradient to 1e-5.
-
-    Adam divides by the gradient's size: of what is only rounding it makes a whole step.
-    """
-
-    def compare(new, old, new_moment, old_moment):
-        new_moment, old_moment = np.asarray(new_moment), np.asarray(old_moment)
-        largest = np.abs(old_moment).max()
-        np.testing.assert_allclose(new_moment, old_moment, rtol=0, atol=1e-4 * largest)
-        clear = np.abs(old_moment) > 0.01 * largest
-        np.testing.assert_allclose(
-            np.asarray(new)[clear], np.asarray(old)[clear], rtol=1e-5, atol=1e-5
-        )
-
-    jax.tree.map(compare, arm.params, alone.params, arm.opt_state[0].mu, alone.opt_state[0].mu)
-    changed = jax.tree.map(lambda x, y: float(jnp.abs(x - y).max()), alone.params, before.params)
-    assert max(jax.tree.leaves(changed)) > 1e-3
 
 
 TINY_SMOOTH_MIP = dataclasses.replace(

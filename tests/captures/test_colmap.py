@@ -7,8 +7,18 @@ import jax
 import numpy as np
 import pytest
 import reference
-from tiny_capture import HEIGHT, WIDTH, single_file, write_image
-from tiny_models import PINHOLE, POINTS, colmap_capture, image_line, random_pose, write_model
+from tiny_capture import (
+    HEIGHT,
+    PINHOLE,
+    POINTS,
+    WIDTH,
+    colmap_capture,
+    image_line,
+    random_pose,
+    single_file,
+    write_image,
+    write_model,
+)
 
 from jaxcloseup.captures import folder as loading
 from jaxcloseup.captures.load import SceneError, load_scene

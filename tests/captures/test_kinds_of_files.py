@@ -5,8 +5,7 @@ import signal
 
 import numpy as np
 import pytest
-from tiny_capture import frame, paper_capture, single_file, write_json
-from tiny_models import colmap_capture, llff_capture
+from tiny_capture import colmap_capture, frame, llff_capture, paper_capture, single_file, write_json
 
 from jaxcloseup.captures.load import SceneError, load_scene
 from jaxcloseup.io.files import check_file, read_bytes

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import reference
-from tiny_models import llff_capture, llff_rows
+from tiny_capture import llff_capture, llff_rows
 
 from jaxcloseup.captures.load import SceneError, load_scene
 

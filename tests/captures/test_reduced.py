@@ -6,8 +6,7 @@ import io
 import cv2
 import numpy as np
 import pytest
-from tiny_capture import POSE, write_image, write_json
-from tiny_models import colmap_capture, llff_capture
+from tiny_capture import POSE, colmap_capture, llff_capture, write_image, write_json
 
 from jaxcloseup.captures import photo_reading
 from jaxcloseup.captures.load import SceneError, load_scene

@@ -4,8 +4,18 @@ import re
 
 import numpy as np
 import pytest
-from tiny_capture import POSE, frame, paper_capture, vertices, write_image, write_json, write_ply
-from tiny_models import colmap_capture, llff_capture, llff_rows
+from tiny_capture import (
+    POSE,
+    colmap_capture,
+    frame,
+    llff_capture,
+    llff_rows,
+    paper_capture,
+    vertices,
+    write_image,
+    write_json,
+    write_ply,
+)
 
 from jaxcloseup.captures.depth_range import near_far_from_cameras
 from jaxcloseup.captures.load import SceneError, load_scene

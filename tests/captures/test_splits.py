@@ -4,14 +4,19 @@ import time
 
 import numpy as np
 import pytest
-from tiny_capture import HEIGHT, WIDTH, vertices, write_image, write_json, write_ply
-from tiny_models import (
+from tiny_capture import (
+    HEIGHT,
     POINTS,
+    WIDTH,
     colmap_capture,
     image_line,
     llff_capture,
     llff_rows,
+    vertices,
+    write_image,
+    write_json,
     write_model,
+    write_ply,
 )
 
 from jaxcloseup.captures.load import SceneError, load_scene

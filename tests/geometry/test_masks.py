@@ -1,7 +1,16 @@
 import numpy as np
 import pytest
-from tiny_capture import HEIGHT, POSE, WIDTH, paper_capture, single_file, write_image, write_json
-from tiny_models import colmap_capture, llff_capture
+from tiny_capture import (
+    HEIGHT,
+    POSE,
+    WIDTH,
+    colmap_capture,
+    llff_capture,
+    paper_capture,
+    single_file,
+    write_image,
+    write_json,
+)
 
 from jaxcloseup.captures.load import SceneError, load_scene
 

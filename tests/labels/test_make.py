@@ -3,6 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import plane
 import pytest
+from tiny_training import settings
 
 from jaxcloseup.geometry.cameras import pixel_grid
 from jaxcloseup.geometry.poses import PoseSettings
@@ -19,20 +20,6 @@ from jaxcloseup.labels.make import (
 label = jax.jit(make_label)
 POSITIONS = (-1.0, 0.0, 1.0, 0.5)
 GRID = pixel_grid(plane.HEIGHT, plane.WIDTH)
-
-
-def settings(**changes):
-    pose = PoseSettings(jnp.array([2.0, 8.0]), jnp.float32(0.5), jnp.float32(jnp.inf))
-    values = {
-        "use_mask": 1.0,
-        "rgb_tolerance": 0.15,
-        "depth_tolerance": jnp.inf,
-        "fixed_anchors": 0.0,
-        "forward_label": 0.0,
-        "leave_out_source": 0.0,
-        "label_loss_weight": 0.5,
-    }
-    return PseudoSettings(pose, **{k: jnp.float32(v) for k, v in (values | changes).items()})
 
 
 @pytest.fixture(scope="module")

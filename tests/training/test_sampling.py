@@ -10,9 +10,8 @@ import optax
 import plane
 import pytest
 from jax.sharding import Mesh
-from test_make import settings
-from test_steps import RATE, fresh_state, one_color_field
 from tiny_runs import TINY_SURFELS, write_plane
+from tiny_training import RATE, fresh_state, one_color_field, settings
 
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.captures.load import load_scene

@@ -6,55 +6,19 @@ import numpy as np
 import optax
 import plane
 import pytest
-from test_make import settings
+from tiny_training import RATE, fresh_state, one_color_field, settings
 
-from jaxcloseup.fields.contract import RadianceField, Rendering
-from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_rays
+from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.labels.rules import undivided_label_depth
 from jaxcloseup.photos.views import sample_image, sample_pixels
 from jaxcloseup.training.steps import (
     TrainConfig,
-    init_state,
     labeled_step,
     pseudo_step,
     render_depths,
     run_steps,
     train_step,
 )
-
-
-RATE = 0.25
-
-
-def one_color_field():
-    """A field of one trainable color, whose depth is that of the plane: steps in closed form."""
-
-    def render(params, buffers, camera, pixels, key):
-        if camera.intrinsics.ndim > 1:
-            shape = pixels.shape[:-1]
-            depth = jnp.ones(shape)
-        else:
-            depth = jnp.asarray(plane_depth(camera, pixels))
-            shape = depth.shape
-        rgb = jnp.broadcast_to(params.reshape((1,) * len(shape) + (3,)), (*shape, 3))
-        return Rendering(rgb, depth, jnp.ones(shape))
-
-    def loss(rendering, target, weight):
-        total = jnp.sum(weight)
-        squared = jnp.sum((rendering.rgb - target) ** 2, axis=-1)
-        return jnp.sum(weight * squared) / jnp.where(total == 0, 1, total), {}
-
-    def init(key, points, rgb):
-        return jnp.full(3, 0.2), ()
-
-    return RadianceField(init, render, loss)
-
-
-def plane_depth(camera, pixels):
-    if pixels is None:
-        pixels = pixel_grid(camera.height, camera.width)
-    origins, directions = pixels_to_rays(camera, pixels)
-    return -origins[..., 2] / directions[..., 2]
 
 
 @pytest.fixture(scope="module")
@@ -69,16 +33,6 @@ def bind(step, **config):
         step, field=one_color_field(), optimizer=optax.sgd(RATE), config=TrainConfig(**config)
     )
     return jax.jit(bound)
-
-
-def fresh_state(seed=0):
-    return init_state(
-        jax.random.key(seed),
-        jnp.zeros((0, 3)),
-        jnp.zeros((0, 3)),
-        field=one_color_field(),
-        optimizer=optax.sgd(RATE),
-    )
 
 
 def drawn(state, views, count):

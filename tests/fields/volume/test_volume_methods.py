@@ -10,8 +10,8 @@ import plane
 import pytest
 import reference_volume as reference
 from reference import nerf_network
-from test_sweep import assert_same_step
 from tiny_runs import TINY
+from tiny_training import assert_same_step
 
 from jaxcloseup.app.methods import METHODS
 from jaxcloseup.app.methods.settings import plain_config
