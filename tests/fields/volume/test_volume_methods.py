@@ -31,7 +31,6 @@ from jaxcloseup.fields.volume.mipnerf import mipnerf_field
 from jaxcloseup.fields.volume.ngp import ngp_field
 from jaxcloseup.fields.volume.tensorf import (
     TensorfBuffers,
-    TensorfConfig,
     factor_products,
     tensorf_field,
 )
