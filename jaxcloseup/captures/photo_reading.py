@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import functools
+import logging
 import math
 import os
 import pathlib
@@ -13,10 +14,10 @@ import cv2
 import numpy as np
 
 from jaxcloseup.captures.distortion import Remap, undistort, undistortion_map
-from jaxcloseup.captures.photo_cache import cached, content_hash
 from jaxcloseup.captures.photo_files import downscale_image, read_file, read_image, read_mask
 from jaxcloseup.captures.scale import check_lens
 from jaxcloseup.captures.world_frames import Frame, frame_intrinsics
+from jaxcloseup.io.cache import Stored, cache_path, cached, content_hash, hash_files
 from jaxcloseup.io.memory import installed_memory
 from jaxcloseup.photos.scene import SceneError
 
@@ -24,6 +25,8 @@ from jaxcloseup.photos.scene import SceneError
 _MAX_CONCURRENT = 4  # each needs a few times its own size: 12 megapixels take about 100 MB
 _SOURCES = ("photo_reading.py", "photo_files.py", "distortion.py")
 _BYTES_PER_PIXEL = 12  # peak of what stays: as read, padded, and weights in float32
+
+_log = logging.getLogger(__name__)
 
 
 class Reading(NamedTuple):
@@ -158,41 +161,48 @@ def _read_photo(
         return make()
     # Everything that the result depends on.
     key = ["area", cv2.__version__, _code(), closeup, reading._replace(half_pixel=False)]
-    key += [content_hash(picture), content_hash(mask), frame.size, frame.distortion]
+    key += [content_hash(picture), None if mask is None else content_hash(mask)]
+    key += [frame.size, frame.distortion]
     if frame.distortion:
         # The size may be unknown before decoding. This stand-in is so large that a principal
         # point that defaults to its middle never equals a given one.
         size = frame.size or (2**30, 2**30)
         key += frame_intrinsics(frame, *size, half_pixel=reading.half_pixel).tolist()
-    count = 2 if closeup else 1
-    return cached(repr(key), lambda: _pack(make()), functools.partial(_unpack, frame, count))
+    # The file is named by a hash of the key, so it is never out of date and may be deleted.
+    key_hash = content_hash(repr(key).encode())
+    return cached(
+        cache_path("photographs", f"{key_hash}.photo"),
+        key_hash,
+        make,
+        pack=_pack,
+        unpack=functools.partial(_unpack, frame, 2 if closeup else 1),
+        report=_log.warning,
+        report_unwritable=_log.debug,  # a full disk would be reported once per photograph
+    )
 
 
 @functools.cache
-def _code() -> list[str]:
+def _code() -> str:
     """Hash the modules that determine how a photograph is processed."""
-    folder = pathlib.Path(__file__).parent
-    return [content_hash((folder / name).read_bytes()) for name in _SOURCES]
+    return hash_files(pathlib.Path(__file__).with_name(name) for name in _SOURCES)
 
 
-def _pack(photos: Sequence[Photo]) -> dict[str, np.ndarray]:
-    return {
-        f"{name}{i}": np.asarray(value)
-        for i, photo in enumerate(photos)
-        for name, value in photo._asdict().items()
-        if name != "frame"
-    }
+def _pack(photos: Sequence[Photo]) -> Stored:
+    images = {f"rgb{i}": photo.rgb for i, photo in enumerate(photos)}
+    images |= {f"mask{i}": photo.mask for i, photo in enumerate(photos)}
+    return Stored(images, [(photo.stored_size, photo.scaled, photo.corner) for photo in photos])
 
 
-def _unpack(frame: Frame, count: int, arrays: dict[str, np.ndarray]) -> list[Photo]:
-    """The `count` photographs that `_pack` packed; raises for other arrays."""
+def _unpack(frame: Frame, count: int, stored: Stored) -> list[Photo]:
+    """Return the `count` photographs that `_pack` packed; raise an exception for other content."""
     photos = []
-    for i in range(count):
-        rgb, mask, *pairs = (arrays[f"{name}{i}"] for name in Photo._fields[1:])
-        images = rgb.dtype == mask.dtype == np.uint8 and rgb.shape == (*mask.shape, 3)
-        if not (images and mask.ndim == 2 and all(pair.shape == (2,) for pair in pairs)):
+    for i, (stored_size, scaled, corner) in enumerate(stored.record):
+        rgb, mask = stored.arrays[f"rgb{i}"], stored.arrays[f"mask{i}"]
+        if not (rgb.dtype == mask.dtype == np.uint8 and rgb.shape == (*mask.shape, 3)):
             raise ValueError("other arrays")
-        photos.append(Photo(frame, rgb, mask, *(tuple(pair.tolist()) for pair in pairs)))
+        photos.append(Photo(frame, rgb, mask, tuple(stored_size), tuple(scaled), tuple(corner)))
+    if len(photos) != count:
+        raise ValueError(f"{len(photos)} photographs instead of {count}")
     return photos
 
 

@@ -6,14 +6,10 @@ cached on disk under a key that covers the source files that draw them.
 """
 
 import functools
-import hashlib
-import os
 import pathlib
-import tempfile
 import warnings
-import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -34,6 +30,7 @@ from jaxcloseup.drawn_scenes.planning import (
 )
 from jaxcloseup.drawn_scenes.raycast import cast_rays, map_in_threads
 from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.io.cache import Stored, cache_path, cached, hash_files
 from jaxcloseup.photos.scene import Scene, Surface
 from jaxcloseup.photos.views import Views, camera_at
 
@@ -131,43 +128,26 @@ def _cameras(poses: np.ndarray, width: int, height: int) -> Camera:
     )
 
 
-def _cached(stem: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+def _cached(stem: str, make: Callable[[], dict[str, np.ndarray]]) -> Mapping[str, np.ndarray]:
     """Return `make()`, or its result from the cache if the same sources made it before.
 
     A cache that cannot be read or written only costs time and a warning.
     """
-    root = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
-    path = pathlib.Path(root) / "jaxcloseup" / f"{stem}-{_sources_digest()}.npz"
-    if path.exists():
-        try:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-                return dict(stored)
-        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
-            warnings.warn(f"ignoring the unreadable cache file {path}: {error}", stacklevel=2)
-    made = make()
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
-            try:
-                np.savez(file, **made)
-                file.close()
-                os.replace(file.name, path)
-            except BaseException:
-                os.unlink(file.name)
-                raise
-    except OSError as error:
-        warnings.warn(f"cannot write the cache file {path}: {error}", stacklevel=2)
-    return made
+    name = f"{stem}-{_sources_digest()}"
+    return cached(
+        cache_path(f"{name}.npz"),
+        name,
+        make,
+        pack=Stored,
+        unpack=lambda stored: stored.arrays,
+        report=warnings.warn,
+    )
 
 
 @functools.cache
 def _sources_digest() -> str:
-    digest = hashlib.sha256()
     folder = pathlib.Path(__file__).parent
-    for pattern in _SOURCES:
-        for source in sorted(folder.glob(pattern)):
-            digest.update(source.read_bytes())
-    return digest.hexdigest()[:16]
+    return hash_files(file for pattern in _SOURCES for file in sorted(folder.glob(pattern)))[:16]
 
 
 def _capture(name: str, width: int, height: int) -> dict[str, np.ndarray]:

@@ -2,8 +2,6 @@
 
 import dataclasses
 import functools
-import io
-import json
 from types import SimpleNamespace
 
 import jax
@@ -34,6 +32,7 @@ from jaxcloseup.detail.weights import (
     write_known,
 )
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
+from jaxcloseup.io.cache import Stored, load, save
 from jaxcloseup.photos.pyramids import scene_pyramid
 from jaxcloseup.photos.views import camera_at, to_float
 from jaxcloseup.photos.windows import view_windows
@@ -306,24 +305,21 @@ def test_damaged_detail_is_made_again(rendered, found, monkeypatch, capsys):
     find_detail(programs, state, path)
     whole = path.read_bytes()
     assert "damaged" not in capsys.readouterr().out
-    with np.load(path) as kept:
-        arrays = dict(kept)
-    about = json.loads(str(arrays["about"]))
+    key = training_detail._hash(programs, state)
+    arrays, about = load(path, key)
 
-    def changed(**changes):
-        file = io.BytesIO()
+    def changed(about=about, **changes):
         kept = {name: array for name, array in (arrays | changes).items() if array is not None}
-        np.savez(file, **kept)
-        return file.getvalue()
+        save(path, key, Stored(kept, about))
+        return path.read_bytes()
 
     middle = len(whole) // 2
     damages = [b"", whole[:100], whole[:-9], b"x" * 100]
     damages += [whole[:middle] + bytes(9) + whole[middle + 9 :], changed(finer=None)]
     damages += [changed(trust=arrays["trust"][:, 1:]), changed(values=arrays["values"] * 1.0)]
-    damages += [changed(finer=arrays["finer"][None]), changed(about="{}")]
+    damages += [changed(finer=arrays["finer"][None]), changed(about={})]
     damages += [changed(intrinsics=arrays["intrinsics"][1:]), changed(inverse_depth=None)]
-    damages += [changed(about=json.dumps(about | {"sizes": [3]})), changed(other=np.zeros(3))]
-    damages += [changed(values=np.array([{}], object))]
+    damages += [changed(about=about | {"sizes": [3]}), changed(other=np.zeros(3))]
     for count, damaged in enumerate(damages, 2):
         path.write_bytes(damaged)
         again, _ = find_detail(programs, state, path)
