@@ -1,107 +1,74 @@
-"""A minimal W3C WebDriver client for headless Chromium, with what the tests need."""
+"""Headless Chromium for tests of pages; a test is skipped where none is installed."""
 
-import base64
 import contextlib
-import json
+import os
 import shutil
 import socket
-import subprocess
-import time
-import urllib.error
-import urllib.request
+from unittest import mock
 
 import pytest
 
 
 ARGUMENTS = (
     *("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--window-size=900,500"),
-    *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking"),
+    *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-first-run"),
+    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
 )
-NO_PROXY = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+BUTTON = "//button[normalize-space()='{}']"
 
 
 def free_port():
     """Return a port of this computer that is free."""
-    with socket.create_server(("127.0.0.1", 0)) as one:
-        return one.getsockname()[1]
-
-
-class Browser:
-    """One browser window."""
-
-    def __init__(self, address):
-        self.session = address + "/session"
-        binary = shutil.which("chromium") or shutil.which("google-chrome")
-        options = {"goog:chromeOptions": {"args": ARGUMENTS, "binary": binary}}
-        made = self.call("POST", "", {"capabilities": {"alwaysMatch": options}})
-        self.session += "/" + made["sessionId"]
-
-    def call(self, method, command, body=None):
-        data = None if body is None else json.dumps(body).encode()
-        request = urllib.request.Request(self.session + command, data, method=method)
-        with NO_PROXY.open(request, timeout=60) as answer:
-            return json.load(answer)["value"]
-
-    def run(self, script, *arguments):
-        return self.call("POST", "/execute/sync", {"script": script, "args": arguments})
-
-    def open(self, url):
-        self.call("POST", "/url", {"url": url})
-
-    def wait(self, script, *arguments, seconds=30):
-        """Run a script until it returns something true, and return that."""
-        end = time.monotonic() + seconds
-        while not (found := self.run(script, *arguments)):
-            assert time.monotonic() < end, f"still nothing: {script}"
-            time.sleep(0.1)
-        return found
-
-    def press(self, text):
-        """Click the button with this text."""
-        script = "return [...document.querySelectorAll('button')].find("
-        script += "one => one.innerText.trim() == arguments[0])"
-        element = self.wait(script, text)
-        for last in (False, False, True):
-            try:
-                return self.call("POST", f"/element/{next(iter(element.values()))}/click", {})
-            except urllib.error.HTTPError:  # a panel that is still opening
-                if last:
-                    raise
-                time.sleep(1)
-
-    def click_in_the_middle(self):
-        """Click in the middle of the window."""
-        x, y = self.run("return [innerWidth, innerHeight].map(side => Math.floor(side / 2))")
-        moves = [{"type": "pointerMove", "x": x, "y": y}, {"type": "pause", "duration": 200}]
-        presses = [{"type": "pointerDown", "button": 0}, {"type": "pointerUp", "button": 0}]
-        mouse = {"type": "pointer", "id": "mouse", "actions": moves + presses}
-        self.call("POST", "/actions", {"actions": [mouse]})
-
-    def screenshot(self):
-        """Return a PNG of the window, as bytes."""
-        return base64.b64decode(self.call("GET", "/screenshot"))
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        return listening.getsockname()[1]
 
 
 @contextlib.contextmanager
 def open_browser():
-    """Open a browser for the duration of the context; skip the test if none is installed."""
-    if not (shutil.which("chromium") or shutil.which("google-chrome")):
+    """Yield Selenium's driver of a new browser."""
+    webdriver = pytest.importorskip("selenium.webdriver", reason="needs Selenium")
+    chromium = shutil.which("chromium") or shutil.which("google-chrome")
+    if chromium is None:
         pytest.skip("needs Chromium (Debian's package chromium)")
-    if not shutil.which("chromedriver"):
+    chromedriver = shutil.which("chromedriver")
+    if chromedriver is None:
         pytest.skip("needs chromedriver (Debian's package chromium-driver)")
-    port = free_port()
-    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    driver = subprocess.Popen(["chromedriver", f"--port={port}"], **silent)
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    for argument in ARGUMENTS:
+        options.add_argument(argument)
+    with mock.patch.dict(os.environ, {"no_proxy": "localhost"}):  # the driver listens there
+        driver = webdriver.Chrome(options, webdriver.ChromeService(chromedriver))
     try:
-        for _ in range(100):
-            with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port)):
-                break
-            time.sleep(0.1)
-        browser = Browser(f"http://127.0.0.1:{port}")
-        try:
-            yield browser
-        finally:
-            browser.call("DELETE", "")
+        yield driver
     finally:
-        driver.terminate()
-        driver.wait()
+        driver.quit()
+
+
+def wait(driver, script, *arguments, seconds=30):
+    """Run a script until it returns something true, and return that."""
+    from selenium.webdriver.support.wait import WebDriverWait
+
+    return WebDriverWait(driver, seconds, poll_frequency=0.1).until(
+        lambda driver: driver.execute_script(script, *arguments), f"still nothing: {script}"
+    )
+
+
+def press(driver, text):
+    """Click the button with this text; a panel that is still opening may move or cover it."""
+    from selenium.common.exceptions import WebDriverException
+    from selenium.webdriver.support.wait import WebDriverWait
+
+    def click(driver):
+        driver.find_element("xpath", BUTTON.format(text)).click()
+        return True
+
+    WebDriverWait(driver, 30, ignored_exceptions=(WebDriverException,)).until(click)
+
+
+def click_in_the_middle(driver):
+    """Click in the middle of the window."""
+    from selenium.webdriver import ActionChains
+
+    page = driver.find_element("tag name", "body")
+    ActionChains(driver).move_to_element(page).pause(0.2).click().perform()

@@ -135,10 +135,9 @@ def test_a_phone_shows_a_page_without_scrolling_it_sideways(tmp_path):
     assert sorted(parts, key=page.index) == list(parts)
     with open_browser() as browser:
         size = {"width": 390, "height": 800, "deviceScaleFactor": 1, "mobile": True}
-        given = {"cmd": "Emulation.setDeviceMetricsOverride", "params": size}
-        browser.call("POST", "/goog/cdp/execute", given)
-        browser.open(f"file://{tmp_path}/report.html")
-        widths = browser.run(
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        browser.get(f"file://{tmp_path}/report.html")
+        widths = browser.execute_script(
             "for (const one of document.querySelectorAll('details')) one.open = true;"
             "const width = one => document.querySelector(one).getBoundingClientRect().width;"
             "return [document.documentElement.scrollWidth, width('.wide img'), width('.pair')]"

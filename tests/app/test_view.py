@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from absl import flags
 from absl.testing import flagsaver
-from browser import free_port, open_browser
+from browser import click_in_the_middle, free_port, open_browser, press, wait
 from reference_splats import sh_color
 from tiny_runs import TINY
 
@@ -90,22 +90,22 @@ def test_a_closeup_is_chosen_and_rendered_in_a_browser(serve, kept, monkeypatch)
         record = read_run(kept)
         programs, state = restore(record, load_run_scene(record), "closeup")
         page, address = serve(programs, state)
-        browser.open(address)
-        browser.wait(HAS, "Render")
-        browser.press("Download PNG")
-        browser.wait(HAS, "There is no picture yet")
-        browser.click_in_the_middle()
+        browser.get(address)
+        wait(browser, HAS, "Render")
+        press(browser, "Download PNG")
+        wait(browser, HAS, "There is no picture yet")
+        click_in_the_middle(browser)
         page.work(timeout=30)
-        browser.wait(HAS, "photographs show that point")
+        wait(browser, HAS, "photographs show that point")
         pictures = [[None]]
         for button in ("Render", "Fine-tune and render", "Render"):
-            browser.press(button)
+            press(browser, button)
             page.work(timeout=30)
             said = "Fine-tuned and rendered (" if "tune" in button else "Rendered ("
-            browser.wait(HAS, said)
-            pictures.append(browser.wait(PICTURES, pictures[-1][0]))
-        browser.call("POST", "/window/rect", {"width": 900, "height": 700})
-        browser.wait(IN_VIEW)
+            wait(browser, HAS, said)
+            pictures.append(wait(browser, PICTURES, pictures[-1][0]))
+        browser.set_window_size(900, 700)
+        wait(browser, IN_VIEW)
     assert told == ["fine-tuning for this camera: 3 of 10 steps ..."]
     _, rendered, tuned, again = pictures
     assert tuned[1] == rendered[1]  # darker, but with the same support
