@@ -93,8 +93,8 @@ def _flicker(before, after, times):
     differences = []
     for old, new in zip(before[2], images, strict=True):
         moved = _warp(old, before[0], camera, depth, source_depth=before[1], tolerance=0.02)
-        difference = jnp.where(moved.valid[..., None], moved.image - new, 0)
-        valid = _averaged(moved.valid[..., None].astype(jnp.float32), times)[..., 0] == 1
+        difference = jnp.where(moved.hit[..., None], moved.values - new, 0)
+        valid = _averaged(moved.hit[..., None].astype(jnp.float32), times)[..., 0] == 1
         averaged = jnp.abs(_averaged(difference, times)).mean(-1)
         differences.append(float(averaged[valid].mean()))
     return differences

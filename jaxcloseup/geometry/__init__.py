@@ -5,9 +5,10 @@ Conventions of every module:
 - Camera frame: OpenCV, x right, y down, z forward; poses are camera-to-world.
 - Pixels: continuous (x, y); the center of the top-left pixel is (0.5, 0.5).
 - Depth: z-depth in world units, 0 where undefined.
-- Sizes: height before width, as in an array's shape. A function that works on an image of a given
-  size takes `height, width`, the fields of `Camera`; only `forward_warp`, whose size is an option,
-  takes both in one as `shape=(height, width)`.
+- Sizes: height before width, as in an array's shape. Functions take `height, width`, the fields of
+  `Camera`; only `forward_warp`, which has no camera, takes both in one as `shape=(height, width)`.
+- Results: `values` is what a warp carried over, `hit` says where anything was, `pixels` and `depth`
+  where it comes from.
 - Batches: functions take one camera; batch cameras with `jax.vmap`.
 """
 
@@ -37,20 +38,28 @@ from jaxcloseup.geometry.rotations import (
 )
 from jaxcloseup.geometry.union_warp import SourceBlocks, block_sources, union_warp
 from jaxcloseup.geometry.visibility import (
-    WarpedImage,
+    VisiblePoints,
     sample_where_visible,
     sphere_in_view,
+)
+from jaxcloseup.geometry.warp import (
+    BackwardWarp,
+    ForwardWarp,
+    backward_warp,
+    draw_nearest,
+    forward_warp,
+    warp_forward_to,
     warp_to,
 )
-from jaxcloseup.geometry.warp import ForwardWarp, backward_warp, draw_nearest, forward_warp
 
 
 __all__ = [
+    "BackwardWarp",
     "Camera",
     "ForwardWarp",
     "PoseSettings",
     "SourceBlocks",
-    "WarpedImage",
+    "VisiblePoints",
     "backward_warp",
     "block_sources",
     "closeup_position",
@@ -76,5 +85,6 @@ __all__ = [
     "sample_where_visible",
     "sphere_in_view",
     "union_warp",
+    "warp_forward_to",
     "warp_to",
 ]

@@ -7,17 +7,22 @@ units; ray directions have unit camera-z, so the parameter along a ray *is* the 
 Functions take one camera and any number of pixels or points `[...]`; batch cameras with `jax.vmap`.
 """
 
+from collections.abc import Sequence
+
 import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxcloseup.geometry.numerics import matmul
+from jaxcloseup.geometry.numerics import matmul, safe_divide, safe_norm
 
 
 @struct.dataclass
 class Camera:
     """A pinhole camera; stacked cameras have leading axes on both arrays.
+
+    `Camera(camtoworld, intrinsics, height, width)` takes the fields as they are. The constructors
+    `from_matrix`, `from_opengl`, `from_fov` and `look_at` convert other descriptions to them.
 
     Attributes:
       camtoworld: `[3, 4]` rotation and position, camera to world.
@@ -33,24 +38,127 @@ class Camera:
 
     @property
     def rotation(self) -> jax.Array:
-        """`[..., 3, 3]` camera-to-world rotation; its columns are the camera's axes."""
+        """Return the camera-to-world rotation `[..., 3, 3]`; its columns are the camera's axes."""
         return self.camtoworld[..., :3]
 
     @property
     def position(self) -> jax.Array:
-        """`[..., 3]` center of projection, world units."""
+        """Return the center of projection `[..., 3]` in world units."""
         return self.camtoworld[..., 3]
+
+    @classmethod
+    def from_matrix(
+        cls,
+        camtoworld: jax.typing.ArrayLike,
+        intrinsics: jax.typing.ArrayLike,
+        *,
+        height: int,
+        width: int,
+    ) -> "Camera":
+        """Return a camera from matrices in OpenCV's convention.
+
+        Args:
+          camtoworld: `[..., 4, 4]` or `[..., 3, 4]` camera-to-world pose.
+          intrinsics: `[..., 3, 3]` matrix K, which maps to pixels whose top-left center is
+            (0.5, 0.5). Add 0.5 to cx and cy of a K that puts this center at (0, 0), as OpenCV's
+            own calibration does. Skew is not supported: K[0, 1] is ignored.
+          height: image height in pixels.
+          width: image width in pixels.
+        """
+        camtoworld, matrix = _floats(camtoworld), _floats(intrinsics)
+        chex.assert_axis_dimension(camtoworld, -1, 4)
+        chex.assert_axis_dimension(matrix, -1, 3)
+        chex.assert_axis_dimension(matrix, -2, 3)
+        focal, center = jnp.diagonal(matrix, axis1=-2, axis2=-1)[..., :2], matrix[..., :2, 2]
+        return cls(camtoworld[..., :3, :], jnp.concatenate([focal, center], axis=-1), height, width)
+
+    @classmethod
+    def from_opengl(
+        cls,
+        camtoworld: jax.typing.ArrayLike,
+        intrinsics: jax.typing.ArrayLike,
+        *,
+        height: int,
+        width: int,
+    ) -> "Camera":
+        """Return a camera from a pose in OpenGL's convention: x right, y up, z backward.
+
+        Blender and `transforms*.json` use it. The world stays the same; only the camera's axes y
+        and z turn round. Arguments as in `from_matrix`.
+        """
+        flip = jnp.array([1, -1, -1, 1], _floats(camtoworld).dtype)
+        camtoworld = _floats(camtoworld)
+        return cls.from_matrix(
+            camtoworld * _match(flip, camtoworld), intrinsics, height=height, width=width
+        )
+
+    @classmethod
+    def from_fov(
+        cls,
+        camtoworld: jax.typing.ArrayLike,
+        fov: jax.typing.ArrayLike,
+        *,
+        height: int,
+        width: int,
+        vertical: bool = False,
+    ) -> "Camera":
+        """Return a camera with square pixels and its principal point at the image's center.
+
+        Args:
+          camtoworld: `[4, 4]` or `[3, 4]` camera-to-world pose, OpenCV.
+          fov: `[]` angle of view in radians, between the left and right edges of the image
+            (`camera_angle_x` of `transforms*.json`).
+          height: image height in pixels.
+          width: image width in pixels.
+          vertical: whether `fov` is the angle between the top and bottom edges instead.
+        """
+        focal = (height if vertical else width) / (2 * jnp.tan(_floats(fov) / 2))
+        center = jnp.array([width / 2, height / 2], focal.dtype)
+        intrinsics = jnp.concatenate([jnp.stack([focal, focal]), center])
+        return cls(_floats(camtoworld)[:3], intrinsics, height, width)
+
+    @classmethod
+    def look_at(
+        cls,
+        position: jax.typing.ArrayLike | Sequence[float],
+        target: jax.typing.ArrayLike | Sequence[float],
+        fov: jax.typing.ArrayLike,
+        *,
+        height: int,
+        width: int,
+        up: jax.typing.ArrayLike | Sequence[float] = (0.0, 0.0, 1.0),
+    ) -> "Camera":
+        """Return a camera that shows a target at the center of its image.
+
+        Args:
+          position: `[3]` center of projection, world units.
+          target: `[3]` point to look at, unlike `position`.
+          fov: `[]` horizontal angle of view in radians, see `from_fov`.
+          height: image height in pixels.
+          width: image width in pixels.
+          up: `[3]` world direction that points up in the image. If the camera looks along it, a
+            fixed direction across the view takes its place.
+        """
+        position, target, up = map(_floats, (position, target, up))
+        forward = _unit(target - position)
+        # Of the world's axes, the one most across the view stands in for a parallel `up`.
+        across = jnp.eye(3, dtype=forward.dtype)[jnp.argmin(jnp.abs(forward))]
+        right = jnp.cross(forward, _unit(up))
+        right = jnp.where(safe_norm(right) < 1e-6, jnp.cross(forward, across), right)
+        right = _unit(right)
+        axes = [right, jnp.cross(forward, right), forward, position]
+        return cls.from_fov(jnp.stack(axes, axis=-1), fov, height=height, width=width)
 
 
 @jax.jit(static_argnames=("height", "width"))
 def pixel_grid(height: int, width: int) -> jax.Array:
-    """Centers of all pixels, `[height, width, 2]` as (x, y)."""
+    """Return the centers of all pixels, `[height, width, 2]` as (x, y)."""
     x, y = jnp.meshgrid(jnp.arange(0.5, width), jnp.arange(0.5, height))
     return jnp.stack([x, y], axis=-1)
 
 
 def pixels_to_rays(camera: Camera, pixels: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """World rays through pixels.
+    """Return the world rays through pixels.
 
     Args:
       camera: one camera.
@@ -69,7 +177,7 @@ def pixels_to_rays(camera: Camera, pixels: jax.Array) -> tuple[jax.Array, jax.Ar
 
 
 def pixels_to_points(camera: Camera, pixels: jax.Array, depth: jax.Array) -> jax.Array:
-    """World points `[..., 3]` seen at `pixels[..., 2]` with z-depth `depth[...]`."""
+    """Return the world points `[..., 3]` seen at `pixels[..., 2]` with z-depth `depth[...]`."""
     chex.assert_equal_shape_prefix([pixels, depth], depth.ndim)
     origins, directions = pixels_to_rays(camera, pixels)
     return origins + depth[..., None] * directions
@@ -90,6 +198,7 @@ def points_to_pixels(camera: Camera, points: jax.Array) -> tuple[jax.Array, jax.
     chex.assert_axis_dimension(points, -1, 3)
     in_camera = matmul(points - _match(camera.position, points), camera.rotation)
     depth = in_camera[..., 2]
+    # Divide by 1 behind the camera: `where` alone would leave NaN in the gradient.
     in_front = depth > jnp.finfo(depth.dtype).eps
     xy = in_camera[..., :2] / jnp.where(in_front, depth, 1)[..., None]
     focal, center = camera.intrinsics[:2], camera.intrinsics[2:]
@@ -97,26 +206,35 @@ def points_to_pixels(camera: Camera, points: jax.Array) -> tuple[jax.Array, jax.
 
 
 def crop_camera(camera: Camera, corner: jax.Array, *, height: int, width: int) -> Camera:
-    """The camera of a part of an image, which may reach beyond it.
+    """Return the camera of a part of an image; the part may reach beyond the image.
 
     Args:
       camera: one camera.
-      corner: `[2]` x, y of the part's first pixel, 0, 0 at the image's.
-      height: of the part in pixels.
-      width: of the part in pixels.
+      corner: `[2]` (x, y) of the part's top-left corner in pixels of the image.
+      height: height of the part in pixels.
+      width: width of the part in pixels.
     """
     moved = jnp.concatenate([jnp.zeros(2), jnp.asarray(corner, camera.intrinsics.dtype)])
     return camera.replace(intrinsics=camera.intrinsics - moved, height=height, width=width)
 
 
 def mean_focal(intrinsics: jax.Array) -> jax.Array:
-    """Geometric mean `[...]` of fx and fy in pixels, of intrinsics `[..., 4]`."""
+    """Return the geometric mean `[...]` of fx and fy in pixels from intrinsics `[..., 4]`."""
     return jnp.sqrt(intrinsics[..., 0] * intrinsics[..., 1])
 
 
 def _check_camera(camera: Camera) -> None:
     chex.assert_shape(camera.camtoworld, (3, 4))
     chex.assert_shape(camera.intrinsics, (4,))
+
+
+def _floats(values: jax.typing.ArrayLike | Sequence[float]) -> jax.Array:
+    """Return an array of JAX's default floating type."""
+    return jnp.asarray(values, jnp.result_type(float))
+
+
+def _unit(vector: jax.Array) -> jax.Array:
+    return safe_divide(vector, jnp.broadcast_to(safe_norm(vector), vector.shape))
 
 
 def _match(vector: jax.Array, like: jax.Array) -> jax.Array:

@@ -15,6 +15,7 @@ from flax import struct
 
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points
 from jaxcloseup.geometry.numerics import matmul
+from jaxcloseup.geometry.visibility import sphere_in_view
 from jaxcloseup.geometry.warp import NO_SOURCE, ForwardWarp, draw_nearest
 
 
@@ -133,7 +134,9 @@ def _union_warp(sources, cameras, values, camera, pixels, exclude):
     slot_of_pixel = slot_of_pixel.at[chosen].set(jnp.arange(chosen.size, dtype=jnp.int32))
     wanted = slot_of_pixel >= 0
 
-    blocks_there = _may_land(sources, camera) & (sources.view != exclude)
+    center = matmul(sources.center - camera.position[None], camera.rotation)
+    visible = sphere_in_view(camera, center, sources.radius)
+    blocks_there = visible & (sources.radius >= 0) & (sources.view != exclude)
     affine = _pixel_to_virtual(cameras, camera)
     every_offset = jnp.arange(BLOCK * BLOCK, dtype=jnp.int32)[None]
     num_blocks = len(blocks_there)
@@ -198,25 +201,6 @@ def _one_after_the_other(size, batched, *arguments):
     )
     _, results = jax.lax.scan(warp, nothing, jnp.arange(size))
     return results, jax.tree.map(lambda _: True, results)
-
-
-def _may_land(sources, camera):
-    """Whether a block's sphere reaches into the camera's frustum, `[N]`."""
-    x, y, z = matmul(sources.center - camera.position[None], camera.rotation).T
-    fx, fy, cx, cy = camera.intrinsics
-
-    def inside(across, focal, center):
-        # Signed distance from a side of the frustum, positive inside; a sphere may reach in.
-        return (focal * across + center * z) / jnp.hypot(focal, center) >= -sources.radius
-
-    return (
-        (sources.radius >= 0)
-        & (z >= -sources.radius)
-        & inside(x, fx, cx)
-        & inside(-x, fx, camera.width - cx)
-        & inside(y, fy, cy)
-        & inside(-y, fy, camera.height - cy)
-    )
 
 
 def _pixel_to_virtual(cameras, camera):

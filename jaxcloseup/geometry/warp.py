@@ -1,6 +1,9 @@
-"""Moving pixels between views: backward (read where a point projects) and forward (z-buffer).
+"""Warps between views: backward (read where a point projects) and forward (z-buffer).
 
 Images are `[H, W, C]`; pixels are continuous (x, y) with the top-left center at (0.5, 0.5).
+`backward_warp` and `forward_warp` take pixels that are already projected; `warp_to` and
+`warp_forward_to` take two cameras and a depth map. Results share their field names: `values` is
+what was carried over, `hit` says where anything was.
 """
 
 from typing import NamedTuple
@@ -9,10 +12,25 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxcloseup.geometry.masks import in_bounds
+from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points, points_to_pixels
+from jaxcloseup.geometry.masks import depth_consistent, in_bounds
 
 
-NO_SOURCE = 2**31 - 1
+NO_SOURCE = 2**31 - 1  # larger than any index, so that a minimum replaces it
+
+
+class BackwardWarp(NamedTuple):
+    """A source image as seen from a target camera.
+
+    Attributes:
+      values: `[H, W, C]` values read from the source, 0 where not hit.
+      hit: `[H, W]` bool, whether the source shows the target's surface.
+      pixels: `[H, W, 2]` source pixels (x, y); finite, but without meaning where not hit.
+    """
+
+    values: jax.Array
+    hit: jax.Array
+    pixels: jax.Array
 
 
 class ForwardWarp(NamedTuple):
@@ -32,7 +50,7 @@ class ForwardWarp(NamedTuple):
 def backward_warp(
     image: jax.Array, pixels: jax.Array, *, order: int = 1, fill_value: float = 0.0
 ) -> jax.Array:
-    """Read an image at continuous pixels: the paper's W(I_n, D', P', P_n, K) once projected.
+    """Read an image at continuous pixels: the paper's warp W of I_n to I', after projection.
 
     Args:
       image: `[H, W, C]` float.
@@ -41,14 +59,14 @@ def backward_warp(
       fill_value: value of pixels outside the image.
 
     Returns:
-      `[..., C]`. Differentiable in `image` and, for order 1, in `pixels`.
+      `[..., C]` values, differentiable in `image` and, for order 1, in `pixels`.
     """
     chex.assert_rank(image, 3)
     if order not in (0, 1):
         raise ValueError(f"order must be 0 (nearest) or 1 (bilinear), not {order}")
     height, width, _ = image.shape
     inside = in_bounds(pixels, height, width)[..., None]
-    pixels = jnp.where(inside, pixels, 0.5)
+    pixels = jnp.where(inside, pixels, 0.5)  # NaN must not reach the indices, nor the gradient
     if order == 0:
         x, y = _index(pixels[..., 0], width), _index(pixels[..., 1], height)
         return jnp.where(inside, image[y, x], fill_value)
@@ -73,7 +91,7 @@ def forward_warp(
     valid: jax.Array | None = None,
     into: ForwardWarp | None = None,
 ) -> ForwardWarp:
-    """Splat sources onto a target image through an exact z-buffer: the paper's union of warps.
+    """Splat sources onto a target image through an exact z-buffer: the paper's union I*.
 
     Each source falls on the one pixel that holds its projection. The nearest source wins; among
     equal depths the lowest source index does, so the result does not depend on scheduling and,
@@ -121,6 +139,89 @@ def forward_warp(
     )
 
 
+def warp_to(
+    source_image: jax.Array,
+    source: Camera,
+    target: Camera,
+    depth: jax.Array,
+    *,
+    source_depth: jax.Array | None = None,
+    tolerance: jax.Array | float = 0.02,
+) -> BackwardWarp:
+    """Read a source image into a target view: the paper's backward warp I' in one call.
+
+    Each target pixel is lifted with its z-depth, projected into the source and read there
+    bilinearly. It is not hit where its depth is undefined, where its point lies behind the source
+    camera or outside the source image, or, if `source_depth` is passed, where its point is
+    occluded in the source.
+
+    Args:
+      source_image: `[Hs, Ws, C]` float.
+      source: camera of the image, of size `Hs, Ws`.
+      target: camera of the view to fill, of size `H, W`.
+      depth: `[H, W]` z-depth of the target view; not positive or not finite is undefined.
+      source_depth: `[Hs, Ws]` z-depth of the source; None ignores occlusion.
+      tolerance: relative; a point is occluded if its z-depth in the source differs by more from
+        `source_depth` at the nearest pixel.
+
+    Returns:
+      A `BackwardWarp`. `values` is differentiable in `source_image`, in `depth` and in the cameras;
+      gradients are finite, and 0 where not hit.
+    """
+    chex.assert_shape(source_image, (source.height, source.width, None))
+    chex.assert_type(source_image, float)
+    chex.assert_shape(depth, (target.height, target.width))
+    defined = (depth > 0) & jnp.isfinite(depth)
+    grid = pixel_grid(target.height, target.width)
+    points = pixels_to_points(target, grid, jnp.where(defined, depth, 1))
+    pixels, landed_depth = points_to_pixels(source, points)
+    hit = defined & (landed_depth > 0) & in_bounds(pixels, source.height, source.width)
+    if source_depth is not None:
+        chex.assert_shape(source_depth, (source.height, source.width))
+        observed = backward_warp(source_depth[..., None], pixels, order=0)[..., 0]
+        hit &= depth_consistent(observed, landed_depth, tolerance)
+    values = jnp.where(hit[..., None], backward_warp(source_image, pixels), 0)
+    return BackwardWarp(values, hit, pixels)
+
+
+def warp_forward_to(
+    source_image: jax.Array,
+    source: Camera,
+    target: Camera,
+    source_depth: jax.Array,
+    *,
+    valid: jax.Array | None = None,
+    into: ForwardWarp | None = None,
+) -> ForwardWarp:
+    """Splat a source image into a target view: the paper's forward warp in one call.
+
+    The twin of `warp_to`: each source pixel is lifted with its own z-depth, projected into the
+    target and drawn on the pixel that it falls on, where the nearest source pixel wins. Several
+    sources join in one target by passing each result to the next call's `into`; `union_warp` does
+    the same for many large views.
+
+    Args:
+      source_image: `[Hs, Ws, C]` values of any type.
+      source: camera of the image, of size `Hs, Ws`.
+      target: camera of the view to fill, of size `H, W`.
+      source_depth: `[Hs, Ws]` z-depth of the source; not positive or not finite is not drawn.
+      valid: `[Hs, Ws]` bool, source pixels to draw; None draws all.
+      into: earlier result to draw onto, which wins ties; None starts from an empty target.
+
+    Returns:
+      A `ForwardWarp` of size `H, W`, differentiable in `source_image`, `source_depth` and cameras.
+    """
+    chex.assert_shape(source_image, (source.height, source.width, None))
+    chex.assert_shape(source_depth, (source.height, source.width))
+    defined = (source_depth > 0) & jnp.isfinite(source_depth)
+    grid = pixel_grid(source.height, source.width)
+    points = pixels_to_points(source, grid, jnp.where(defined, source_depth, 1))
+    pixels, depth = points_to_pixels(target, points)
+    drawn = defined if valid is None else defined & valid
+    shape = target.height, target.width
+    return forward_warp(source_image, pixels, depth, shape=shape, valid=drawn, into=into)
+
+
 def draw_nearest(
     buffer: tuple[jax.Array, jax.Array], target: jax.Array, depth: jax.Array, source: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
@@ -136,12 +237,14 @@ def draw_nearest(
       The updated buffer.
     """
     before, sources = buffer
+    # Two scatters with commutative minima: the result does not depend on their order. The first
+    # finds the nearest depth of each entry, the second the lowest index among its sources.
     nearest = before.at[target].min(depth, mode="drop")
     wins = depth == nearest.at[target].get(mode="fill", fill_value=jnp.nan)
     sources = jnp.where(nearest < before, NO_SOURCE, sources)
     return nearest, sources.at[jnp.where(wins, target, nearest.size)].min(source, mode="drop")
 
 
-def _index(coordinate, size):
-    """Index of the pixel that holds a coordinate, clamped to the image."""
+def _index(coordinate: jax.Array, size: int) -> jax.Array:
+    """Return the index of the pixel that holds a coordinate, clamped to the image."""
     return jnp.clip(jnp.floor(coordinate).astype(jnp.int32), 0, size - 1)

@@ -6,7 +6,8 @@ import reference
 
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.geometry.rotations import euler_to_matrix
-from jaxcloseup.geometry.visibility import sample_where_visible, warp_to
+from jaxcloseup.geometry.visibility import sample_where_visible
+from jaxcloseup.geometry.warp import warp_to
 
 
 SOURCE = Camera(jnp.eye(3, 4), jnp.array([40.0, 40, 20, 15]), height=30, width=40)
@@ -56,8 +57,8 @@ def test_warp_to_matches_the_oracle(key, occluded, jit):
     clear = margin > 1e-3
     assert clear.mean() > 0.9
     assert 0.05 < valid.mean() < 0.95
-    np.testing.assert_array_equal(np.asarray(ours.valid)[clear], valid[clear])
-    np.testing.assert_allclose(np.asarray(ours.image)[clear], expected[clear], atol=1e-4)
+    np.testing.assert_array_equal(np.asarray(ours.hit)[clear], valid[clear])
+    np.testing.assert_allclose(np.asarray(ours.values)[clear], expected[clear], atol=1e-4)
 
 
 def test_a_wall_behind_a_screen_is_read_only_where_the_source_sees_it():
@@ -76,14 +77,14 @@ def test_a_wall_behind_a_screen_is_read_only_where_the_source_sees_it():
     clear &= np.minimum(np.abs(y), np.abs(y - 30)) > 0.6
     assert (hidden & clear).sum() > 5
     assert (inside & ~hidden & clear).sum() > 100
-    valid = np.asarray(warped.valid)
+    valid = np.asarray(warped.hit)
     np.testing.assert_array_equal(valid[clear], (inside & ~hidden)[clear])
     seen = clear & valid
-    np.testing.assert_allclose(np.asarray(warped.image)[seen], wall[..., :2][seen], atol=1e-4)
+    np.testing.assert_allclose(np.asarray(warped.values)[seen], wall[..., :2][seen], atol=1e-4)
     np.testing.assert_allclose(np.asarray(warped.pixels)[seen], np.stack([x, y], -1)[seen], 1e-4)
-    assert not np.any(np.asarray(warped.image)[~valid])
+    assert not np.any(np.asarray(warped.values)[~valid])
     # Without the source's depth, the screen's color is taken for the wall behind it.
-    assert np.asarray(warp(*arguments).valid)[hidden & clear & inside].all()
+    assert np.asarray(warp(*arguments).hit)[hidden & clear & inside].all()
 
 
 def test_points_behind_the_source_are_not_valid():
@@ -92,7 +93,7 @@ def test_points_behind_the_source_are_not_valid():
     image = jnp.ones((SOURCE.height, SOURCE.width, 1))
     for source_depth in (None, jnp.full((SOURCE.height, SOURCE.width), 2.0)):
         warped = warp(image, ahead, TARGET, depth, source_depth=source_depth, tolerance=jnp.inf)
-        assert not jnp.any(warped.valid)
+        assert not jnp.any(warped.hit)
         assert jnp.all(jnp.isfinite(warped.pixels))
 
 
@@ -100,11 +101,11 @@ def test_gradients_are_finite_and_reach_image_and_depth(key):
     image, source, target, depth = random_problem(key)
 
     def total(image, depth, source, target):
-        return jnp.sum(warp_to(image, source, target, depth).image)
+        return jnp.sum(warp_to(image, source, target, depth).values)
 
     gradients = jax.jit(jax.grad(total, argnums=(0, 1, 2, 3)))(image, depth, source, target)
     assert all(jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradients))
-    valid = warp(image, source, target, depth).valid
+    valid = warp(image, source, target, depth).hit
     np.testing.assert_allclose(gradients[0].sum(), 2 * valid.sum(), rtol=1e-5)
     assert jnp.any(gradients[1] != 0)
     np.testing.assert_array_equal(gradients[1][~valid], 0)
@@ -118,8 +119,8 @@ def test_warp_to_batches_under_vmap(key):
     together = jax.jit(jax.vmap(warp_to, (None, 0, None, None)))(image, sources, target, depth)
     for i in range(3):
         one = warp(image, source.replace(camtoworld=poses[i]), target, depth)
-        np.testing.assert_allclose(together.image[i], one.image, atol=1e-5)
-        np.testing.assert_array_equal(together.valid[i], one.valid)
+        np.testing.assert_allclose(together.values[i], one.values, atol=1e-5)
+        np.testing.assert_array_equal(together.hit[i], one.hit)
 
 
 def test_wrong_shapes_and_types_are_refused(key):
