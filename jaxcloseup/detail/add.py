@@ -30,8 +30,7 @@ _NEAREST, _FARTHEST = -1.0, 3.0  # log2 of how much finer views are than photogr
 _BLURS = 1.0, 4.0  # standard deviations in pixels
 
 
-@struct.dataclass
-class Detail:
+class Detail(struct.PyTreeNode):
     """What a model's renders lack, as the photographs show it.
 
     Attributes:

@@ -56,8 +56,7 @@ class Evidence(NamedTuple):
     weight: np.ndarray
 
 
-@struct.dataclass
-class Networks:
+class Networks(struct.PyTreeNode):
     """K networks of features.
 
     Attributes:
@@ -72,8 +71,7 @@ class Networks:
     layers: tuple[jax.Array, ...]
 
 
-@struct.dataclass
-class DetailWeights:
+class DetailWeights(struct.PyTreeNode):
     """How features predict what of a gathered residual and colors is really there.
 
     Attributes:

@@ -17,8 +17,7 @@ from flax import struct
 from jaxcloseup.geometry.numerics import matmul, safe_divide, safe_norm
 
 
-@struct.dataclass
-class Camera:
+class Camera(struct.PyTreeNode):
     """A pinhole camera; stacked cameras have leading axes on both arrays.
 
     `Camera(camtoworld, intrinsics, height, width)` takes the fields as they are. The constructors

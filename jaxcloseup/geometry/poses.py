@@ -14,8 +14,7 @@ from jaxcloseup.geometry.numerics import matmul
 from jaxcloseup.geometry.rotations import euler_to_matrix, matrix_to_euler
 
 
-@struct.dataclass
-class PoseSettings:
+class PoseSettings(struct.PyTreeNode):
     """How virtual cameras are drawn; every leaf is traced.
 
     Attributes:

@@ -26,8 +26,7 @@ GROUP = 1024  # minimum number of sources drawn together
 _WORD = 32  # bits per word
 
 
-@struct.dataclass
-class SourceBlocks:
+class SourceBlocks(struct.PyTreeNode):
     """Training pixels with their depth, in N square blocks of P pixels.
 
     Attributes:

@@ -33,8 +33,7 @@ def _by_default(value: float) -> jax.Array:
     return struct.field(default_factory=functools.partial(jnp.float32, value))
 
 
-@struct.dataclass
-class LabelSources:
+class LabelSources(struct.PyTreeNode):
     """The training photographs with what labels need to read them, V views.
 
     Attributes:
@@ -54,8 +53,7 @@ def label_sources(views: Views, depths: jax.Array) -> LabelSources:
     return LabelSources(views, depths, block_sources(views.cameras, depths, views.weight))
 
 
-@struct.dataclass
-class PseudoSettings:
+class PseudoSettings(struct.PyTreeNode):
     """What makes a pseudo-label; every leaf is traced, so settings stack into the arms of a sweep.
 
     Attributes:
