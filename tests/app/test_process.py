@@ -141,7 +141,7 @@ def test_poses_of_a_video(walk, tmp_path):
     assert len(indices) == summary_of(out)["photographs"] >= 8
     assert all(i % 3 != 1 for i in indices)
     away, turned = errors(list(found.values()), poses[indices])
-    # A dozen small frames after lossy compression: docs/running.md has a real video's figures.
+    # A dozen small frames after lossy compression: docs/programs.md has a real video's figures.
     assert away.max() < 0.01 and turned.max() < 0.4
     np.testing.assert_allclose(scene.train.cameras.intrinsics[0, 0], FOCAL, rtol=0.03)
 
