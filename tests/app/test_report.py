@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from browser import open_browser
+from pages import Page
 
-from jaxcloseup.app.report.headline import conclusion, tables
+from jaxcloseup.app.report.headline import conclusion, print_results, run_tables
 from jaxcloseup.app.report.page import Picture
 from jaxcloseup.app.report.pictures import comparisons, enlarge
-from jaxcloseup.app.report.run_page import print_results, write_report
+from jaxcloseup.app.report.run_page import write_report
 from jaxcloseup.app.report.showcase import Exhibit, best_middle_worst, cut_out, find_place
 from jaxcloseup.app.score.scores import Target
 from jaxcloseup.artifacts.images import side_by_side
@@ -41,58 +42,51 @@ def results(psnr, *, weight=None, detail=None, **changes):
 
 
 @pytest.mark.parametrize(
-    ("found", "said"),
+    ("found", "parts"),
     [
-        (results({"baseline": 20.04}), "Close-ups have a PSNR of 20.0 dB."),
-        (
-            results({"control": 20.0, "closeup": 20.26}),
-            "Close-ups have a PSNR of 20.3 dB. Labels found for 25% of the pixels of close-ups "
-            "made the field 0.26 dB better than as many steps without.",
-        ),
+        (results({"baseline": 20.04}), ["Close-ups", "20.0 dB"]),
+        (results({"control": 20.0, "closeup": 20.26}), ["20.3 dB", "25%", "0.26 dB better"]),
         (
             results({"control": 20.0, "closeup": 19.9, "detail": 22.0}, detail="closeup"),
-            "Close-ups have a PSNR of 22.0 dB with the photographs' detail, 2.1 dB better than the "
-            "trained field alone. Labels found for 25% of the pixels of close-ups made the field "
-            "0.10 dB worse than as many steps without.",
+            ["22.0 dB", "2.1 dB better", "25%", "0.10 dB worse"],
         ),
-        (
-            results({"control": 20.0, "closeup": 20.001}, weight=1.0),
-            "Labels found for 25% of the pixels of close-ups changed nothing.",
-        ),
-        (
-            results({"control": 20.0, "closeup": 20.0}, weight=0.0),
-            "Labels were not used: on photographs that were left out, only 8% of their pixels "
-            "agreed closely, too few to trust them.",
-        ),
-        (results({"closeup": 20.0}), "no control tells what they changed."),
-        (results({}), "No view was held out"),
+        (results({"control": 20.0, "closeup": 20.001}, weight=1.0), ["25%", "changed nothing"]),
+        (results({"control": 20.0, "closeup": 20.0}, weight=0.0), ["not used", "8%"]),
+        (results({"closeup": 20.0}), ["no control"]),
+        (results({}), ["No view was held out"]),
     ],
 )
-def test_a_page_begins_with_what_was_found(found, said):
-    assert said in conclusion(found)
+def test_the_conclusion_has_the_numbers_that_decide(found, parts):
+    said = conclusion(found)
+    assert sorted(parts, key=said.index) == parts
 
 
 def test_without_close_ups_the_ordinary_views_count():
     found = results({"baseline": 20.0})
     del found["stages"]["baseline"]["test"]
     assert conclusion(found) == "Ordinary views have a PSNR of 30.0 dB."
-    assert list(tables(found)) == ["Ordinary views"]
+    assert [table.title for table in run_tables(found)] == ["Ordinary views"]
 
 
-def test_stages_without_labels_share_the_row_of_their_control():
+@pytest.mark.parametrize(
+    ("weight", "targets", "stages"),
+    [
+        (0.0, None, ["baseline", "control, closeup", "test_time_control, test_time"]),
+        (0.1, None, ["baseline", "control", "closeup", "test_time", "test_time_control"]),
+        # Labels with detail have no gate.
+        (
+            *(0.0, {"label": "residual"}),
+            ["baseline", "control, closeup", "test_time", "test_time_control"],
+        ),
+    ],
+)
+def test_stages_without_labels_share_the_row_of_their_control(weight, targets, stages):
     psnr = {"baseline": 19.0, "control": 20.0, "closeup": 20.0, "test_time": 20.5}
-    header, body = tables(results(psnr, weight=0.0))["Close-ups"]
-    assert header == ["stage", "PSNR (dB)", "SSIM", "color-corrected", "depth off by"]
-    assert body[1] == ["control, closeup", "20.00", "0.5000", "21.00", "1.23%"]
-    assert [row[0] for row in body] == ["baseline", "control, closeup", "test_time"]
-    _, body = tables(results(psnr, weight=0.1))["Close-ups"]
-    assert [row[0] for row in body] == list(psnr)
-    by_warps = results(psnr | {"test_time_control": 20.0}, weight=0.0)
-    _, body = tables(by_warps)["Close-ups"]
-    assert body[-1][0] == "test_time_control, test_time"
-    by_detail = by_warps | {"config": {"targets": {"label": "residual"}}}
-    _, body = tables(by_detail)["Close-ups"]
-    assert [row[0] for row in body[-2:]] == ["test_time", "test_time_control"]
+    found = results(psnr | {"test_time_control": 20.0}, weight=weight, config={"targets": targets})
+    table = run_tables(found)[0]
+    assert table.header == ["stage", "PSNR (dB)", "SSIM", "color-corrected", "depth off by"]
+    assert table.rows[1][1:] == ["20.00", "0.5000", "21.00", "1.23%"]
+    assert [row[0] for row in table.rows] == stages
 
 
 def test_tables_show_the_finer_size_and_perceptual_distances():
@@ -100,10 +94,10 @@ def test_tables_show_the_finer_size_and_perceptual_distances():
     splits = found["stages"]["baseline"]
     splits["test"]["lpips_vgg"] = 0.25
     splits["test_finer"] = {"psnr": 18.0}
-    header, body = tables(found)["Close-ups"]
-    assert header[1:5] == ["PSNR (dB)", "at 240 x 135", "SSIM", "LPIPS (VGG)"]
-    assert body == [["baseline", "20.00", "18.00", "0.5000", "0.2500", "1.23%"]]
-    assert len(header) == 6
+    table = run_tables(found)[0]
+    assert table.header[1:5] == ["PSNR (dB)", "at 240 x 135", "SSIM", "LPIPS (VGG)"]
+    assert table.rows == [["baseline", "20.00", "18.00", "0.5000", "0.2500", "1.23%"]]
+    assert len(table.header) == 6
 
 
 def test_stages_are_never_cut_in_a_narrow_terminal(capsys, monkeypatch):
@@ -112,31 +106,73 @@ def test_stages_are_never_cut_in_a_narrow_terminal(capsys, monkeypatch):
     assert "test_time_control" in capsys.readouterr().out
 
 
-def test_a_phone_shows_a_page_without_scrolling_it_sideways(tmp_path):
-    """Wide tables, rows of panels and the configuration scroll in themselves."""
-    found = results({"baseline": 19.0, "test_time_control": 20.0}, scene="a", method="m")
+HOSTILE = "<script>alert('x')</script> \"&{{ 1 }}"
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """Write a page with everything that a page can have; names in it are hostile."""
+    found = results({"baseline": 19.0, "test_time_control": 20.0}, scene=HOSTILE, method=HOSTILE)
     found |= {"preset": "quick", "seed": 0, "resolution": [24, 18], "versions": {}}
     audit = {"error": 0.01, "kept": 0.5, "leaked": 0.1, "curve": None}
     tried = {"rgb_tolerance": 0.02, "depth_tolerance": 0.005, "coverage": 0.1}
     tried |= {"label_psnr": 30.0, "model_psnr": 31.0}
     found["gate"] = {"weight": 0.0, "agreement": 0.08, "left_out": [tried]}
-    found |= {"labels": {"exact depth": audit}, "left_out": None}
+    found |= {"labels": {"exact_depth": audit}, "left_out": None}
     found |= {"config": {"targets": None, "name": "long " * 50}}
-    for split in found["stages"]["baseline"].values():
-        split |= {"seen_psnr": 1.0, "seen_share": 0.5, "lpips_vgg": 0.3}
+    errors = [{"expected": 0.1, "actual": 0.2}]
+    found["detail"] = {"stage": "baseline", "errors": errors, "sizes": [[36, 48]]}
+    for stage, splits in found["stages"].items():
+        splits["zoom_2"] = {"psnr": {"baseline": 18.0, "test_time_control": 17.0}[stage]}
+        for metrics in splits.values():
+            metrics |= {"psnr_seen1": 1.0, "coverage_seen1": 0.5, "lpips_vgg": 0.3}
     noise = np.random.default_rng(0).integers(0, 255, (18, 24, 3), np.uint8)
-    shown = [Exhibit("a" * 40, 20.0, noise, noise, "b" * 40, noise, pixel) for pixel in (0.2, 1.3)]
+    shown = [
+        Exhibit(HOSTILE, 20.0, noise, noise, "b" * 40, cutout, pixel)
+        for cutout, pixel in ((noise, 0.2), (noise, 1.3), (None, float("nan")))
+    ]
     row = side_by_side([enlarge(noise)] * 5, labels=["a title"] * 5)
-    pictures = [Picture(section, "a", row) for section in ("Close-ups", "Pseudo-labels")]
-    write_report(tmp_path / "report.html", found, shown, pictures)
-    page = (tmp_path / "report.html").read_text()
-    assert "whose pixels are 5.0 times finer" in page and "are 1.3 times as large" in page
-    parts = "Close-ups beside", "times finer", "Close-ups</h2>", "Scores</h2>", "Pseudo-labels</h2>"
-    assert sorted(parts, key=page.index) == list(parts)
+    pictures = [Picture(section, HOSTILE, row) for section in ("Close-ups", "Pseudo-labels")]
+    path = tmp_path_factory.mktemp("page") / "report.html"
+    write_report(path, found, shown, pictures)
+    return path, found
+
+
+def test_a_page_shows_the_numbers_of_results_in_order(written):
+    path, found = written
+    page = Page(path.read_text())
+    order = ["Close-ups beside photographs", "Close-ups", "Scores", "Pseudo-labels"]
+    assert [heading for heading in page.headings if heading in order][:3] == order[:3]
+    assert page.headings.index("Scores") < page.headings.index("Pseudo-labels")
+    close_ups, ordinary, everything, labels, gate, detail = page.tables
+    for split, (_, *body) in (("test", close_ups), ("test_far", ordinary)):
+        psnr = {stage: splits[split]["psnr"] for stage, splits in found["stages"].items()}
+        assert {stage: float(value) for stage, value, *_ in body} == psnr
+    assert len(everything) == 1 + 4
+    assert labels[1] == ["exact depth", "0.0100", "0.5000", "0.1000"]
+    assert gate[1] == ["0.02", "0.005", "10%", "30.00", "31.00"]
+    assert detail[1] == ["1", "25.5", "51.0"]
+    assert page.tags.count("svg") == 1  # no control: no plot of gains
+    assert page.tags.count("details") == 5
+
+
+def test_a_page_needs_no_other_file_and_escapes_names(written):
+    page = Page(written[0].read_text())
+    # Two sliders of two images and a truth, a render and its truth, two rows of panels.
+    assert [image.shape[:2] for image in page.pictures()[:8]] == [(18, 24)] * 8
+    assert len(page.pictures()) == 10
+    assert "script" not in page.tags and page.headings[0] == HOSTILE
+    assert page.text.count(HOSTILE) >= 7
+    finer, coarser = page.captions[0], page.captions[2]
+    assert "5.0 times finer" in finer and "1.3 times as large" in coarser
+
+
+def test_a_phone_shows_a_page_without_scrolling_it_sideways(written):
+    """Wide tables, rows of panels and the configuration scroll in themselves."""
     with open_browser() as browser:
         size = {"width": 390, "height": 800, "deviceScaleFactor": 1, "mobile": True}
         browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-        browser.get(f"file://{tmp_path}/report.html")
+        browser.get(f"file://{written[0]}")
         widths = browser.execute_script(
             "for (const one of document.querySelectorAll('details')) one.open = true;"
             "const width = one => document.querySelector(one).getBoundingClientRect().width;"

@@ -24,7 +24,8 @@ from jaxcloseup.app.methods import (
     pseudo_settings,
 )
 from jaxcloseup.app.methods.surfels import REDUCED
-from jaxcloseup.app.report.comparison import read_finished, say_which_is_best, write_comparison
+from jaxcloseup.app.report.comparison import say_which_is_best, write_comparison
+from jaxcloseup.app.report.finished_runs import read_finished
 from jaxcloseup.app.run.gate import AGREEMENT, gated, verdict, weigh_labels
 from jaxcloseup.app.run.loop import TrainingError, run_stage
 from jaxcloseup.app.run.programs import Programs
@@ -258,8 +259,8 @@ def test_a_run_leaves_pictures_and_a_page_without_links(finished):
     depth = cv2.imread(str(output_dir / "renders" / "baseline" / "test" / "depth" / "0.png"))
     assert depth.shape == (plane.HEIGHT, plane.WIDTH, 3)
     page = (output_dir / "report.html").read_text()
-    assert "src='data:image/webp" in page
-    assert page.index("Close-ups have a PSNR") < page.index("type=range") < page.index("<table")
+    assert 'src="data:image/webp' in page
+    assert page.index("Close-ups have a PSNR") < page.index('type="range"') < page.index("<table")
     assert len(page) < 3e6
     animation = (output_dir / "dolly.webp").read_bytes()
     assert base64.b64encode(animation).decode() in page
@@ -278,7 +279,7 @@ def test_finished_runs_can_be_compared(finished, tmp_path):
     runs = read_finished([output_dir, other])
     write_comparison(tmp_path / "both", runs)
     page = (tmp_path / "both" / "report.html").read_text()
-    assert "as good as" in say_which_is_best(runs) and page.count("type=range") == 2
+    assert "as good as" in say_which_is_best(runs) and page.count('type="range"') == 2
     assert [run.stage for run in runs] == ["detail", "detail"]
 
 

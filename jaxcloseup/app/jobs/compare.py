@@ -9,11 +9,11 @@ from absl import flags
 from jaxcloseup.app.cli.start import check_unused, prepare_to_stop
 from jaxcloseup.app.report.comparison import (
     comparison_tables,
-    read_finished,
     say_which_is_best,
     write_comparison,
 )
-from jaxcloseup.app.report.run_page import print_tables
+from jaxcloseup.app.report.finished_runs import read_finished
+from jaxcloseup.app.report.table import print_tables
 from jaxcloseup.app.store.stored_run import RunError
 
 

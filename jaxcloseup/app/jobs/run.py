@@ -15,7 +15,7 @@ from jaxcloseup.app.cli import chosen as training_flags
 from jaxcloseup.app.cli.start import lock_output_dir, prepare_to_stop, set_up
 from jaxcloseup.app.methods import Preset
 from jaxcloseup.app.methods.settings import plain_config
-from jaxcloseup.app.report.run_page import print_results
+from jaxcloseup.app.report.headline import print_results
 from jaxcloseup.app.report.run_report import report_run
 from jaxcloseup.app.run.logs import TrainLog, check_tensorboard
 from jaxcloseup.app.run.loop import TrainingError

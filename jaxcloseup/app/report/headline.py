@@ -1,30 +1,33 @@
-"""What a run found, in a sentence, and in a small table of each kind of view."""
+"""The result of a run: one sentence, a small table for each kind of view, and all scores."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from jaxcloseup.app.report.table import Table, print_tables
 from jaxcloseup.app.score.metrics_text import COLUMNS, FINER, SPLIT_TITLES, format_metric
 
 
+Splits = Mapping[str, Mapping[str, Any]]  # metrics by split
+
 _DEPTH = ("depth_error_median", "point_depth_error_median")
-# Perceptual distances where their networks are at hand, else colors that were corrected.
+# Perceptual distances where their networks are available, else PSNR of corrected colors.
 _LAST = ("lpips_vgg", "lpips_alex", "cc_psnr")
 _SHORT = {"cc_psnr": "color-corrected"} | dict.fromkeys(_DEPTH, "depth off by")
 
 
 def best_stage(stages: Iterable[str]) -> str:
-    """The stage whose renders are shown first."""
+    """Return the stage whose renders are shown first."""
     stages = list(stages)
     return "detail" if "detail" in stages else stages[-1]
 
 
 def used_labels(results: Mapping[str, Any]) -> bool:
-    """Whether the gate let labels in; there may be none."""
+    """Return True if the gate, or a run without one, used labels."""
     return results["gate"] is None or results["gate"]["weight"] > 0
 
 
 def conclusion(results: Mapping[str, Any]) -> str:
-    """Return what the run found on its close-ups, or ordinary views if it has no close-ups."""
+    """Return the result on close-ups, or on ordinary views if the run has no close-ups."""
     stages = results["stages"]
     split = "test" if any("test" in splits for splits in stages.values()) else "test_far"
     views = SPLIT_TITLES[split]
@@ -36,15 +39,15 @@ def conclusion(results: Mapping[str, Any]) -> str:
         change = psnr["detail"] - psnr[results["detail"]["stage"]]
         text = (
             f"{views} have a PSNR of {psnr['detail']:.1f} dB with the photographs' detail, "
-            f"{than(change, 1)} than the trained field alone."
+            f"{compare_psnr(change, 1)} than the trained field alone."
         )
     else:
         stage = next(name for name in ("closeup", "control", "baseline", *psnr) if name in psnr)
         text = f"{views} have a PSNR of {psnr[stage]:.1f} dB."
-    return f"{text} {_say_of_labels(results, psnr)}".rstrip()
+    return f"{text} {_effect_of_labels(results, psnr)}".rstrip()
 
 
-def _say_of_labels(results, psnr):
+def _effect_of_labels(results: Mapping[str, Any], psnr: Mapping[str, float]) -> str:
     if "closeup" not in psnr:
         return ""
     if not used_labels(results):
@@ -55,27 +58,23 @@ def _say_of_labels(results, psnr):
         )
     history = results["history"].get("closeup") or [{}]
     coverage = history[-1].get("label_coverage")
-    found = "" if coverage is None else f" found for {coverage:.0%} of the pixels of close-ups"
+    where = "" if coverage is None else f" found for {coverage:.0%} of the pixels of close-ups"
     if "control" not in psnr:
-        return f"The field learned from labels{found}; no control tells what they changed."
+        return f"The field learned from labels{where}; no control tells what they changed."
     change = psnr["closeup"] - psnr["control"]
     if round(abs(change), 2) == 0:
-        return f"Labels{found} changed nothing."
-    return f"Labels{found} made the field {than(change, 2)} than as many steps without."
+        return f"Labels{where} changed nothing."
+    return f"Labels{where} made the field {compare_psnr(change, 2)} than as many steps without."
 
 
-def than(change: float, digits: int) -> str:
+def compare_psnr(change: float, digits: int) -> str:
     """Say how much better or worse a PSNR is, in dB."""
     return f"{abs(change):.{digits}f} dB {'worse' if change < 0 else 'better'}"
 
 
-def tables(results: Mapping[str, Any]) -> dict[str, tuple[list[str], list[list[str]]]]:
-    """Return a header and a row for each stage, by the title of the views; at most six columns.
-
-    Stages that took no labels are one row with their control.
-    """
-    stages, found = results["stages"], {}
-    names = {stage: stage for stage in stages}
+def run_tables(results: Mapping[str, Any]) -> list[Table]:
+    """Return `score_tables` of a run; stages that used no labels share a row with their control."""
+    names = {stage: stage for stage in results["stages"]}
     if not used_labels(results):
         targets = results["config"].get("targets")
         gated = {"closeup": "control"}
@@ -85,35 +84,72 @@ def tables(results: Mapping[str, Any]) -> dict[str, tuple[list[str], list[list[s
             if stage in names and control in names:
                 del names[stage]
                 names[control] = f"{control}, {stage}"
+    return score_tables(results["stages"], finer_size=results["finer_resolution"], names=names)
+
+
+def score_tables(
+    stages: Mapping[str, Splits],
+    *,
+    finer_size: tuple[int, int] | None,
+    names: Mapping[str, str] | None = None,
+    row: str = "stage",
+) -> list[Table]:
+    """Return a table of at most six columns for each kind of view.
+
+    Args:
+      stages: metrics by stage and split.
+      finer_size: width and height of the finer views, or None without any.
+      names: text of each stage that has a row; default: all stages, by their names.
+      row: what a row is.
+    """
+    tables = []
     for split, title in SPLIT_TITLES.items():
         scores = {stage: splits[split] for stage, splits in stages.items() if split in splits}
         if not scores or split.endswith(FINER):
             continue
-        finer = {stage: splits.get(split + FINER, {}) for stage, splits in stages.items()}
-
-        def first_known(keys, scores=scores):
-            known = (k for k in keys if any(one.get(k) is not None for one in scores.values()))
-            return next(known, None)
-
+        finer = {stage: stages[stage].get(split + FINER, {}) for stage in scores}
         columns = [(COLUMNS["psnr"], "psnr", scores)]
-        if any(one.get("psnr") is not None for one in finer.values()):
-            width, height = results["finer_resolution"]
-            columns.append((f"at {width} x {height}", "psnr", finer))
+        if finer_size and _known(finer, ["psnr"]):
+            columns.append((f"at {finer_size[0]} x {finer_size[1]}", "psnr", finer))
         columns.append((COLUMNS["ssim"], "ssim", scores))
         for keys in (_LAST, _DEPTH):
-            key = first_known(keys)
-            if key is not None:
-                columns.append((_SHORT.get(key) or COLUMNS[key], key, scores))
+            columns += [
+                (_SHORT.get(key, COLUMNS[key]), key, scores) for key in _known(scores, keys)[:1]
+            ]
         body = [
             [name, *(_cell(key, values[stage].get(key)) for _, key, values in columns)]
-            for stage, name in names.items()
+            for stage, name in (names or {stage: stage for stage in stages}).items()
             if stage in scores
         ]
-        found[title] = ["stage", *(name for name, _, _ in columns)], body
-    return found
+        tables.append(Table(title, [row, *(column for column, _, _ in columns)], body))
+    return tables
 
 
-def _cell(key, value):
+def all_scores(stages: Mapping[str, Splits]) -> Table:
+    """Return all scores: a row for each split and stage."""
+    found = [scores for splits in stages.values() for scores in splits.values()]
+    keys = _known(dict(enumerate(found)), COLUMNS)
+    body = [
+        [title, stage, *(format_metric(key, splits[split].get(key)) for key in keys)]
+        for split, title in SPLIT_TITLES.items()
+        for stage, splits in stages.items()
+        if split in splits
+    ]
+    header = ["views", "stage", *(COLUMNS[key] for key in keys)]
+    return Table("All scores", header, body, names=2)
+
+
+def print_results(results: Mapping[str, Any]) -> None:
+    """Print a run's table of each kind of view, and its conclusion."""
+    print_tables(run_tables(results), conclusion(results))
+
+
+def _known(scores: Mapping[Any, Mapping[str, Any]], keys: Iterable[str]) -> list[str]:
+    """Return the metrics that any of the scores has."""
+    return [key for key in keys if any(one.get(key) is not None for one in scores.values())]
+
+
+def _cell(key: str, value: float | None) -> str:
     if key in _DEPTH and value is not None:
         return f"{value:.2%}"
     return format_metric(key, value)

@@ -1,8 +1,8 @@
-"""The pictures of a run: comparisons of its stages with the true images, and pseudo-labels."""
+"""Draw the pictures of a run: its stages beside the true images, and its pseudo-labels."""
 
 import pathlib
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -46,7 +46,8 @@ def comparisons(
     Returns:
       The pictures, for the report.
     """
-    pictures, written = [], set()
+    pictures: list[Picture] = []
+    written: set[str] = set()
     # Finer views show the same, larger.
     shown = {split: views for split, views in targets.items() if split + FINER not in targets}
     for split, views in shown.items():
@@ -63,14 +64,14 @@ def comparisons(
     return pictures
 
 
-def _comparison(truth, seen):
-    """The true image, `seen` stage by stage, and the error of the last one."""
+def _comparison(truth: np.ndarray, seen: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Draw the true image, the render of each stage in `seen`, and the error of the last one."""
     last = list(seen)[-1]
     error = colorize_error(np.abs(seen[last] - truth).mean(axis=-1))
     return _row({"truth": truth, **seen, f"error of {last}": error})
 
 
-def _row(panels):
+def _row(panels: Mapping[str, np.ndarray | jax.Array]) -> np.ndarray:
     return side_by_side(map(enlarge, panels.values()), labels=list(panels))
 
 
@@ -105,34 +106,77 @@ def label_pictures(
     Returns:
       The pictures, for the report.
     """
-    sample = jax.jit(sample_virtual_camera)
-    sizes = scene.sizes("train")
-    shots: list[tuple[str, Camera, jax.Array, Any, Any, tuple[int, int]]] = []
-    for i, one in enumerate(jax.random.split(key, SHOWN_LABELS)):
-        camera, index = sample(one, sources, settings)
-        truth = scene.surface(camera).rgb if scene.surface else None
-        # A virtual camera has the lens of its source, and as many pixels.
-        shots.append(
-            (f"virtual_{i}", camera, render_depth(camera), index, truth, sizes[int(index)])
-        )
-    nearest = jax.jit(best_source)
-    for target in targets[:SHOWN_LABELS]:
-        depth = render_depth(target.camera)
-        index = nearest(target.camera, sources.views, sources.depths, depth=depth)
-        own = target.rgb.shape[1::-1]
-        shots.append((f"closeup_{target.name}", target.camera, depth, index, target.rgb, own))
+    shots = [
+        *_virtual_shots(key, scene, sources, settings, render_depth),
+        *_closeup_shots(targets[:SHOWN_LABELS], sources, render_depth),
+    ]
     pictures = []
-    for name, camera, depth, index, truth, (width, height) in shots:
-        pixels = pixel_grid(camera.height, camera.width)
-        label = label_pixels(camera, pixels, depth, index, sources, settings)
-        kept = np.where(label.weight[..., None] > 0, label.rgb, 0)
-        panels = {"backward warp": label.backward, "forward warp": label.forward, "kept": kept}
-        panels["mask"] = np.repeat(np.asarray(label.weight)[..., None], 3, axis=-1)
-        panels["rendered depth"] = colorize_depth(depth, near=scene.near, far=scene.far)
-        if truth is not None:
-            panels["truth"] = np.asarray(truth)
+    for shot in shots:
+        pixels = pixel_grid(shot.camera.height, shot.camera.width)
+        label = label_pixels(shot.camera, pixels, shot.depth, shot.source, sources, settings)
+        panels = {
+            "backward warp": label.backward,
+            "forward warp": label.forward,
+            "kept": np.where(label.weight[..., None] > 0, label.rgb, 0),
+            "mask": np.repeat(np.asarray(label.weight)[..., None], 3, axis=-1),
+            "rendered depth": colorize_depth(shot.depth, near=scene.near, far=scene.far),
+        }
+        if shot.truth is not None:
+            panels["truth"] = np.asarray(shot.truth)
+        width, height = shot.size
         image = _row({title: panel[:height, :width] for title, panel in panels.items()})
-        write_png(folder / f"{name}.png", image)
-        source = scene.names["train"][int(index)]
-        pictures.append(Picture("Pseudo-labels", f"{name}, from {source}", image))
+        write_png(folder / f"{shot.name}.png", image)
+        photograph = scene.names["train"][int(shot.source)]
+        pictures.append(Picture("Pseudo-labels", f"{shot.name}, from {photograph}", image))
     return pictures
+
+
+class _Shot(NamedTuple):
+    """A camera to label.
+
+    Attributes:
+      name: name of its picture.
+      camera: the camera, perhaps padded.
+      depth: `[H, W]` its z-depth.
+      source: index of the photograph that the backward warp reads.
+      truth: `[H, W, 3]` its true image, or None.
+      size: its width and height without padding.
+    """
+
+    name: str
+    camera: Camera
+    depth: jax.Array
+    source: jax.Array
+    truth: jax.Array | None
+    size: tuple[int, int]
+
+
+def _virtual_shots(
+    key: jax.Array,
+    scene: Scene,
+    sources: LabelSources,
+    settings: PseudoSettings,
+    render_depth: Callable[[Camera], jax.Array],
+) -> Iterator[_Shot]:
+    """Draw virtual cameras, each with the lens and the size of its source."""
+    sample, sizes = jax.jit(sample_virtual_camera), scene.sizes("train")
+    for i, camera_key in enumerate(jax.random.split(key, SHOWN_LABELS)):
+        camera, source = sample(camera_key, sources, settings)
+        truth = scene.surface(camera).rgb if scene.surface else None
+        size = sizes[int(source)]
+        yield _Shot(f"virtual_{i}", camera, render_depth(camera), source, truth, size)
+
+
+def _closeup_shots(
+    targets: Sequence[Target],
+    sources: LabelSources,
+    render_depth: Callable[[Camera], jax.Array],
+) -> Iterator[_Shot]:
+    """Choose the source of each held-out close-up."""
+    nearest = jax.jit(best_source)
+    for target in targets:
+        depth = render_depth(target.camera)
+        source = nearest(target.camera, sources.views, sources.depths, depth=depth)
+        height, width = target.weight.shape
+        name = f"closeup_{target.name}"
+        yield _Shot(name, target.camera, depth, source, target.rgb, (width, height))

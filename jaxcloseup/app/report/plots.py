@@ -58,7 +58,7 @@ def line_plot(
         figure, axes = plt.subplots(figsize=(6.5, 3.6), layout="constrained")
         for curve, marker in zip(curves, "os^Dvx*P" * len(curves), strict=False):
             (line,) = axes.plot(curve.x, curve.y, marker=marker, label=curve.name, markersize=4)
-            if curve.low is not None:
+            if curve.low is not None and curve.high is not None:
                 axes.fill_between(
                     curve.x, curve.low, curve.high, color=line.get_color(), alpha=0.15, linewidth=0
                 )

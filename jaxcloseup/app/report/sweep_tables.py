@@ -5,6 +5,7 @@ The standard deviation measures how the mean varies with the seed.
 """
 
 import csv
+import dataclasses
 import io
 import itertools
 import pathlib
@@ -12,32 +13,33 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
-from jaxcloseup.app.report.page import Picture, figures, head, table
+from jaxcloseup.app.report.page import Picture, by_section, fill_page
 from jaxcloseup.app.report.plots import Curve, line_plot
+from jaxcloseup.app.report.table import Table, format_number, markdown, print_tables
 from jaxcloseup.app.score.ladder import MAGNIFICATIONS, PREFIX
 from jaxcloseup.app.score.metrics_text import SPLIT_TITLES
 from jaxcloseup.io.files import write_file, write_json
 
 
 RESAMPLES = 4000
+Scenes = Mapping[str, Mapping[str, Any]]  # scores of `run_sweep` by scene
 
 
-class Row(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Row:
     """One arm on one split.
 
     Attributes:
       arm: name of the arm.
       split: name of the split.
       psnr: mean PSNR over scenes, seeds and views, in dB.
-      spread: standard deviation over seeds of the mean PSNR over scenes and views. Only seeds that
-        have all views count; None for one seed.
+      spread: standard deviation over seeds of the mean PSNR over scenes and views; only seeds with
+        all views count. None for one seed.
       ssim: mean SSIM.
       lpips: mean LPIPS with VGG.
       gain: mean difference of PSNR from control in dB, or None without control.
-      low: lower end of the 95 % interval of `gain`; None for a single view.
+      low: lower end of the 95 % interval of `gain`, or None for a single view.
       high: upper end of that interval.
       count: number of images in the means, over scenes, seeds and views.
       skipped: number of steps that were not finite, over seeds and scenes.
@@ -75,48 +77,49 @@ def paired_bootstrap(
     return float(low), float(high)
 
 
-def rows(scenes: Mapping[str, Mapping[str, Any]]) -> list[Row]:
-    """Return a row for each split and arm.
-
-    Args:
-      scenes: the scores of `run_sweep` by scene.
-    """
-    table = []
+def rows(scenes: Scenes) -> list[Row]:
+    """Return a row for each split and arm."""
     arms = _arms(scenes)
-    for split in SPLIT_TITLES:
-        for arm in arms:
-            psnr = _by_view(scenes, arm, split, "psnr")
-            if not psnr:
-                continue
-            by_seed: dict[str, list[float]] = {}
-            for (_, seed, _), value in psnr.items():
-                by_seed.setdefault(seed, []).append(value)
-            most = max(map(len, by_seed.values()))
-            seeds = [float(np.mean(values)) for values in by_seed.values() if len(values) == most]
-            skipped = sum(
-                result["skipped"]
-                for by_arm in scenes.values()
-                for result in by_arm.get(arm, {}).values()
-            )
-            table.append(
-                Row(
-                    arm,
-                    split,
-                    float(np.mean(list(psnr.values()))),
-                    float(np.std(seeds, ddof=1)) if len(seeds) > 1 else None,
-                    *(_mean(scenes, arm, split, metric) for metric in ("ssim", "lpips_vgg")),
-                    *(gain_over_control(scenes, arm, split) or (None, None, None)),
-                    len(psnr),
-                    skipped,
-                )
-            )
-    return table
+    found = (_row(scenes, arm, split) for split in SPLIT_TITLES for arm in arms)
+    return [row for row in found if row is not None]
 
 
-def gain_over_control(
-    scenes: Mapping[str, Mapping[str, Any]], arm: str, split: str
-) -> tuple[float, float | None, float | None] | None:
-    """Return an arm's mean PSNR difference from control and its 95 % interval; None if unknown."""
+def _row(scenes: Scenes, arm: str, split: str) -> Row | None:
+    psnr = _by_view(scenes, arm, split, "psnr")
+    if not psnr:
+        return None
+    by_seed: dict[str, list[float]] = {}
+    for (_, seed, _), value in psnr.items():
+        by_seed.setdefault(seed, []).append(value)
+    most = max(map(len, by_seed.values()))
+    seeds = [float(np.mean(values)) for values in by_seed.values() if len(values) == most]
+    results = [result for by_arm in scenes.values() for result in by_arm.get(arm, {}).values()]
+    gain = gain_over_control(scenes, arm, split)
+    return Row(
+        arm=arm,
+        split=split,
+        psnr=float(np.mean(list(psnr.values()))),
+        spread=float(np.std(seeds, ddof=1)) if len(seeds) > 1 else None,
+        ssim=_mean(scenes, arm, split, "ssim"),
+        lpips=_mean(scenes, arm, split, "lpips_vgg"),
+        gain=gain and gain.mean,
+        low=gain and gain.low,
+        high=gain and gain.high,
+        count=len(psnr),
+        skipped=sum(result["skipped"] for result in results),
+    )
+
+
+class Gain(NamedTuple):
+    """Mean PSNR difference of an arm from control, and its 95 % interval; None for one view."""
+
+    mean: float
+    low: float | None
+    high: float | None
+
+
+def gain_over_control(scenes: Scenes, arm: str, split: str) -> Gain | None:
+    """Return an arm's gain over control on the views that both have; None without such views."""
     if arm == "control":
         return None
     control = _by_view(scenes, "control", split, "psnr")
@@ -127,38 +130,44 @@ def gain_over_control(
     if not pairs:
         return None
     groups = [np.array(group) for group in pairs.values()]
-    return float(np.mean([group.mean() for group in groups])), *paired_bootstrap(groups)
+    low, high = paired_bootstrap(groups)
+    return Gain(float(np.mean([group.mean() for group in groups])), low, high)
 
 
-def gain_curves(scenes: Mapping[str, Mapping[str, Any]]) -> list[Curve]:
+def gain_curves(scenes: Scenes) -> list[Curve]:
     """Return each arm's gain over control against magnification, with its 95 % interval."""
     curves = []
     for arm in _arms(scenes):
-        found = {}
-        for m in MAGNIFICATIONS:
-            gain = gain_over_control(scenes, arm, f"{PREFIX}{m:g}")
-            if gain is not None:
-                found[m] = gain
-        if found:
-            gains, lows, highs = map(list, zip(*found.values(), strict=True))
-            known = (lows, highs) if None not in lows else ()
-            curves.append(Curve(arm, list(found), gains, *known))
+        gains = {m: gain_over_control(scenes, arm, f"{PREFIX}{m:g}") for m in MAGNIFICATIONS}
+        known = {m: gain for m, gain in gains.items() if gain is not None}
+        if known:
+            lows = [gain.low for gain in known.values() if gain.low is not None]
+            highs = [gain.high for gain in known.values() if gain.high is not None]
+            whole = len(lows) == len(known)
+            curves.append(
+                Curve(
+                    name=arm,
+                    x=list(known),
+                    y=[gain.mean for gain in known.values()],
+                    low=lows if whole else None,
+                    high=highs if whole else None,
+                )
+            )
     return curves
 
 
-def print_sweep(scenes: Mapping[str, Mapping[str, Any]]) -> None:
+def print_sweep(scenes: Scenes) -> None:
     """Print a table for each split."""
-    header, *body = _cells(rows(scenes))
-    for title, lines in itertools.groupby(body, key=lambda line: line[0]):
-        table = Table(*header[1:], title=title)
-        for line in lines:
-            table.add_row(*line[1:])
-        Console().print(table)
+    table = score_table(rows(scenes))
+    by_split = itertools.groupby(table.rows, key=lambda line: line[0])
+    print_tables(
+        [Table(title, table.header[1:], [line[1:] for line in lines]) for title, lines in by_split]
+    )
 
 
 def write_sweep(
     folder: pathlib.Path,
-    scenes: Mapping[str, Any],
+    scenes: Scenes,
     about: Mapping[str, Any],
     pictures: Sequence[Picture] = (),
 ) -> None:
@@ -170,61 +179,63 @@ def write_sweep(
       about: method, preset and other facts about the sweep.
       pictures: pictures for the report.
     """
-    found = rows(scenes)
     write_json(folder / "sweep.json", {"scenes": scenes, **about})
-    header, *body = _cells(found)
-    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
-    lines += ["| " + " | ".join(line) + " |" for line in body]
-    write_file(folder / "table.md", "\n".join([*lines, ""]).encode())
+    found = rows(scenes)
+    table, curves = score_table(found), gain_curves(scenes)
+    write_file(folder / "table.md", markdown(table).encode())
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(Row._fields)
-    writer.writerows(found)
+    writer.writerow(field.name for field in dataclasses.fields(Row))
+    writer.writerows(map(dataclasses.astuple, found))
     write_file(folder / "table.csv", text.getvalue().encode())
-    title = f"Sweep: {about['method']}, preset {about['preset']}, {', '.join(scenes)}"
-    parts = [
-        *head(title),
-        "<p>The table shows the mean of each metric over scenes, seeds and views, and the standard "
-        "deviation of PSNR over seeds (s.d.). Higher PSNR and SSIM and lower LPIPS are better. "
-        "<i>control</i> continues the baseline without labels. The gain is an arm's PSNR above "
-        "<i>control</i> on the same views, with a 95 % bootstrap interval over views: an arm "
-        "helps if its whole interval is above 0. n is the number of images, and skipped is the "
-        "number of steps that were not finite. All arms take the same number of steps, except "
-        "<i>baseline</i>, which takes none, and <i>test_time</i>, which has its own number.</p>",
-        table(header, body, names=2),
-    ]
-    curves = gain_curves(scenes)
-    if curves:
-        parts += [
-            "<h2>Gain by magnification</h2><p>Cameras move up to 16 times nearer to points of the "
-            "ordinary views; at 0.5 they have half the focal length. The plot shows each arm's "
-            "PSNR above <i>control</i>, with its 95 % interval shaded: an arm helps where its "
-            "curve is above 0.</p>",
-            "<div class=plots>",
-            line_plot(
-                curves,
-                x="magnification (times nearer)",
-                y="PSNR above control (dB)",
-                title="Gain",
-                doubling=True,
-                level=0,
-            ),
-            "</div>",
-        ]
-    parts += [*figures(pictures), "</html>"]
-    write_file(folder / "report.html", "\n".join(parts).encode())
+    gain_plot = curves and line_plot(
+        curves,
+        x="magnification (times nearer)",
+        y="PSNR above control (dB)",
+        title="Gain",
+        doubling=True,
+        level=0,
+    )
+    page = fill_page(
+        "sweep.html",
+        title=f"Sweep: {about['method']}, preset {about['preset']}, {', '.join(scenes)}",
+        scores=table,
+        gain_plot=gain_plot,
+        pictures=by_section(pictures),
+    )
+    write_file(folder / "report.html", page)
 
 
-def _arms(scenes):
+def score_table(found: Sequence[Row]) -> Table:
+    """Return the table of all rows."""
+    columns = {
+        "views": [SPLIT_TITLES[row.split] for row in found],
+        "arm": [row.arm for row in found],
+        "PSNR (dB)": [format_number(row.psnr) for row in found],
+        "s.d.": [format_number(row.spread) for row in found],
+        "SSIM": [format_number(row.ssim, "{:.4f}") for row in found],
+        "LPIPS": [format_number(row.lpips, "{:.4f}") for row in found],
+        "gain (dB)": [format_number(row.gain, "{:+.3f}") for row in found],
+        "95 %": ["-" if row.low is None else f"{row.low:+.3f} to {row.high:+.3f}" for row in found],
+        "n": [str(row.count) for row in found],
+        "skipped": [str(row.skipped) for row in found],
+    }
+    body = [list(line) for line in zip(*columns.values(), strict=True)]
+    return Table("Scores", list(columns), body, names=2)
+
+
+def _arms(scenes: Scenes) -> list[str]:
     return list(dict.fromkeys(arm for by_arm in scenes.values() for arm in by_arm))
 
 
-def _mean(scenes, arm, split, metric):
+def _mean(scenes: Scenes, arm: str, split: str, metric: str) -> float | None:
     values = list(_by_view(scenes, arm, split, metric).values())
     return float(np.mean(values)) if values else None
 
 
-def _by_view(scenes, arm, split, metric):
+def _by_view(
+    scenes: Scenes, arm: str, split: str, metric: str
+) -> dict[tuple[str, str, str], float]:
     """Return a metric by (scene, seed, view), where it is known."""
     return {
         (scene, seed, view): values[metric]
@@ -233,37 +244,3 @@ def _by_view(scenes, arm, split, metric):
         for view, values in result["splits"].get(split, {"views": {}})["views"].items()
         if values.get(metric) is not None
     }
-
-
-def _cells(found):
-    def number(value, pattern="{:.2f}"):
-        return "-" if value is None else pattern.format(value)
-
-    body = [
-        [
-            SPLIT_TITLES[row.split],
-            row.arm,
-            number(row.psnr),
-            number(row.spread),
-            number(row.ssim, "{:.4f}"),
-            number(row.lpips, "{:.4f}"),
-            number(row.gain, "{:+.3f}"),
-            "-" if row.low is None else f"{row.low:+.3f} to {row.high:+.3f}",
-            str(row.count),
-            str(row.skipped),
-        ]
-        for row in found
-    ]
-    header = [
-        "views",
-        "arm",
-        "PSNR (dB)",
-        "s.d.",
-        "SSIM",
-        "LPIPS",
-        "gain (dB)",
-        "95 %",
-        "n",
-        "skipped",
-    ]
-    return [header, *body]
