@@ -1,7 +1,5 @@
 """Numbers that float32 cannot hold, alone or beside a capture's others."""
 
-import re
-
 import numpy as np
 import pytest
 from tiny_capture import (
@@ -34,55 +32,12 @@ def moved(*position):
     return pose.tolist()
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        (
-            {"transform_matrix": moved(1e300, 0, 0)},
-            "transform_matrix holds a value that is not fin",
-        ),
-        ({"transform_matrix": moved(1e30, 0, 0)}, "camera lies 1e+30 from the origin, too far"),
-        (
-            {"transform_matrix": moved(5e6, 2, 3)},
-            "camera lies 5e+06 from the origin of a scene 9 l",
-        ),
-        ({"fx": 1e39}, "fx is too large for 32 bits, 1e+39: correct it"),
-        ({"fx": 1e-50}, "fx must be greater than 0, got 1e-50"),
-        (
-            {"fx": 1e31},
-            "a focal length of 1e+31 pixels is not between 0.01 and 10000 times the lon",
-        ),
-        ({"fy": 0.01}, "a focal length of 0.01 pixels is not between"),
-        ({"fx": 1e31, "k1": 0.1}, "a focal length of 1e+31 pixels is not between"),
-        ({"fx": 1e31, "w": 8, "h": 6}, "a focal length of 1e+31 pixels is not between"),
-        ({"cx": 1e39}, "cx is too large for 32 bits"),
-        (
-            {"cy": -1e6},
-            "the principal point 4, -1e+06 lies more than 100 times the longer side out",
-        ),
-    ],
-)
-def test_cameras_that_float32_cannot_hold(capture, changes, message):
-    frames = [frame("train/a.png"), frame("train/b.png", **changes)]
-    write_json(capture / "transforms_train.json", frames)
-    with pytest.raises(SceneError, match=re.escape(message)) as error:
-        load_scene(capture)
-    assert "train/b.png" in str(error.value)
-
-
 def test_lenses_of_cached_photographs_are_checked(capture):
     load_scene(capture, downscale=2)
     frames = [frame("train/a.png"), frame("train/b.png", fx=1e31)]
     write_json(capture / "transforms_train.json", frames)
     with pytest.raises(SceneError, match="a focal length of"):
         load_scene(capture, downscale=2)
-
-
-@pytest.mark.parametrize("given", [{"near": 1e-30}, {"far": 1e30}, {"far": 1e39}])
-def test_depths_that_float32_cannot_hold(capture, given):
-    write_json(capture / "transforms_train.json", [frame("train/a.png")], **given)
-    with pytest.raises(SceneError, match=r"must lie between 1e-12 and 1e\+12|too large for 32"):
-        load_scene(capture)
 
 
 def test_coordinates_of_a_map_need_another_origin(tmp_path):

@@ -8,7 +8,7 @@ import pytest
 from ray_world import LENS, SIZE, photograph, seen, turned
 from tiny_capture import frame, write_image, write_json
 
-from jaxcloseup.captures.load import SceneError, load_scene
+from jaxcloseup.captures.load import load_scene
 
 
 @pytest.fixture
@@ -96,18 +96,3 @@ def test_the_close_up_is_the_crop_with_the_most_weighted_detail(tmp_path):
     scene = load_scene(tmp_path, split="zoom")
     assert scene.metadata["corners"] == [(24, 6)]
     np.testing.assert_array_equal(scene.test.weight[0] * 255, mask[6:12, 24:32])
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"zoom": 4}, "zoom needs split 'zoom', but split is 'given': leave out zoom"),
-        ({"split": "zoom", "zoom": 1}, "zoom must be a whole number of at least 2, got 1"),
-        ({"split": "zoom", "zoom": 2.5}, "zoom must be a whole number of at least 2, got 2.5"),
-        ({"split": "zoom", "zoom": True}, "zoom must be a whole number of at least 2, got True"),
-        ({"split": "zoom", "downscale": 9}, r"47 x 35 pixels, and downscale 9 times zoom 4 leaves"),
-    ],
-)
-def test_wrong_zooms(capture, options, message):
-    with pytest.raises(SceneError, match=message):
-        load_scene(capture, **options)

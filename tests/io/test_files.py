@@ -1,11 +1,11 @@
-"""Strict JSON files."""
+"""Files: strict JSON, whole or not at all, and only ordinary ones of a stated size."""
 
 import json
 import math
 
 import pytest
 
-from jaxcloseup.io.files import strict, write_json
+from jaxcloseup.io.files import check_file, read_bytes, strict, write_json
 
 
 VALUE = {"psnr": [1.5, math.nan], "views": {"a": (math.inf, -math.inf)}, "name": "x", "count": 3}
@@ -31,3 +31,14 @@ def test_an_unwritable_path_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match=r"file/a\.json cannot be written"):
         write_json(tmp_path / "file" / "a.json", {})
+
+
+def test_devices_folders_and_large_files_are_not_read(tmp_path):
+    with pytest.raises(OSError, match="Not an ordinary file"):
+        read_bytes("/dev/zero")
+    with pytest.raises(IsADirectoryError, match="Is a directory"):
+        check_file(tmp_path)
+    (tmp_path / "a").write_bytes(b"12345")
+    assert read_bytes(tmp_path / "a", most=5) == b"12345"
+    with pytest.raises(OSError, match=r"More than 3\.8147e-06 MiB"):
+        read_bytes(tmp_path / "a", most=4)

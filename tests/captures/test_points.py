@@ -1,0 +1,95 @@
+"""Points from PLY files."""
+
+import numpy as np
+import pytest
+from tiny_capture import PROPERTIES, vertices, write_ply
+
+from jaxcloseup.captures.load import SceneError
+from jaxcloseup.captures.points import read_ply_points
+from jaxcloseup.photos.scene import PointsWarning
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize("color", ["u1", "u2", "f4"])
+def test_ply_encodings(tmp_path, encoding, color):
+    properties = [("blue", color), ("nx", "f4"), *PROPERTIES[:3][::-1], ("segment", "i4")]
+    properties += [("red", color), ("green", color)]
+    rows = vertices(properties)
+    write_ply(tmp_path / "p.ply", rows, encoding, after=b"3 0 1 2\n")
+    points, rgb = read_ply_points(tmp_path / "p.ply")
+    scale = {"u1": 255, "u2": 65535, "f4": 1}[color]
+    assert points.dtype == rgb.dtype == np.float32
+    np.testing.assert_allclose(points, np.stack([rows[axis] for axis in "xyz"], -1), rtol=1e-6)
+    for channel, name in enumerate(("red", "green", "blue")):
+        np.testing.assert_allclose(rgb[:, channel], rows[name] / scale, rtol=1e-5)
+
+
+def test_ply_oddities(tmp_path):
+    rows = vertices(PROPERTIES[:3])
+    rows["y"][1] = np.nan
+    write_ply(tmp_path / "p.ply", rows, "ascii", newline="\r\n")
+    with pytest.warns(PointsWarning, match="1 of 5 points are not finite"):
+        points, rgb = read_ply_points(tmp_path / "p.ply")
+    assert points.shape == (4, 3) and (rgb == 0.5).all()
+    rows = vertices([*PROPERTIES[:3], ("red", "f4"), ("green", "f4"), ("blue", "f4")])
+    rows["red"] = 255
+    write_ply(tmp_path / "p.ply", rows)
+    assert (read_ply_points(tmp_path / "p.ply")[1][:, 0] == 1).all()
+    write_ply(tmp_path / "p.ply", vertices(count=0))
+    assert read_ply_points(tmp_path / "p.ply")[0].shape == (0, 3)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
+def test_ply_cut_short_or_claiming_more(tmp_path, encoding):
+    write_ply(tmp_path / "p.ply", vertices(), encoding)
+    data = (tmp_path / "p.ply").read_bytes()
+    for cut in (20, 60):
+        (tmp_path / "p.ply").write_bytes(data[:-cut])
+        with pytest.raises(SceneError, match=r"p\.ply ends before its 5 vertices do"):
+            read_ply_points(tmp_path / "p.ply")
+    for count in (10**12, 10**30):
+        claim = b"vertex %d" % count
+        (tmp_path / "p.ply").write_bytes(data.replace(b"vertex 5", claim))
+        with pytest.raises(SceneError, match=f"ends before its {count} vertices do"):
+            read_ply_points(tmp_path / "p.ply")
+
+
+XYZ = (
+    "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\n"
+    "property float z\n{}end_header\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is not a PLY file"),
+        ("hello\nend_header\n", "is not a PLY file"),
+        ("ply\nformat gzip 1.0\nend_header\n", "is not a PLY file"),
+        ("ply\nformat ascii 1.0\nelement face 1\nend_header\n", "does not begin with vertices"),
+        ("ply\nformat ascii 1.0\nend_header\n", "does not begin with vertices"),
+        (
+            "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
+            "plain properties x, y, z",
+        ),
+        (
+            "ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n1\n",
+            "plain properties x, y, z",
+        ),
+        (XYZ.format(-1, ""), "a count of -1"),
+        (XYZ.format(1, "property float x\n") + "1 2 3 4\n", "a property name appears twice"),
+        (XYZ.format(1, "") + "a b c\n", "has words instead of numbers"),
+        *(
+            (XYZ.format(count, "") + "1 2 3\n", f"ends before its {count} vertices do")
+            for count in (2, 10**12, 10**30)
+        ),
+        *(
+            (XYZ.format(1, "property uchar red\n") + f"1 2 3 {red}\n", "numbers beyond their type")
+            for red in ("300", "inf", "nan")
+        ),
+    ],
+)
+def test_ply_errors(tmp_path, text, message):
+    (tmp_path / "p.ply").write_text(text)
+    with pytest.raises(SceneError, match=message):
+        read_ply_points(tmp_path / "p.ply")
