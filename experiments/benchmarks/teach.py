@@ -19,16 +19,19 @@ import numpy as np
 from jaxcloseup.app.run.kept_detail import detail_path, find_detail
 from jaxcloseup.app.score.expected_errors import error_tenths
 from jaxcloseup.app.store.stored_run import choose_stage, load_run_scene, read_run, restore
-from jaxcloseup.detail.add import find_candidates, testify
-from jaxcloseup.detail.weights import (
+from jaxcloseup.detail.add import find_candidates
+from jaxcloseup.detail.learn import (
     PIXELS,
-    DetailWeights,
     Evidence,
+    learn_weights,
+    make_evidence,
+    sample_evidence,
+)
+from jaxcloseup.detail.weights import (
+    DetailWeights,
     blend,
     expected_errors,
-    learn_weights,
     one_network,
-    sample_evidence,
     write_known,
 )
 from jaxcloseup.geometry.cameras import pixel_grid
@@ -73,7 +76,7 @@ def run_evidence(folder: pathlib.Path) -> tuple[str, list[Evidence]]:
         pixels = pixel_grid(camera.height, camera.width)
         found = find_candidates(detail, camera, pixels, seen.rgb, seen.alpha, depth)
         own = to_float(views.rgb[index]) - jnp.clip(seen.rgb, 0, 1)
-        told = testify(found, own, jnp.asarray(views.weight[index]))
+        told = make_evidence(found, own, jnp.asarray(views.weight[index]))
         return sample_evidence(told, PIXELS // len(views), seed=index)
 
     kinds = _held_out(scene, programs.preset.score_downscale)
@@ -92,7 +95,9 @@ def _describe(weights: DetailWeights, views: Sequence[Evidence]) -> str:
     """PSNR of all pixels before and after, and how right the expected errors are."""
     found = jax.tree.map(lambda *rows: np.concatenate(rows), *views)
     mixed, share = blend(weights, *map(jnp.asarray, found[:3]))
-    errors = [np.abs(own) for own in (found.own, found.own - np.asarray(share[:, None] * mixed))]
+    errors = [
+        np.abs(off) for off in (found.missing, found.missing - np.asarray(share[:, None] * mixed))
+    ]
     before, after = (-10 * np.log10(np.mean(error**2)) for error in errors)
     expected = np.asarray(expected_errors(weights, jnp.asarray(found.features)))[:, 1]
     tenths = error_tenths(expected, errors[1].mean(-1), found.weight)

@@ -1,7 +1,7 @@
-"""Holes: places of a view that no photograph shows, filled with the colors around them.
+"""Holes: pixels of a view that no photograph shows, filled with the colors around them.
 
-Where a view looks past all photographs, nothing stops its rays, and its render fades to black. A
-smooth continuation of what is around is nearer to the truth, and to what people expect.
+Rays that leave the part of the scene that was photographed meet no surface, so their pixels fade to
+black. A smooth continuation of the surroundings is nearer to the truth.
 """
 
 import jax
@@ -13,23 +13,23 @@ from jaxcloseup.geometry.warp import backward_warp
 from jaxcloseup.photos.gather import GatherSources
 
 
-OPAQUE = 0.9  # opacity from which a render is whole
-_PHOTOGRAPHS = 3  # that look through a place before it counts as empty; fewer may err
-_DEPTHS = 16  # places on a ray that are tried,
-_REACH = 3.0  # as many powers of two nearer and farther than what photographs see
-_RAYS = 120  # across an image that are tried
-_ACROSS = 20  # pixels of a small image whose blur makes rims of holes
+OPAQUE = 0.9  # opacity from which a render counts as opaque
+_PHOTOGRAPHS = 3  # photographs that must see through a place that counts as empty; fewer may err
+_DEPTHS = 16  # places that are tried on a ray,
+_REACH = 3.0  # from 2**-3 to 2**3 times the typical depth of the photographs
+_RAYS = 120  # rays that are tried across an image
+_ACROSS = 20  # width in pixels of the small image whose enlargement blurs the rims of holes
 
 
 def find_empty(camera: Camera, pixels: jax.Array, sources: GatherSources) -> jax.Array:
-    """Pixels `[H, W]` whose rays lead through a place behind which several photographs see nothing.
+    """Return the pixels `[H, W]` whose rays pass a place behind which photographs see nothing.
 
-    Dark surfaces may be learned as transparent, so the blackness of these pixels may be the truth.
+    Dark surfaces may be learned as transparent, so these pixels may truly be black.
 
     Args:
       camera: camera of the view.
       pixels: `[H, W, 2]` its pixel centers, neighbors in the image.
-      sources: depth maps of the photographs; 0 is undefined, where a photograph sees nothing.
+      sources: depth maps of the photographs; an inverse depth of 0 means that nothing was seen.
     """
     (height, width), step = pixels.shape[:2], max(1, round(pixels.shape[1] / _RAYS))
     pixels, known = pixels[::step, ::step], sources.inverse_depth > 0
@@ -37,10 +37,10 @@ def find_empty(camera: Camera, pixels: jax.Array, sources: GatherSources) -> jax
     log_depth = -jnp.log2(jnp.where(known, sources.inverse_depth, 1))
     typical = safe_divide(jnp.sum(log_depth), jnp.sum(known, dtype=log_depth.dtype))
 
-    def at_depth(depth):
+    def at_depth(depth: jax.Array) -> jax.Array:
         points = pixels_to_points(camera, pixels, jnp.full(pixels.shape[:2], depth))
 
-        def add(through, photograph):
+        def add(through: jax.Array, photograph: tuple[Camera, jax.Array]) -> tuple[jax.Array, None]:
             view, nothing = photograph
             landed, z = points_to_pixels(view, points)
             sees_nothing = backward_warp(nothing, landed, order=0)[..., 0]
@@ -54,18 +54,18 @@ def find_empty(camera: Camera, pixels: jax.Array, sources: GatherSources) -> jax
 
 
 def fill_holes(rgb: jax.Array, alpha: jax.Array, seen: jax.Array, empty: jax.Array) -> jax.Array:
-    """A render whose holes have the colors around them.
+    """Fill the holes of a render with the colors around them, by a pull-push pyramid.
 
-    A hole is where no photograph saw a surface, or emptiness. What it has of opacity stays, and
-    what is missing is filled; so are its rims, where opacity fades. Colors spread from coarse
-    images to fine ones, as far as a pixel's own color says little (Gortler et al. 1996, section
+    A hole is where no photograph saw a surface, nor emptiness. Its rendered opacity stays, and the
+    rest is filled; so are its rims, where opacity fades. Colors are averaged into coarser images
+    by their weight and flow back to finer pixels of low weight (Gortler et al. 1996, section
     3.4.2).
 
     Args:
       rgb: `[H, W, 3]` colors over black.
       alpha: `[H, W]` opacity.
       seen: `[H, W]` whether a photograph saw the surface.
-      empty: `[H, W]` `find_empty`.
+      empty: `[H, W]` from `find_empty`.
     """
     hole, (height, width) = ~seen & ~empty, seen.shape
     few = max(1, round(_ACROSS * height / width)), _ACROSS
@@ -79,8 +79,8 @@ def fill_holes(rgb: jax.Array, alpha: jax.Array, seen: jax.Array, empty: jax.Arr
     return jnp.clip(rgb + missing[..., None] * around, 0, 1)
 
 
-def _spread(colors, weight):
-    """Colors `[H, W, 3]` as far as their weight `[H, W, 1]` goes, and coarser ones for the rest."""
+def _spread(colors: jax.Array, weight: jax.Array) -> jax.Array:
+    """Mix colors `[H, W, 3]` of weight `[H, W, 1]` with coarser ones, which have the rest."""
     height, width, _ = colors.shape
     if min(height, width) == 1:
         coarse = safe_divide(jnp.sum(weight * colors, (0, 1)), jnp.sum(weight))

@@ -15,22 +15,15 @@ from jaxcloseup.app.run import fine_tuning, gate
 from jaxcloseup.app.run import kept_detail as training_detail
 from jaxcloseup.app.run.fine_tuning import fine_tune, tuned_detail
 from jaxcloseup.app.run.kept_detail import detail_finder, detail_path, detailed, find_detail
-from jaxcloseup.app.run.residuals import _enlarge
+from jaxcloseup.app.run.residuals import enlarge
 from jaxcloseup.app.run.setup import label_closeups, label_targets, start_labels
 from jaxcloseup.app.score.scores import targets_by_split
 from jaxcloseup.app.store.stored_run import load_run_scene, read_run, restore
 from jaxcloseup.captures.load import DRAWN_SCENES, SceneError, load_scene
 from jaxcloseup.detail import weights as detail_weights
-from jaxcloseup.detail.add import FEATURES
-from jaxcloseup.detail.weights import (
-    CONTRAST,
-    Evidence,
-    blend,
-    expected_errors,
-    known_weights,
-    learn_weights,
-    write_known,
-)
+from jaxcloseup.detail.features import FEATURES
+from jaxcloseup.detail.learn import Evidence, learn_weights
+from jaxcloseup.detail.weights import CONTRAST, blend, expected_errors, known_weights, write_known
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.io.cache import Stored, load, save
 from jaxcloseup.photos.pyramids import scene_pyramid
@@ -346,7 +339,7 @@ def test_an_enlarged_render_stays_in_its_place():
         wave = 0.5 + 0.4 * np.sin(4 * (x - cx) / fx) * np.cos(3 * (y - cy) / fy)
         return np.stack([wave, wave**2, 1 - wave], axis=-1).astype(np.float32)
 
-    rgb = _enlarge(image(coarse), coarse, fine)
+    rgb = enlarge(image(coarse), coarse, fine)
     inner = np.s_[6:-6, 6:-6]
     assert np.abs(rgb - image(fine))[inner].max() < 0.006  # a tenth of a coarse pixel
 

@@ -14,7 +14,9 @@ from experiments.benchmarks import teach
 from jaxcloseup.app.score.expected_errors import compare_errors, error_tenths
 from jaxcloseup.app.score.scores import Target
 from jaxcloseup.detail import weights as detail_weights
-from jaxcloseup.detail.add import FEATURES, Detailed
+from jaxcloseup.detail.add import Detailed
+from jaxcloseup.detail.features import FEATURES
+from jaxcloseup.detail.learn import learn_weights
 from jaxcloseup.detail.weights import known_weights
 
 
@@ -24,7 +26,7 @@ def test_runs_of_two_scenes_teach_a_network_each(kept, tmp_path, monkeypatch, ca
         teach, "load_run_scene", lambda record: dataclasses.replace(load(record), name=next(names))
     )
     monkeypatch.setattr(teach, "STAGE", "closeup")
-    quickly = functools.partial(detail_weights.learn_weights, steps=(20, 20))
+    quickly = functools.partial(learn_weights, steps=(20, 20))
     monkeypatch.setattr(teach, "learn_weights", quickly)
     for name in ("a", "b"):
         shutil.copytree(kept, tmp_path / name)

@@ -19,16 +19,15 @@ from jaxcloseup.app import progress
 from jaxcloseup.app.run.manifest import hash_data
 from jaxcloseup.app.run.programs import Programs, describe_photographs
 from jaxcloseup.app.run.residuals import render_residuals, reproduced
-from jaxcloseup.detail.add import Detail, Detailed, add_detail
+from jaxcloseup.detail.add import Detail, Detailed, add_to_rendering, label_with_detail
 from jaxcloseup.detail.weights import known_weights
 from jaxcloseup.fields.contract import Rendering
-from jaxcloseup.geometry.cameras import Camera, pixel_grid
+from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.io.cache import Stored, cached
-from jaxcloseup.labels.rules import label_depth
 from jaxcloseup.photos.gather import GatherSources, gather_sources
 from jaxcloseup.photos.pyramids import Pyramid
 from jaxcloseup.photos.scene import Scene
-from jaxcloseup.photos.views import Views, camera_at
+from jaxcloseup.photos.views import Views
 from jaxcloseup.training.steps import TrainState
 
 
@@ -37,21 +36,18 @@ _RECIPE = 8  # a change of how detail is made raises it, so that kept detail is 
 
 def detailed(programs: Programs, detail: Detail, camera: Camera, rendering: Rendering) -> Detailed:
     """Add detail to a whole image that the programs rendered with `camera`."""
-    pixels = pixel_grid(camera.height, camera.width)
-    depth = label_depth(rendering, near=0, far=programs.scene.far)
-    return add_detail(detail, camera, pixels, rendering.rgb, rendering.alpha, depth)
+    return add_to_rendering(detail, camera, rendering, far=programs.scene.far)
 
 
 def detailed_views(programs: Programs, state: TrainState, detail: Detail, cameras: Camera) -> Views:
     """Renders of stacked cameras `[Q]` with detail; pixels weigh as much as it is trusted."""
-
-    def label(index):
-        camera = camera_at(cameras, index)
-        return detailed(programs, detail, camera, programs.render(state, camera))
-
-    found = list(progress.each(label, range(cameras.intrinsics.shape[0]), "views with detail"))
-    rgb, weight = (jnp.stack([getattr(one, name) for one in found]) for name in ("rgb", "weight"))
-    return Views(cameras, rgb, weight)
+    return label_with_detail(
+        detail,
+        lambda camera: programs.render(state, camera),
+        cameras,
+        far=programs.scene.far,
+        each=lambda label, views: progress.each(label, views, "views with detail"),
+    )
 
 
 FindDetail = Callable[[], tuple[Detail, dict[str, Any]]]

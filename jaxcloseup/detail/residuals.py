@@ -1,0 +1,175 @@
+"""Residuals: photographs, at several sizes, minus a model's renders of their views."""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcloseup.detail.add import Detail
+from jaxcloseup.detail.features import blur_images
+from jaxcloseup.detail.weights import DetailWeights
+from jaxcloseup.fields.contract import Rendering
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.geometry.numerics import matmul
+from jaxcloseup.labels.rules import label_depth
+from jaxcloseup.metrics.image_metrics import change_colors, fit_colors
+from jaxcloseup.photos.gather import gather_sources
+from jaxcloseup.photos.pyramids import Pyramid
+from jaxcloseup.photos.views import Views, camera_at, to_float
+
+
+MISFIT = 4  # times the median error, where a photograph has a quarter of its trust
+COLOR_RIDGE = 0.01  # regularizes the affine map of a photograph's colors, see `fit_colors`
+_BLUR = 1.5  # standard deviation in pixels of errors that lower trust
+
+
+class Residuals(NamedTuple):
+    """What V photographs show beyond a model.
+
+    Attributes:
+      shown: int8 `[V, P, 6]`, see `Detail`.
+      depths: `[V, H, W]` rendered z-depths at the coarsest level, 0 where undefined.
+    """
+
+    shown: Pyramid
+    depths: jax.Array
+
+
+def make_detail(
+    render: Callable[[Camera], Rendering],
+    views: Views,
+    pyramid: Pyramid,
+    weights: DetailWeights,
+    *,
+    near: float = 0.0,
+    far: float = np.inf,
+) -> Detail:
+    """Return the detail of photographs beyond a model that renders every level of a pyramid.
+
+    Args:
+      render: renders a whole image of the model.
+      views: the photographs that the model learned from.
+      pyramid: the same photographs at finer sizes too, see `photograph_pyramid`.
+      weights: such as `known_weights()`.
+      near: smallest z-depth of a surface, world units.
+      far: largest one.
+    """
+    shown, depths = render_residuals(render, views.cameras, pyramid, near=near, far=far)
+    sources = gather_sources(views.cameras, depths, views.weight * reproduced(shown))
+    finer = jnp.float32(np.log2(pyramid.sizes[0][1] / views.cameras.width))
+    return Detail(shown, sources, weights, finer)
+
+
+def render_residuals(
+    render: Callable[[Camera], Rendering],
+    cameras: Camera,
+    pyramid: Pyramid,
+    chosen: Sequence[int] | None = None,
+    *,
+    near: float,
+    far: float,
+    rendered: int = 0,
+    enlarge: Callable[[Any, Camera, Camera], Any] | None = None,
+    each: Callable[[Callable[[int], Any], Sequence[int]], Iterable[Any]] = map,
+) -> Residuals:
+    """Render photographs' views, and subtract the renders from the photographs at every level.
+
+    Exposure is not detail: an affine map first brings each photograph's colors to its render's.
+
+    Args:
+      render: renders a whole image of the model.
+      cameras: stacked `[V]`, of photographs at the size that the model learned from.
+      pyramid: the photographs with their weights; its last level has that size.
+      chosen: indices of the photographs; None takes all.
+      near: smallest z-depth of a surface, world units.
+      far: largest one.
+      rendered: finest level that is rendered; `enlarge` makes finer ones.
+      enlarge: `(rgb, camera, finer_camera) -> rgb` of a render; not called where `rendered` is 0.
+      each: like `map`; may show progress.
+    """
+    last = len(pyramid.sizes) - 1
+    chosen = range(pyramid.values.shape[0]) if chosen is None else chosen
+    values = np.empty((len(chosen), pyramid.values.shape[1], 6), np.int8)
+
+    def compare(view: int) -> tuple[list[tuple[int, np.ndarray]], jax.Array]:
+        """Return the residual of each level, the coarsest first, and the coarsest one's depth."""
+        levels = []
+        for level in range(last, -1, -1):
+            camera = pyramid.camera(camera_at(cameras, view), view, level)
+            photograph = pyramid.image(view, level)
+            if level >= rendered:
+                rendering = render(camera)
+                rgb, shown_by = rendering.rgb, camera
+            else:
+                assert enlarge is not None, "levels that are not rendered need `enlarge`"
+                rgb, shown_by = enlarge(rgb, shown_by, camera), camera
+            if level == last:
+                # The model reproduces the exposure best at the size that it learned from.
+                colors = _match(photograph, rendering.rgb, rendering.alpha)
+                depth = label_depth(rendering, near=near, far=far)
+            levels.append((level, np.asarray(_subtract(photograph, rgb, colors))))
+        return levels, depth
+
+    depths = []
+    for row, (levels, depth) in zip(values, each(compare, chosen), strict=True):
+        depths.append(depth)
+        for level, both in levels:
+            row[pyramid.pixels_of(level)] = both.reshape(-1, 6)
+    intrinsics = pyramid.intrinsics[np.asarray(chosen)]
+    return Residuals(Pyramid(jnp.asarray(values), intrinsics, pyramid.sizes), jnp.stack(depths))
+
+
+def reproduced(
+    shown: Pyramid,
+    *,
+    blur: Callable[[Any, float], Any] = blur_images,
+) -> jax.Array:
+    """Return how far the model reproduces each photograph, `[V, H, W]` in [0, 1].
+
+    Where it fails at the size that it learned from, its depth is not to be trusted either: a
+    floater in front of one camera would otherwise spoil every view that it appears in.
+
+    Args:
+      shown: residuals of V photographs.
+      blur: `(images[V, H, W], deviation) -> [V, H, W]`, a Gaussian blur.
+    """
+    coarsest = shown.level(len(shown.sizes) - 1)[..., :3]
+    error = np.abs(np.asarray(coarsest, np.float32)).mean(-1)
+    error = np.asarray(blur(error, _BLUR))
+    typical = max(float(np.median(error)), 1e-6)
+    return jnp.asarray(1 / (1 + (error / (MISFIT * typical)) ** 4) ** 2, jnp.float32)
+
+
+@jax.jit
+def _match(photograph: jax.Array, rgb: jax.Array, alpha: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the affine change `(matrix, offset)` of a photograph's colors to those of its render.
+
+    It is the inverse of the best change of the render: a blurred render predicts a photograph
+    without bias, but a photograph predicts a blurred render with too little contrast.
+    """
+    values = to_float(photograph)
+    rgb = jnp.clip(rgb, 0, 1)
+    # Pixels that the model misses or invents do not inform about exposure.
+    error = jnp.mean(jnp.abs(values[..., :3] - rgb), axis=-1)
+    typical = jnp.maximum(jnp.median(error), 1e-3)
+    weight = values[..., 3] * alpha**2 / (1 + (error / (2 * typical)) ** 2) ** 2
+    matrix, offset = fit_colors(rgb, values[..., :3], weight, ridge=COLOR_RIDGE)
+    inverse = jnp.linalg.inv(matrix)
+    change = inverse, -matmul(offset[None], inverse)[0]
+    known = jnp.all(jnp.isfinite(change[0])) & jnp.all(jnp.abs(change[0]) < 2)
+    same = jnp.eye(3, dtype=rgb.dtype), jnp.zeros(3, rgb.dtype)
+    return jax.tree.map(lambda fitted, none: jnp.where(known, fitted, none), change, same)
+
+
+@jax.jit
+def _subtract(
+    photograph: jax.Array, rgb: jax.Array, change: tuple[jax.Array, jax.Array]
+) -> jax.Array:
+    """Return the residual and the matched colors of a photograph, int8 `[H, W, 6]`."""
+    values, (matrix, offset) = to_float(photograph), change
+    matched = change_colors(values[..., :3], matrix, offset)
+    both = jnp.concatenate([matched - jnp.clip(rgb, 0, 1), 2 * matched - 1], axis=-1)
+    both = jnp.where(values[..., 3:] > 0, both, 0)
+    return jnp.round(127 * jnp.clip(both, -1, 1)).astype(jnp.int8)
