@@ -39,7 +39,8 @@ from jaxcloseup.app.run.logs import TrainLog
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.setup import state_shapes
 from jaxcloseup.app.store.stored_run import RunError, load_run_scene, read_run
-from jaxcloseup.app.view.camera_paths import CameraError, read_camera_path, read_camera_transform
+from jaxcloseup.app.view.camera_files import read_camera_path, read_camera_transform
+from jaxcloseup.app.view.camera_paths import CameraError
 from jaxcloseup.artifacts.checkpoints import CheckpointError, Checkpoints
 from jaxcloseup.captures.load import SceneError, load_scene
 from jaxcloseup.captures.photo_files import read_image, read_mask

@@ -13,13 +13,13 @@ from tiny_capture import single_file
 from tiny_runs import path_file
 
 from jaxcloseup.app.run.manifest import write_dataparser_transforms
-from jaxcloseup.app.view import camera_paths
+from jaxcloseup.app.view import camera_files, camera_paths
+from jaxcloseup.app.view.camera_files import read_camera_path
 from jaxcloseup.app.view.camera_paths import (
     CameraError,
     check_pixel,
     dolly,
     focus_point,
-    read_camera_path,
 )
 from jaxcloseup.app.view.orientation import up_direction
 from jaxcloseup.captures.load import SceneError, load_scene
@@ -75,7 +75,7 @@ def test_a_nerfstudio_path_maps_back_to_the_capture(
     recorded = {"transform": transform.tolist(), "scale": scale * applied_scale}
     file.write_text(json.dumps(recorded))
     shots = read_camera_path(path_file(tmp_path))
-    back = camera_paths.to_capture(shots, *camera_paths.read_camera_transform(file), scene)
+    back = camera_files.to_capture(shots, *camera_files.read_camera_transform(file), scene)
     pose = np.asarray(shots.cameras.camtoworld[0], np.float64)
     seen = (theirs - pose[:, 3]) @ pose[:, :3]  # in the camera's frame
     pose = np.asarray(back.cameras.camtoworld[0], np.float64)
@@ -98,7 +98,7 @@ def test_the_transform_that_a_run_writes_keeps_its_own_coordinates(
         written["transform"], np.eye(3, 4) if applied is None else applied
     )
     shots = read_camera_path(path_file(tmp_path))
-    back = camera_paths.to_capture(shots, *camera_paths.read_camera_transform(file), scene)
+    back = camera_files.to_capture(shots, *camera_files.read_camera_transform(file), scene)
     np.testing.assert_allclose(back.cameras.camtoworld, shots.cameras.camtoworld, atol=1e-6)
 
 
@@ -107,7 +107,7 @@ def test_a_transform_of_another_capture_raises_one_sentence(tmp_path, capture_fo
     scene.metadata["applied_transform"] = 2 * APPLIED
     shots = read_camera_path(path_file(tmp_path))
     with pytest.raises(SceneError, match="applied_transform after --camera_transform is not rigid"):
-        camera_paths.to_capture(shots, APPLIED, 1.0, scene)
+        camera_files.to_capture(shots, APPLIED, 1.0, scene)
 
 
 RIGID = np.eye(3, 4).tolist()
@@ -130,7 +130,7 @@ def test_a_broken_camera_transform_raises_one_sentence(tmp_path, fields, message
     file = tmp_path / "t.json"
     file.write_text(json.dumps(fields))
     with pytest.raises(SceneError, match=message) as error:
-        camera_paths.read_camera_transform(file)
+        camera_files.read_camera_transform(file)
     assert "t.json" in str(error.value) and "\n" not in str(error.value)
 
 

@@ -31,7 +31,7 @@ from posing import (
     walk_around,
 )
 
-from jaxcloseup.app.process import solver_jobs as jobs
+from jaxcloseup.app.process import solver_process
 from jaxcloseup.app.process.pairs import choose_pairing, pairs_to_match, similarity
 from jaxcloseup.app.process.video_frames import choose_frames
 from jaxcloseup.artifacts.video import write_video
@@ -341,9 +341,11 @@ def test_pycolmap_is_not_installed(tmp_path, monkeypatch):
 
 
 def test_a_solver_that_dies_is_one_sentence(tmp_path, monkeypatch):
-    monkeypatch.setattr(jobs.sys, "executable", "false")
-    with pytest.raises(jobs.ProcessingError, match=r"pycolmap ended with code 1 in finding .*log"):
-        jobs.do("features", "finding features", "photographs", tmp_path / "log", names=["a"] * 9999)
+    monkeypatch.setattr(solver_process.sys, "executable", "false")
+    message = r"pycolmap ended with code 1 in finding: .*log"
+    given = {"names": ["a"] * 9999}
+    with pytest.raises(solver_process.ProcessingError, match=message):
+        solver_process.run_job("features", "finding", "photographs", tmp_path / "log", **given)
 
 
 def test_a_run_on_photographs_names_the_command(tmp_path):

@@ -9,11 +9,11 @@ from absl import flags
 
 from jaxcloseup.app.cli.interrupt import when_stopped
 from jaxcloseup.app.cli.start import check_unused, lock_output_dir, set_up
+from jaxcloseup.app.process.capture_stages import NAME, Stages
+from jaxcloseup.app.process.capture_summary import summary_lines
 from jaxcloseup.app.process.choices import COUNT
 from jaxcloseup.app.process.pipeline import PICTURE, Request, make_capture
-from jaxcloseup.app.process.solver_jobs import ProcessingError, check_pycolmap
-from jaxcloseup.app.process.stages import NAME, Stages
-from jaxcloseup.app.process.summary import summary_lines
+from jaxcloseup.app.process.solver_process import ProcessingError, check_pycolmap
 from jaxcloseup.app.process.video_frames import LARGEST
 from jaxcloseup.app.progress import showing
 from jaxcloseup.io.files import check_file

@@ -17,7 +17,7 @@ from jaxcloseup.app.run.kept_detail import detail_finder, detail_path
 from jaxcloseup.app.run.loop import TrainingError
 from jaxcloseup.app.run.setup import start_labels
 from jaxcloseup.app.store.stored_run import RunError, load_run_scene, restore
-from jaxcloseup.app.view import camera_paths
+from jaxcloseup.app.view import camera_files, camera_paths
 from jaxcloseup.app.view.camera_paths import CameraError, Shots
 from jaxcloseup.app.view.chosen_run import run_from_flags
 from jaxcloseup.app.view.frames import render_shots
@@ -58,12 +58,12 @@ def _render() -> None:
     output_dir = check_unused(FLAGS.output_dir or record.folder / "videos" / stamp)
     prepare_to_stop(output_dir)
     file = FLAGS.target or FLAGS.camera_path
-    shots = camera_paths.read_camera_path(pathlib.Path(file)) if file else None
+    shots = camera_files.read_camera_path(pathlib.Path(file)) if file else None
     file = FLAGS.camera_transform
-    transform = camera_paths.read_camera_transform(pathlib.Path(file)) if file else None
+    transform = camera_files.read_camera_transform(pathlib.Path(file)) if file else None
     scene = load_run_scene(record, FLAGS.data)
     if transform is not None:
-        shots = camera_paths.to_capture(shots, *transform, scene)
+        shots = camera_files.to_capture(shots, *transform, scene)
     if chosen == "views":
         shots = camera_paths.view_shots(scene, FLAGS.views)
     elif chosen == "orbit":

@@ -17,7 +17,7 @@ from PIL.ExifTags import IFD, Base
 
 from jaxcloseup.app.process.choices import FEWEST
 from jaxcloseup.app.process.counting import progress
-from jaxcloseup.app.process.solver_jobs import ProcessingError
+from jaxcloseup.app.process.solver_process import ProcessingError
 from jaxcloseup.artifacts.images import encode_png
 from jaxcloseup.captures.photo_files import ENDINGS, read_file, read_image
 from jaxcloseup.io.files import write_file

@@ -7,12 +7,12 @@ import shutil
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from jaxcloseup.app.process.capture_stages import Stages
+from jaxcloseup.app.process.capture_summary import draw_from_above, other_models, why_left_out
 from jaxcloseup.app.process.choices import LENSES
 from jaxcloseup.app.process.pairs import choose_pairing
 from jaxcloseup.app.process.photo_folder import Copied, copy_photographs, list_files
-from jaxcloseup.app.process.solver_jobs import ProcessingError, do
-from jaxcloseup.app.process.stages import Stages
-from jaxcloseup.app.process.summary import draw_from_above, other_models, why_left_out
+from jaxcloseup.app.process.solver_process import ProcessingError, run_job
 from jaxcloseup.app.process.video_frames import extract_frames
 from jaxcloseup.app.progress import saying
 from jaxcloseup.version import __version__
@@ -88,14 +88,14 @@ def make_capture(request: Request, folder: pathlib.Path, stages: Stages) -> dict
     def find_features() -> dict[str, int]:
         lenses, model = _by_lens(copied), LENSES[request.lens]
         given = {"database": database, "images": images, "lenses": lenses, "model": model}
-        return do("features", "finding features", "photographs", log, **given)
+        return run_job("features", "finding features", "photographs", log, **given)
 
     features = stages.run("features", _DATABASE, find_features)
     pairing = choose_pairing(request.pairs, len(names), video=request.video is not None)
 
     def match() -> dict[str, int]:
         given = {"database": database, "pairing": pairing, "names": names}
-        return do("matches", f"matching ({pairing})", "pairs", log, **given)
+        return run_job("matches", f"matching ({pairing})", "pairs", log, **given)
 
     partners = stages.run("matches", _DATABASE, match)
 
@@ -103,7 +103,7 @@ def make_capture(request: Request, folder: pathlib.Path, stages: Stages) -> dict
         shutil.rmtree(part := folder / _WORK / "model", ignore_errors=True)
         part.mkdir()
         given = {"database": database, "images": images, "folder": str(part)}
-        models = do("mapping", "finding poses", "photographs", log, **given)
+        models = run_job("mapping", "finding poses", "photographs", log, **given)
         if models:
             shutil.rmtree(model := folder / MODEL, ignore_errors=True)
             model.parent.mkdir(exist_ok=True)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxcloseup.app.process.choices import FEWEST
 from jaxcloseup.app.process.counting import progress
 from jaxcloseup.app.process.photo_folder import Copied
-from jaxcloseup.app.process.solver_jobs import ProcessingError
+from jaxcloseup.app.process.solver_process import ProcessingError
 from jaxcloseup.io.files import check_file, write_file
 
 

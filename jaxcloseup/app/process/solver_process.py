@@ -26,7 +26,7 @@ def check_pycolmap() -> None:
         )
 
 
-def do(job: str, what: str, unit: str, log: pathlib.Path, **arguments: Any) -> Any:
+def run_job(job: str, what: str, unit: str, log: pathlib.Path, **arguments: Any) -> Any:
     """Do a job of `jaxcloseup.app.process.solver` in a process of its own.
 
     Args:

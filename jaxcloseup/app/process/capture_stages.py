@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from jaxcloseup.app.process.solver_jobs import ProcessingError
+from jaxcloseup.app.process.solver_process import ProcessingError
 from jaxcloseup.io.files import read_object, write_json
 
 
