@@ -1,5 +1,7 @@
 """Sentences for the user, about files that may say anything."""
 
+import shutil
+import textwrap
 import unicodedata
 
 
@@ -23,3 +25,12 @@ def reason(error: Exception) -> str:
     """The beginning of what another library says of an error, on one line."""
     text = " ".join(str(error).split()) or type(error).__name__
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+
+
+def describe_option(shown: str, about: str) -> str:
+    """Return lines of help, as wide as the terminal: an option with its value, and its text."""
+    width = min(max(shutil.get_terminal_size().columns, 60), 100)
+    left = " " * 26
+    wrapped = textwrap.fill(about, width, initial_indent=left, subsequent_indent=left)
+    first = f"  {shown}"
+    return first + wrapped[len(first) :] if len(first) < len(left) - 1 else f"{first}\n{wrapped}"

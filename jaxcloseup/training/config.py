@@ -2,20 +2,32 @@
 
 import dataclasses
 
+from jaxcloseup.setting import setting
+
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
-    """How much one step looks at.
+    """How much one step looks at."""
 
-    Attributes:
-      num_rays: pixels of photographs in a step; None takes one whole photograph.
-      num_label_rays: labeled pixels in a step; None takes the whole virtual image.
-      label_rule: a name in `LABEL_RULES`. Whole virtual images always add both losses.
-      num_windows: how often a step draws all this: photographs or their windows, and labels. The
-        mean gradient of the draws moves the parameters.
-    """
-
-    num_rays: int | None = 1024
-    num_label_rays: int | None = 1024
-    label_rule: str = "paper"
-    num_windows: int = 1
+    num_rays: int | None = setting(
+        1024,
+        "pixels of photographs in a step; none takes one whole photograph",
+        low=1,
+    )
+    num_label_rays: int | None = setting(
+        1024,
+        "labeled pixels in a step; none takes the whole virtual image",
+        low=1,
+    )
+    label_rule: str = setting(
+        "paper",
+        "how labels are made and their loss joins the photographs', see `LABEL_RULES`; whole "
+        "virtual images always add both losses",
+        choices=("paper", "pooled", "released"),
+    )
+    num_windows: int = setting(
+        1,
+        "draws of a step, each of photographs or their windows and of labels; the mean gradient "
+        "of the draws moves the parameters",
+        low=1,
+    )

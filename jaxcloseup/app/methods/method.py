@@ -11,26 +11,26 @@ from jaxcloseup.artifacts.viewer_gaussians import Gaussians
 from jaxcloseup.fields.contract import RadianceField
 from jaxcloseup.labels.config import LabelConfig
 from jaxcloseup.photos.scene import Scene
+from jaxcloseup.setting import setting
 from jaxcloseup.training.config import TrainConfig
 from jaxcloseup.training.steps import TrainState
 
 
 @dataclasses.dataclass(frozen=True)
 class TargetConfig:
-    """How target views, the wanted ones, are labeled and learned, other than random close-ups.
+    """How target views are labeled and learned where random close-ups differ."""
 
-    Attributes:
-      label: as in `LabelConfig`.
-      label_loss_weight: as there.
-      lr_scale: as there.
-      control_lr_scale: the same for as many steps without labels, `test_time_control`, which may
-        learn best at other rates.
-    """
-
-    label: str = "warp"
-    label_loss_weight: float = 0.5
-    lr_scale: float = 1.0
-    control_lr_scale: float = 1.0
+    label: str = setting(
+        "warp",
+        "source of labels, as in `LabelConfig`",
+        choices=("warp", "residual"),
+    )
+    label_loss_weight: float = setting(0.5, "weight of the labels' loss in a step", high=1)
+    lr_scale: float = setting(1.0, "factor on the learning rates in steps with labels")
+    control_lr_scale: float = setting(
+        1.0,
+        "factor on the learning rates of `test_time_control`, as many steps without labels",
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,61 +39,61 @@ class WindowConfig:
 
     Fields that render whole images read windows as large as reduced photographs, and fields that
     render single rays read single pixels.
-
-    Attributes:
-      finest: divisor of the finest size that is read; one that fits into memory is taken.
-      whole_share: share of the steps, or pixels, that read a whole reduced photograph.
     """
 
-    finest: int = 1
-    whole_share: float = 0.4
+    finest: int = setting(
+        1,
+        "divisor of the finest size that steps read; larger if that size does not fit into memory",
+        low=1,
+    )
+    whole_share: float = setting(
+        0.4,
+        "share of the steps, or pixels, that read a whole reduced photograph",
+        high=1,
+    )
 
 
 @dataclasses.dataclass(frozen=True)
 class CoarseConfig:
-    """A first training, on whole reduced photographs, whose result becomes finer.
+    """A first training, on whole reduced photographs, whose result becomes finer."""
 
-    Attributes:
-      field: the field's configuration in it.
-      steps: how many.
-    """
-
-    field: Any
-    steps: int
+    field: Any = setting(help="configuration of the field during this training")
+    steps: int = setting(help="number of steps", low=1)
 
 
 @dataclasses.dataclass(frozen=True)
 class Preset:
-    """One experiment with one method.
+    """One experiment with one method."""
 
-    Attributes:
-      method: a name in `METHODS`.
-      field: the method's own configuration: its field, optimizer and steps for target views.
-      train: what a step looks at.
-      labels: how close-ups are drawn and labeled.
-      baseline_steps: steps of stage 1, on photographs alone.
-      closeup_steps: steps of stage 2 with labels, and of its control without.
-      downscale: divisor of the photographs' size.
-      score_downscale: divisor of the photographs' size at which held-out views are scored too,
-        if it is finer; None: at none.
-      gated: let left-out photographs decide how much labels weigh, which may be nothing.
-      windows: how steps read finer photographs; None: they read reduced photographs alone.
-      coarse: what trains before stage 1; None: stage 1 begins with the initial points.
-      targets: how target views are labeled; None: as random close-ups.
-    """
-
-    method: str
-    field: Any
-    train: TrainConfig
-    labels: LabelConfig
-    baseline_steps: int
-    closeup_steps: int
-    downscale: int = 1
-    score_downscale: int | None = None
-    gated: bool = False
-    windows: WindowConfig | None = None
-    coarse: CoarseConfig | None = None
-    targets: TargetConfig | None = None
+    method: str = setting(help="a name in `METHODS`")
+    field: Any = setting(help="the method's configuration of its field, optimizer and target views")
+    train: TrainConfig = setting(help="how much a step looks at")
+    labels: LabelConfig = setting(help="how close-ups are drawn and labeled")
+    baseline_steps: int = setting(help="steps of stage 1, on photographs alone", low=1)
+    closeup_steps: int = setting(help="steps of stage 2 with labels, and of its control", low=1)
+    downscale: int = setting(1, "divisor of the photographs' size", low=1)
+    score_downscale: int | None = setting(
+        None,
+        "divisor of the photographs' size at which held-out views are scored too, if finer; "
+        "none scores no finer views",
+        low=1,
+    )
+    gated: bool = setting(
+        False,
+        "let held-out training photographs decide the weight of labels, which may be 0",
+    )
+    windows: WindowConfig | None = setting(
+        None,
+        "how steps read finer photographs; none reads reduced photographs only",
+    )
+    coarse: CoarseConfig | None = setting(
+        None,
+        "training before stage 1; none begins stage 1 with the initial points",
+    )
+    targets: TargetConfig | None = setting(
+        None,
+        "how target views are labeled; none labels them as random close-ups",
+    )
 
     @property
     def target_labels(self) -> LabelConfig:

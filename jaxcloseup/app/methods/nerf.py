@@ -17,20 +17,20 @@ from jaxcloseup.fields.contract import RadianceField
 from jaxcloseup.fields.volume.config import NerfConfig
 from jaxcloseup.fields.volume.nerf import nerf_field
 from jaxcloseup.photos.scene import Scene
+from jaxcloseup.setting import setting
 from jaxcloseup.training.config import TrainConfig
 
 
 @dataclasses.dataclass(frozen=True)
 class NerfTrainingConfig(NerfConfig, DepthConfig, AdamConfig):
-    """A NeRF and its training.
-
-    Attributes:
-      normalize: scale the scene to the unit cube around what the cameras look at.
-    """
+    """A NeRF and its training."""
 
     initial_lr: float = 5e-4
     lr_decay_steps: int = 250_000
-    normalize: bool = False
+    normalize: bool = setting(
+        False,
+        "scale the scene to the unit cube around the cameras and their view",
+    )
 
 
 PAPER = Preset(

@@ -45,27 +45,28 @@ from jaxcloseup.labels.rules import label_depth
 from jaxcloseup.photos.pyramids import Pyramid
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.views import Views, camera_at, to_float
+from jaxcloseup.setting import setting
 from jaxcloseup.training.config import TrainConfig
 from jaxcloseup.training.steps import TrainState
 
 
 @dataclasses.dataclass(frozen=True)
 class SplatTraining:
-    """What experiments add to the configuration of surfels, and of volumetric Gaussians.
+    """What experiments add to the configuration of surfels, and of volumetric Gaussians."""
 
-    Attributes:
-      steps_per_target: steps for each target view.
-      fewest_target_steps: steps for all of them, at least.
-      surfels_per_target: splats that each target view gets where its labels show more, in place of
-        those that show least.
-      smoothed_at: divisor of the photographs' size whose pixels bound how small splats are, by the
-        smoothing filter in space, see `filters`; at least training's size. None has no filter.
-    """
-
-    steps_per_target: int = 5
-    fewest_target_steps: int = 1
-    surfels_per_target: int = 0
-    smoothed_at: int | None = None
+    steps_per_target: int = setting(5, "steps for each target view", low=1)
+    fewest_target_steps: int = setting(1, "smallest number of steps for all target views", low=1)
+    surfels_per_target: int = setting(
+        0,
+        "splats added for each target view where its labels show more detail, replacing the "
+        "least visible splats",
+    )
+    smoothed_at: int | None = setting(
+        None,
+        "divisor of the photographs' size whose pixels bound how small splats are, by the "
+        "smoothing filter in space; none applies no filter",
+        low=1,
+    )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,36 +12,36 @@ from jaxcloseup.app.methods.sightings import find_sightings
 from jaxcloseup.fields.contract import RadianceField
 from jaxcloseup.fields.volume.depth_supervision import DepthSupervision
 from jaxcloseup.photos.scene import Scene
+from jaxcloseup.setting import setting
 
 
 @dataclasses.dataclass(frozen=True)
 class AdamConfig:
-    """A training by Adam whose learning rate decays.
+    """A training by Adam whose learning rate decays."""
 
-    Attributes:
-      initial_lr: the learning rate at the first step.
-      lr_decay: factor on it over `lr_decay_steps`, along an exponential through all stages.
-      lr_decay_steps: see `lr_decay`.
-      target_steps: steps on all target views together.
-    """
-
-    initial_lr: float = 1e-2
-    lr_decay: float = 0.1
-    lr_decay_steps: int = 20_000
-    target_steps: int = 200
+    initial_lr: float = setting(1e-2, "learning rate at the first step")
+    lr_decay: float = setting(
+        0.1,
+        "factor of the learning rate's exponential decay over `lr_decay_steps`, through all stages",
+    )
+    lr_decay_steps: int = setting(
+        20_000,
+        "steps over which the learning rate decays by `lr_decay`",
+        low=1,
+    )
+    target_steps: int = setting(200, "steps on all target views together", low=1)
 
 
 @dataclasses.dataclass(frozen=True)
 class DepthConfig:
-    """Supervision of depth by the capture's points, for any volumetric field.
+    """Supervision of depth by the capture's points, for any volumetric field."""
 
-    Attributes:
-      depth_weight: weight of its loss; 0 turns it off.
-      depth_share: rays through points in a step, as a share of its pixels.
-    """
-
-    depth_weight: float = 0.0
-    depth_share: float = 0.25
+    depth_weight: float = setting(0.0, "weight of the depth loss; 0 turns it off")
+    depth_share: float = setting(
+        0.25,
+        "rays through points in a step, as a share of its pixels",
+        high=1,
+    )
 
 
 def depth_supervision(config: DepthConfig, scene: Scene) -> DepthSupervision | None:
