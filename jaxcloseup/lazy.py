@@ -26,3 +26,12 @@ def lazy_names(
         return getattr(importlib.import_module(f"{package}.{module_of[name]}"), name)
 
     return sorted(module_of), load, lambda: sorted(module_of)
+
+
+def lazy_function(module: str, name: str) -> Callable[..., Any]:
+    """Return a function of a module that is imported when the function is first called."""
+
+    def call(*args: Any, **kwargs: Any) -> Any:
+        return getattr(importlib.import_module(module), name)(*args, **kwargs)
+
+    return call

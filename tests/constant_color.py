@@ -2,21 +2,23 @@
 
 import dataclasses
 
-import jax
-import jax.numpy as jnp
-import optax
-
-from jaxcloseup.app.methods import LabelConfig, Method, Preset
-from jaxcloseup.fields.contract import RadianceField, Rendering
+from jaxcloseup.app.methods.method import Method, Preset
+from jaxcloseup.labels.config import LabelConfig
+from jaxcloseup.setting import setting
 from jaxcloseup.training.config import TrainConfig
 
 
 @dataclasses.dataclass(frozen=True)
 class ConstantConfig:
-    lr: float = 0.1
+    lr: float = setting(0.1, "how fast the color is learned", high=2)
 
 
 def make_field(config, scene, growth):
+    import jax
+    import jax.numpy as jnp
+
+    from jaxcloseup.fields.contract import RadianceField, Rendering
+
     def render(params, buffers, camera, pixels, key):
         shape = (camera.height, camera.width) if pixels is None else pixels.shape[:-1]
         depth = jnp.full(shape, (scene.near + scene.far) / 2)
@@ -30,18 +32,26 @@ def make_field(config, scene, growth):
     return RadianceField(lambda key, points, rgb: (jax.random.uniform(key, (3,)), ()), render, loss)
 
 
-QUICK = Preset(
-    method="constant",
-    field=ConstantConfig(),
-    train=TrainConfig(num_rays=64, num_label_rays=64),
-    labels=LabelConfig(),
-    baseline_steps=9,
-    closeup_steps=2,
-)
+def make_optimizer(config, scene):
+    import optax
+
+    return optax.adam(config.lr)
+
+
 METHOD = Method(
-    presets={"quick": QUICK},
+    help="one color for everything (Nobody et al. 2026)",
+    presets={
+        "quick": Preset(
+            method="constant_color",
+            field=ConstantConfig(),
+            train=TrainConfig(num_rays=64, num_label_rays=64),
+            labels=LabelConfig(),
+            baseline_steps=9,
+            closeup_steps=2,
+        )
+    },
     make_field=make_field,
-    make_optimizer=lambda config, scene: optax.adam(config.lr),
+    make_optimizer=make_optimizer,
     renders_pixels=True,
     target_steps=lambda config, count: 2,
 )

@@ -24,7 +24,7 @@ MAY_IMPORT = {
     "captures": {"geometry", "io", "photos", "drawn_scenes"},
     "artifacts": {"geometry", "io", "fields"},
 }
-FREE = {"lazy", "version"}  # modules that every room may use
+FREE = {"lazy", "setting", "version"}  # modules that every room may use
 # The rooms of `jaxcloseup.app`, and which others each may use.
 ROOMS = {
     "progress": set(),

@@ -21,7 +21,8 @@ import numpy as np
 import jaxcloseup
 from experiments.benchmarks import nerf, splats, sweep
 from experiments.benchmarks.timing import interleaved_medians
-from jaxcloseup.app.methods import Preset, surfels
+from jaxcloseup.app.methods import surfels
+from jaxcloseup.app.methods.method import Preset
 from jaxcloseup.app.methods.nerf import QUICK as NERF_QUICK
 from jaxcloseup.app.run.fine_tuning import fine_tune
 from jaxcloseup.app.run.kept_detail import detail_finder

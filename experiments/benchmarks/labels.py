@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcloseup.app.methods import LabelConfig, pseudo_settings
 from jaxcloseup.app.report.pictures import label_pictures
 from jaxcloseup.app.score.audit import audit_labels, resolved_by_photographs
 from jaxcloseup.app.score.scores import exact_depths
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.drawn_scenes.drawn import DRAWN_SCENES
+from jaxcloseup.labels.config import LabelConfig, pseudo_settings
 from jaxcloseup.labels.make import label_sources
 from jaxcloseup.metrics.image_metrics import psnr
 from jaxcloseup.photos.scene import Scene

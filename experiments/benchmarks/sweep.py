@@ -3,12 +3,14 @@
 import jax
 
 from experiments.benchmarks.timing import interleaved_medians
-from jaxcloseup.app.methods import METHODS, Preset, pseudo_settings
+from jaxcloseup.app.methods.method import Preset
+from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.setup import initial_state, start_labels
 from jaxcloseup.app.sweep.arm_training import stack_arms
 from jaxcloseup.app.sweep.arms import make_arm
 from jaxcloseup.captures.load import load_scene
+from jaxcloseup.labels.config import pseudo_settings
 
 
 ARMS = ("control", "labels", "mask", "diverse")

@@ -31,6 +31,8 @@ def describe_option(shown: str, about: str) -> str:
     """Return lines of help, as wide as the terminal: an option with its value, and its text."""
     width = min(max(shutil.get_terminal_size().columns, 60), 100)
     left = " " * 26
-    wrapped = textwrap.fill(about, width, initial_indent=left, subsequent_indent=left)
+    wrapped = textwrap.fill(
+        about, width, initial_indent=left, subsequent_indent=left, break_on_hyphens=False
+    )
     first = f"  {shown}"
     return first + wrapped[len(first) :] if len(first) < len(left) - 1 else f"{first}\n{wrapped}"

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from tiny_runs import TINY, TINY_SURFELS
 
-from jaxcloseup.app.methods import pseudo_settings
 from jaxcloseup.app.sweep.arm_training import order_arms
 from jaxcloseup.app.sweep.arms import make_arm
+from jaxcloseup.labels.config import pseudo_settings
 
 
 @pytest.mark.parametrize(

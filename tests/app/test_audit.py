@@ -7,7 +7,6 @@ import plane
 import pytest
 from tiny_runs import TINY
 
-from jaxcloseup.app.methods import pseudo_settings
 from jaxcloseup.app.score.audit import (
     audit_labels,
     error_curve,
@@ -16,6 +15,7 @@ from jaxcloseup.app.score.audit import (
 )
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_rays
+from jaxcloseup.labels.config import pseudo_settings
 from jaxcloseup.labels.make import label_sources
 from jaxcloseup.photos.scene import Scene, Surface
 

@@ -7,9 +7,9 @@ import plane
 import pytest
 from tiny_runs import TINY
 
-from jaxcloseup.app.methods import pseudo_settings
 from jaxcloseup.app.sweep.ceilings import CEILING_VIEWS, labels_with_better_depth
 from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_rays
+from jaxcloseup.labels.config import pseudo_settings
 from jaxcloseup.labels.make import label_sources
 from jaxcloseup.photos.scene import Scene, Surface
 from jaxcloseup.photos.views import camera_at

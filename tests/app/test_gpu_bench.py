@@ -8,7 +8,7 @@ import jax
 
 from experiments.benchmarks import gpu
 from experiments.benchmarks.nerf import SMALL
-from jaxcloseup.app.methods import METHODS
+from jaxcloseup.app.methods.registry import METHODS
 
 
 TOY = gpu.Size(
@@ -17,10 +17,10 @@ TOY = gpu.Size(
     numbers=256,
     nerf=dataclasses.replace(SMALL, depth=2, width=16, num_coarse=4, num_fine=4),
     rays=16,
-    preset=constant_color.QUICK,
+    preset=constant_color.METHOD.presets["quick"],
     stages=("control",),
     training_seconds=1,
-    arms=(constant_color.QUICK,),
+    arms=(constant_color.METHOD.presets["quick"],),
     warmup=1,
 )
 
@@ -30,7 +30,7 @@ def test_every_part_finishes_and_fills_its_fields(tmp_path, capture_folder, monk
         raise RuntimeError("no such library")
 
     monkeypatch.setattr(gpu, "peer", broken)
-    monkeypatch.setitem(METHODS, "constant", constant_color.METHOD)
+    monkeypatch.setitem(METHODS, "constant_color", constant_color.METHOD)
     with jax.numpy_dtype_promotion("standard"):
         size = dataclasses.replace(TOY, scene=str(capture_folder))
         found = gpu.run(size, tmp_path / "gpu.json")
@@ -49,7 +49,7 @@ def test_every_part_finishes_and_fills_its_fields(tmp_path, capture_folder, monk
     assert set(parts["nerf"]) == {"float32", "bfloat16"}
     assert parts["training"]["wanted_view_s"] > 0
     assert set(parts["training"]["psnr"]) == {"baseline", "control"}
-    assert parts["sweep"]["constant"]["over_eight_alone"] > 0
+    assert parts["sweep"]["constant_color"]["over_eight_alone"] > 0
 
 
 def test_no_part_begins_after_its_time(tmp_path):

@@ -2,6 +2,10 @@
 
 import dataclasses
 import json
+import pathlib
+import shutil
+import subprocess
+import sys
 
 import chex
 import constant_color
@@ -10,13 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 import plane
 import pytest
-from absl import flags
-from absl.testing import flagsaver
 from tiny_runs import TINY_MIP, TINY_SURFELS
 
-from jaxcloseup.app.cli import render, run, sweep
-from jaxcloseup.app.methods import METHODS, surfels
-from jaxcloseup.app.methods.surfels import extent, make_field
+from jaxcloseup.app import methods
+from jaxcloseup.app.methods import registry
+from jaxcloseup.app.methods.registry import METHODS
+from jaxcloseup.app.methods.shared import splat_training
+from jaxcloseup.app.methods.shared.splat_training import extent, make_field
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.setup import (
     FEWEST_POINTS,
@@ -34,6 +38,9 @@ from jaxcloseup.geometry.cameras import points_to_pixels
 from jaxcloseup.photos.pyramids import scene_pyramid
 from jaxcloseup.photos.views import camera_at
 from jaxcloseup.training.steps import TrainState
+
+
+ROOT = pathlib.Path(__file__).parents[2]
 
 
 @pytest.fixture
@@ -59,7 +66,7 @@ def test_cameras_in_one_place_have_the_size_of_what_they_see(scene):
 
 def test_the_near_plane_is_small_in_a_small_scene(scene, monkeypatch):
     seen = []
-    monkeypatch.setattr(surfels, "surfel_field", lambda config, **_: seen.append(config))
+    monkeypatch.setattr(splat_training, "surfel_field", lambda config, **_: seen.append(config))
     small = moved(scene, lambda old: 0.01 * old)
     for one in (scene, small, dataclasses.replace(small, far=0.01 * scene.far)):
         make_field(TINY_SURFELS.field, one, 1)
@@ -76,7 +83,7 @@ def test_the_smoothing_filter_is_that_of_the_finest_photographs(capture_folder, 
         np.testing.assert_allclose(center, middle, atol=1e-6)
         seen.append(photographs)
 
-    monkeypatch.setattr(surfels, "surfel_field", keep)
+    monkeypatch.setattr(splat_training, "surfel_field", keep)
     train, own = scene.train.cameras, plane.WIDTH
     for divisor, width in ((1, own), (2, own / 2), (8, own / 2)):
         make_field(dataclasses.replace(TINY_MIP.field, smoothed_at=divisor), scene, 1)
@@ -181,10 +188,22 @@ def test_the_shapes_of_a_state_are_those_of_the_state(scene):
     chex.assert_trees_all_equal_shapes_and_dtypes(shapes, state)
 
 
-def test_a_new_method_runs_through_every_program(capture_folder, tmp_path, monkeypatch):
-    # What a maintainer adds: a module, and a line of the table, which the flag's choices come from.
-    monkeypatch.setitem(METHODS, "constant", constant_color.METHOD)
+@pytest.fixture
+def trial(tmp_path, monkeypatch):
+    """A folder beside the methods' own, with the file of a trial method."""
+    folder = tmp_path / "methods"
+    folder.mkdir()
+    shutil.copy(constant_color.__file__, folder)
+    monkeypatch.setattr(methods, "__path__", [*methods.__path__, str(folder)])
+    found = registry.find_methods()
+    assert list(found) == ["surfels", *sorted(set(found) - {"surfels"})]
+    monkeypatch.setitem(METHODS, "constant_color", found["constant_color"])
     monkeypatch.setattr(flags.FLAGS["method"].parser, "enum_values", list(METHODS))
+    return folder
+
+
+def test_a_new_method_is_one_file(trial, capture_folder, tmp_path):
+    """It is trained, swept, rendered and reported, and nothing else mentions it."""
 
     def call(program, folder, **given):
         flags.FLAGS(["program"])
@@ -193,12 +212,12 @@ def test_a_new_method_runs_through_every_program(capture_folder, tmp_path, monke
             program.main(["program"])
         return tmp_path / folder
 
-    given = {"method": "constant", "set": ["lr=0.2"]}
+    given = {"method": "constant_color", "set": ["lr=0.2"]}
     trained = call(run, "run", scene=str(capture_folder), stages=["closeup"], **given)
     results = json.loads((trained / "results.json").read_text())
-    assert results["method"] == "constant" and results["config"]["field"] == {"lr": 0.2}
+    assert results["method"] == "constant_color" and results["config"]["field"] == {"lr": 0.2}
     assert set(results["stages"]) == {"baseline", "closeup"}
-    assert "constant, preset quick" in (trained / "report.html").read_text()
+    assert "constant_color, preset quick" in (trained / "report.html").read_text()
     arms = ["control", "label_loss_weight=0.9"]
     swept = call(sweep, "sweep", scenes=[str(capture_folder)], seeds=1, arms=arms, **given)
     found = json.loads((swept / "sweep.json").read_text())["scenes"]
@@ -206,3 +225,22 @@ def test_a_new_method_runs_through_every_program(capture_folder, tmp_path, monke
     rendered = call(render, "render", run=str(trained), views="test", support=False, detail=False)
     assert (rendered / "rgb" / "0.png").exists() and (rendered / "depth" / "0.png").exists()
     assert not (rendered / "normals").exists()
+
+
+def test_help_lists_a_new_method_and_its_settings(trial):
+    code = (
+        "import sys, jaxcloseup.app.methods as methods\n"
+        "methods.__path__.append(sys.argv.pop(1))\n"
+        "from jaxcloseup.app.cli.main import main\n"
+        "main()"
+    )
+    for words, wanted in (
+        (["--help"], "constant_color, one color for everything (Nobody et al. 2026)"),
+        (
+            ["--method=constant_color", "--set=help"],
+            "lr=0.1 how fast the color is learned; a number between 0 and 2",
+        ),
+    ):
+        command = [sys.executable, "-c", code, trial, "run", *words]
+        said = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+        assert wanted in " ".join(said.split())

@@ -13,7 +13,7 @@ from absl.testing import flagsaver
 from tiny_runs import KEPT, copy_of, path_file
 
 from jaxcloseup.app.cli import render as program
-from jaxcloseup.app.methods import METHODS
+from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.methods.settings import plain_config
 from jaxcloseup.app.run import fine_tuning
 from jaxcloseup.app.run.programs import Programs

@@ -16,13 +16,8 @@ from tiny_runs import TINY, TINY_SURFELS
 
 from jaxcloseup.app.jobs.evaluate import evaluate_folders
 from jaxcloseup.app.jobs.run import run
-from jaxcloseup.app.methods import (
-    METHODS,
-    CoarseConfig,
-    TargetConfig,
-    WindowConfig,
-    pseudo_settings,
-)
+from jaxcloseup.app.methods.method import CoarseConfig, TargetConfig, WindowConfig
+from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.methods.surfels import REDUCED
 from jaxcloseup.app.report.comparison import say_which_is_best, write_comparison
 from jaxcloseup.app.report.finished_runs import read_finished
@@ -40,6 +35,7 @@ from jaxcloseup.artifacts.surfel_ply import read_surfels
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.io.files import write_json
+from jaxcloseup.labels.config import pseudo_settings
 from jaxcloseup.labels.make import label_sources
 from jaxcloseup.photos.views import camera_at
 from jaxcloseup.training.steps import init_state

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tiny_runs import KEPT
 
-from jaxcloseup.app.methods import TargetConfig
+from jaxcloseup.app.methods.method import TargetConfig
 from jaxcloseup.app.run import fine_tuning, gate
 from jaxcloseup.app.run import kept_detail as training_detail
 from jaxcloseup.app.run.fine_tuning import fine_tune, tuned_detail

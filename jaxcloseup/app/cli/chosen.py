@@ -10,7 +10,8 @@ from typing import Any
 from absl import flags
 
 from jaxcloseup.app.cli.start import CHECKPOINTS, check_unused
-from jaxcloseup.app.methods import METHODS, Preset
+from jaxcloseup.app.methods.method import Preset
+from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.methods.settings import describe_settings, with_settings
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.metrics.image_metrics import SSIM_TAPS

@@ -6,23 +6,23 @@
 from absl import flags
 
 from jaxcloseup.app.cli import set_flag
-from jaxcloseup.app.run.stage_names import METHODS, PRESETS
+from jaxcloseup.app.methods.registry import DEFAULT, METHODS
 from jaxcloseup.captures.choices import ALPHA_MODES, FORMATS, SPLITS
 
 
 flags.adopt_module_key_flags(set_flag)
 flags.DEFINE_enum(
     "method",
-    "surfels",
+    DEFAULT,
     list(METHODS),
-    "radiance field: " + "; ".join(f"{name}, {what}" for name, what in METHODS.items()),
+    "radiance field: " + "; ".join(f"{name}, {method.help}" for name, method in METHODS.items()),
 )
 flags.DEFINE_enum(
     "preset",
     "quick",
-    list(dict.fromkeys(name for presets in PRESETS.values() for name in presets)),
+    list(dict.fromkeys(name for method in METHODS.values() for name in method.presets)),
     "hyper-parameters: "
-    + "; ".join(f"{name} has {', '.join(presets)}" for name, presets in PRESETS.items()),
+    + "; ".join(f"{name} has {', '.join(method.presets)}" for name, method in METHODS.items()),
 )
 flags.DEFINE_integer(
     "downscale",

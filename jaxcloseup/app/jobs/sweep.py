@@ -13,7 +13,7 @@ from absl import flags
 from jaxcloseup.app import progress
 from jaxcloseup.app.cli import chosen as training_flags
 from jaxcloseup.app.cli.start import lock_output_dir, prepare_to_stop, set_up
-from jaxcloseup.app.methods import Preset
+from jaxcloseup.app.methods.method import Preset
 from jaxcloseup.app.methods.settings import plain_config
 from jaxcloseup.app.report.page import Picture
 from jaxcloseup.app.report.pictures import comparisons

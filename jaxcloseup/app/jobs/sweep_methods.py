@@ -18,7 +18,7 @@ from absl import flags
 from jaxcloseup.app.cli import chosen as training_flags
 from jaxcloseup.app.cli.start import CHECKPOINTS, LOCK, lock_output_dir, prepare_to_stop
 from jaxcloseup.app.jobs.sweep import check_flags
-from jaxcloseup.app.methods import METHODS
+from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.report.method_tables import read_method, write_methods
 from jaxcloseup.app.run.manifest import NAME as MANIFEST
 from jaxcloseup.io.files import read_object

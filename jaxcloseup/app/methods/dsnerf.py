@@ -12,11 +12,13 @@ _DEPTH_WEIGHT = 0.001
 
 
 def supervised(preset: Preset) -> Preset:
-    """The NeRF's preset with supervision of depth."""
+    """Return the NeRF's preset with supervision of depth."""
     field = dataclasses.replace(preset.field, depth_weight=_DEPTH_WEIGHT)
     return dataclasses.replace(preset, method="dsnerf", field=field)
 
 
-METHOD = nerf.METHOD._replace(
+METHOD = dataclasses.replace(
+    nerf.METHOD,
+    help="a NeRF whose depth the capture's points supervise (Deng et al. 2022)",
     presets={"quick": supervised(nerf.QUICK), "paper": supervised(nerf.PAPER)},
 )

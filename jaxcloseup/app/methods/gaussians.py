@@ -13,7 +13,7 @@ class GaussianTrainingConfig(surfels.SplatTraining, GaussianConfig):
 
 
 def of_gaussians(preset: Preset) -> Preset:
-    """A preset of surfels for volumetric Gaussians: the same training, by the published filter."""
+    """Return the preset for volumetric Gaussians: the same training, the published filter."""
     coarse = preset.coarse
     if coarse is not None:
         coarse = dataclasses.replace(coarse, field=_as_gaussians(coarse.field))
@@ -21,7 +21,7 @@ def of_gaussians(preset: Preset) -> Preset:
     return dataclasses.replace(preset, method="gaussians", field=field, coarse=coarse)
 
 
-def _as_gaussians(config):
+def _as_gaussians(config: surfels.SurfelTrainingConfig) -> GaussianTrainingConfig:
     names = {field.name for field in dataclasses.fields(GaussianTrainingConfig)}
     values = {name: value for name, value in vars(config).items() if name in names}
     raster = dataclasses.replace(config.raster, antialias=False)
@@ -46,11 +46,13 @@ QUICK = dataclasses.replace(
 )
 QUICK_ADAPTIVE = of_gaussians(surfels.QUICK_ADAPTIVE)
 
-METHOD = surfels.METHOD._replace(
+METHOD = dataclasses.replace(
+    surfels.METHOD,
+    help="3D Gaussian splatting (Kerbl et al. 2023)",
     presets={
         "quick": QUICK,
         "paper": PAPER,
         "quick_adaptive": QUICK_ADAPTIVE,
         "paper_mcmc": PAPER_MCMC,
-    }
+    },
 )

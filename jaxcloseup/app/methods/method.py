@@ -3,17 +3,20 @@
 import dataclasses
 import pathlib
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-import optax
-
-from jaxcloseup.artifacts.viewer_gaussians import Gaussians
-from jaxcloseup.fields.contract import RadianceField
 from jaxcloseup.labels.config import LabelConfig
-from jaxcloseup.photos.scene import Scene
 from jaxcloseup.setting import setting
 from jaxcloseup.training.config import TrainConfig
-from jaxcloseup.training.steps import TrainState
+
+
+if TYPE_CHECKING:  # flags read presets, and must not wait for JAX
+    import optax
+
+    from jaxcloseup.artifacts.viewer_gaussians import Gaussians
+    from jaxcloseup.fields.contract import RadianceField
+    from jaxcloseup.photos.scene import Scene
+    from jaxcloseup.training.steps import TrainState
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,19 +100,21 @@ class Preset:
 
     @property
     def target_labels(self) -> LabelConfig:
-        """How target views are labeled."""
+        """Labels of target views."""
         if self.targets is None:
             return self.labels
         own = {k: v for k, v in vars(self.targets).items() if k != "control_lr_scale"}
         return dataclasses.replace(self.labels, **own)
 
 
-class Method(NamedTuple):
-    """A radiance field as experiments train it: plain values and functions.
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """A radiance field and its training: plain values, and functions that import JAX when called.
 
     `config` below is the `field` of a preset.
 
     Attributes:
+      help: a line for `--help`, with the paper.
       presets: by name; `quick`, the default, is the smallest run that shows the method honestly.
       make_field: `(config, scene, growth) -> RadianceField`; `growth` multiplies the capacity of a
         field whose renderings overflow.
@@ -131,15 +136,16 @@ class Method(NamedTuple):
         target views show and `render(camera)` of the state does not.
     """
 
+    help: str
     presets: Mapping[str, Preset]
-    make_field: Callable[[Any, Scene, int], RadianceField]
-    make_optimizer: Callable[[Any, Scene], optax.GradientTransformation]
+    make_field: "Callable[[Any, Scene, int], RadianceField]"
+    make_optimizer: "Callable[[Any, Scene], optax.GradientTransformation]"
     renders_pixels: bool
     target_steps: Callable[[Any, int], int]
     max_points: Callable[[Any], int | None] = lambda config: None
     with_expected_depth: Callable[[Any, bool], Any] | None = None
     export: Callable[[pathlib.Path, str, Any, Any], None] = lambda *state: None
-    gaussians: Callable[[Any, Any, Any], Gaussians] | None = None
+    gaussians: "Callable[[Any, Any, Any], Gaussians] | None" = None
     background: Callable[[Any], float] = lambda config: 0.0
     refine: Callable[..., tuple[Any, Any]] | None = None
-    add_for_targets: Callable[..., TrainState] = lambda key, config, state, *data: state
+    add_for_targets: "Callable[..., TrainState]" = lambda key, config, state, *data: state

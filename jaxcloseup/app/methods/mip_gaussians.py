@@ -3,11 +3,12 @@
 import dataclasses
 
 from jaxcloseup.app.methods import gaussians
+from jaxcloseup.app.methods.gaussians import GaussianTrainingConfig
 from jaxcloseup.app.methods.method import Preset
 
 
 def with_filters(preset: Preset) -> Preset:
-    """The preset with both filters, the one in space for photographs as large as steps read."""
+    """Return the preset with both filters, in space for photographs as large as steps read."""
     finest = preset.downscale if preset.windows is None else preset.windows.finest
     coarse = preset.coarse
     if coarse is not None:
@@ -16,11 +17,13 @@ def with_filters(preset: Preset) -> Preset:
     return dataclasses.replace(preset, method="mip_gaussians", field=field, coarse=coarse)
 
 
-def _filtered(config, finest):
+def _filtered(config: GaussianTrainingConfig, finest: int) -> GaussianTrainingConfig:
     raster = dataclasses.replace(config.raster, antialias=True)
     return dataclasses.replace(config, smoothed_at=finest, raster=raster)
 
 
-METHOD = gaussians.METHOD._replace(
-    presets={name: with_filters(preset) for name, preset in gaussians.METHOD.presets.items()}
+METHOD = dataclasses.replace(
+    gaussians.METHOD,
+    help="Mip-Splatting, 3D Gaussians that are filtered (Yu et al. 2024)",
+    presets={name: with_filters(preset) for name, preset in gaussians.METHOD.presets.items()},
 )

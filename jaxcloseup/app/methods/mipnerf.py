@@ -1,8 +1,8 @@
-"""mip-NeRF: presets and field."""
+"""mip-NeRF: presets."""
 
 import dataclasses
 
-from jaxcloseup.app.methods.method import LabelConfig, Preset, WindowConfig
+from jaxcloseup.app.methods.method import Preset, WindowConfig
 from jaxcloseup.app.methods.volumes import (
     QUICK_LABELS,
     QUICK_TARGETS,
@@ -11,7 +11,8 @@ from jaxcloseup.app.methods.volumes import (
     volumetric,
 )
 from jaxcloseup.fields.volume.config import MipNerfConfig
-from jaxcloseup.fields.volume.mipnerf import mipnerf_field
+from jaxcloseup.labels.config import LabelConfig
+from jaxcloseup.lazy import lazy_function
 from jaxcloseup.training.config import TrainConfig
 
 
@@ -57,4 +58,8 @@ QUICK = Preset(
     windows=WindowConfig(finest=8),
 )
 
-METHOD = volumetric(mipnerf_field, quick=QUICK, paper=PAPER)
+METHOD = volumetric(
+    lazy_function("jaxcloseup.fields.volume.mipnerf", "mipnerf_field"),
+    help="mip-NeRF, a network that sees cones (Barron et al. 2021)",
+    presets={"quick": QUICK, "paper": PAPER},
+)

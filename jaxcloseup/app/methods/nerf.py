@@ -1,22 +1,19 @@
-"""NeRF, coarse and fine: presets, field and optimizer."""
+"""NeRF, a coarse and a fine network: presets."""
 
 import dataclasses
 
-import optax
-
-from jaxcloseup.app.methods.method import LabelConfig, Method, Preset, WindowConfig
+from jaxcloseup.app.methods.method import Preset, WindowConfig
 from jaxcloseup.app.methods.volumes import (
+    NETWORK_ADAM,
     QUICK_LABELS,
     QUICK_TARGETS,
     AdamConfig,
     DepthConfig,
-    depth_supervision,
-    unit_cube,
+    volumetric,
 )
-from jaxcloseup.fields.contract import RadianceField
 from jaxcloseup.fields.volume.config import NerfConfig
-from jaxcloseup.fields.volume.nerf import nerf_field
-from jaxcloseup.photos.scene import Scene
+from jaxcloseup.labels.config import LabelConfig
+from jaxcloseup.lazy import lazy_function
 from jaxcloseup.setting import setting
 from jaxcloseup.training.config import TrainConfig
 
@@ -78,33 +75,10 @@ QUICK = Preset(
     windows=WindowConfig(finest=8),
 )
 
-
-def make_field(config: NerfTrainingConfig, scene: Scene, growth: int) -> RadianceField:
-    """A NeRF between the scene's near and far; nothing overflows, so `growth` says nothing."""
-    del growth
-    center, scale = unit_cube(scene) if config.normalize else ((0.0, 0.0, 0.0), 1.0)
-    return nerf_field(
-        config,
-        near=scene.near,
-        far=scene.far,
-        center=center,
-        scale=scale,
-        supervision=depth_supervision(config, scene),
-    )
-
-
-def make_optimizer(config: NerfTrainingConfig, scene: Scene) -> optax.GradientTransformation:
-    """Adam with an exponentially decaying learning rate."""
-    del scene
-    return optax.adam(
-        optax.exponential_decay(config.initial_lr, config.lr_decay_steps, config.lr_decay)
-    )
-
-
-METHOD = Method(
+METHOD = volumetric(
+    lazy_function("jaxcloseup.fields.volume.nerf", "nerf_field"),
+    help="a coarse and a fine network (Mildenhall et al. 2020)",
     presets={"quick": QUICK, "paper": PAPER, "released": RELEASED},
-    make_field=make_field,
-    make_optimizer=make_optimizer,
-    renders_pixels=True,
-    target_steps=lambda config, count: config.target_steps,
+    make_optimizer=NETWORK_ADAM,
+    normalize=lambda config: config.normalize,
 )

@@ -1,8 +1,8 @@
-"""Instant-NGP with proposals: presets and field."""
+"""Instant-NGP with proposals: presets."""
 
 import dataclasses
 
-from jaxcloseup.app.methods.method import LabelConfig, Preset, WindowConfig
+from jaxcloseup.app.methods.method import Preset, WindowConfig
 from jaxcloseup.app.methods.volumes import (
     QUICK_LABELS,
     QUICK_TARGETS,
@@ -11,7 +11,8 @@ from jaxcloseup.app.methods.volumes import (
     volumetric,
 )
 from jaxcloseup.fields.volume.config import HashGridConfig, NgpConfig
-from jaxcloseup.fields.volume.ngp import ngp_field
+from jaxcloseup.labels.config import LabelConfig
+from jaxcloseup.lazy import lazy_function
 from jaxcloseup.training.config import TrainConfig
 
 
@@ -55,4 +56,8 @@ QUICK = Preset(
     windows=WindowConfig(),
 )
 
-METHOD = volumetric(ngp_field, quick=QUICK, paper=PAPER)
+METHOD = volumetric(
+    lazy_function("jaxcloseup.fields.volume.ngp", "ngp_field"),
+    help="Instant-NGP, a hash grid and small networks, with proposals (Müller et al. 2022)",
+    presets={"quick": QUICK, "paper": PAPER},
+)

@@ -1,8 +1,8 @@
-"""TensoRF: presets and field."""
+"""TensoRF: presets."""
 
 import dataclasses
 
-from jaxcloseup.app.methods.method import LabelConfig, Preset, WindowConfig
+from jaxcloseup.app.methods.method import Preset, WindowConfig
 from jaxcloseup.app.methods.volumes import (
     QUICK_LABELS,
     QUICK_TARGETS,
@@ -11,7 +11,8 @@ from jaxcloseup.app.methods.volumes import (
     volumetric,
 )
 from jaxcloseup.fields.volume.config import TensorfConfig
-from jaxcloseup.fields.volume.tensorf import tensorf_field
+from jaxcloseup.labels.config import LabelConfig
+from jaxcloseup.lazy import lazy_function
 from jaxcloseup.training.config import TrainConfig
 
 
@@ -61,4 +62,8 @@ QUICK = Preset(
     windows=WindowConfig(),
 )
 
-METHOD = volumetric(tensorf_field, quick=QUICK, paper=PAPER)
+METHOD = volumetric(
+    lazy_function("jaxcloseup.fields.volume.tensorf", "tensorf_field"),
+    help="TensoRF, sums of vector-matrix products on a grid that grows (Chen et al. 2022)",
+    presets={"quick": QUICK, "paper": PAPER},
+)

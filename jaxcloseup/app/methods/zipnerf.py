@@ -1,8 +1,8 @@
-"""Zip-NeRF: presets and field."""
+"""Zip-NeRF: presets."""
 
 import dataclasses
 
-from jaxcloseup.app.methods.method import LabelConfig, Preset, WindowConfig
+from jaxcloseup.app.methods.method import Preset, WindowConfig
 from jaxcloseup.app.methods.volumes import (
     QUICK_LABELS,
     QUICK_TARGETS,
@@ -11,7 +11,8 @@ from jaxcloseup.app.methods.volumes import (
     volumetric,
 )
 from jaxcloseup.fields.volume.config import HashGridConfig, ZipNerfConfig
-from jaxcloseup.fields.volume.zipnerf import zipnerf_field
+from jaxcloseup.labels.config import LabelConfig
+from jaxcloseup.lazy import lazy_function
 from jaxcloseup.training.config import TrainConfig
 
 
@@ -59,4 +60,8 @@ QUICK = Preset(
     windows=WindowConfig(),
 )
 
-METHOD = volumetric(zipnerf_field, quick=QUICK, paper=PAPER)
+METHOD = volumetric(
+    lazy_function("jaxcloseup.fields.volume.zipnerf", "zipnerf_field"),
+    help="Zip-NeRF, anti-aliased hash features over proposals (Barron et al. 2023)",
+    presets={"quick": QUICK, "paper": PAPER},
+)

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcloseup.app import progress
-from jaxcloseup.app.methods import LabelConfig
 from jaxcloseup.app.run.gate import gated, lets_in, weigh
 from jaxcloseup.app.run.kept_detail import FindDetail, refresh_detail
 from jaxcloseup.app.run.loop import TrainingError
@@ -17,6 +16,7 @@ from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.setup import LabelStart, label_targets, rendered_depths
 from jaxcloseup.detail.add import Detail
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
+from jaxcloseup.labels.config import LabelConfig
 from jaxcloseup.labels.make import PseudoSettings
 from jaxcloseup.labels.rules import label_depth
 from jaxcloseup.photos.gather import gather

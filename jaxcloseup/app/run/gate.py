@@ -13,12 +13,12 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from jaxcloseup.app.methods import LabelConfig, pseudo_settings
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.setup import LabelStart
 from jaxcloseup.app.score.audit import audit_left_out
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.labels.config import LabelConfig, pseudo_settings
 from jaxcloseup.labels.make import LabelSources, PseudoSettings
 
 

@@ -2,7 +2,8 @@
 
 from collections.abc import Sequence
 
-from jaxcloseup.app.methods import METHODS, Preset
+from jaxcloseup.app.methods.method import Preset
+from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.photos.scene import Scene
 
 

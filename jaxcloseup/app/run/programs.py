@@ -16,7 +16,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from orbax.checkpoint.multihost import sync_global_processes
 
 from jaxcloseup.app import progress
-from jaxcloseup.app.methods import METHODS, Preset
+from jaxcloseup.app.methods.method import Preset
+from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.labels.make import LabelSources, PseudoSettings

@@ -13,7 +13,7 @@ import numpy as np
 
 import jaxcloseup
 from jaxcloseup.app import progress
-from jaxcloseup.app.methods import LabelConfig, Preset, pseudo_settings
+from jaxcloseup.app.methods.method import Preset
 from jaxcloseup.app.methods.settings import plain_config
 from jaxcloseup.app.run.kept_detail import FindDetail, detailed_views
 from jaxcloseup.app.run.logs import TrainLog
@@ -25,6 +25,7 @@ from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.fields.splats.surfels import random_points
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.io.memory import give_back_memory, installed_memory
+from jaxcloseup.labels.config import LabelConfig, pseudo_settings
 from jaxcloseup.labels.make import (
     LabelSources,
     PseudoSettings,

@@ -6,8 +6,10 @@ import typing
 from collections.abc import Mapping
 from typing import Any
 
-from jaxcloseup.app.methods import METHODS, Preset
+from jaxcloseup.app.methods.method import Preset
+from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.methods.settings import check_value, is_plain, plain_config
+from jaxcloseup.setting import Limits, limits_of
 
 
 def preset_from_config(stored: Mapping[str, Any]) -> tuple[Preset, dict[str, Any]]:
@@ -43,8 +45,8 @@ def preset_from_config(stored: Mapping[str, Any]) -> tuple[Preset, dict[str, Any
     return preset, {name.split(".")[-1]: value for name, value in absent.items()}
 
 
-def _collect(record, name, records):
-    """The types of records in a preset, by the path where they are."""
+def _collect(record: Any, name: str, records: dict[str, set[type]]) -> None:
+    """Add the types of records in a preset, by the path where they are."""
     records.setdefault(name, set()).add(type(record))
     for field in dataclasses.fields(record):
         value = getattr(record, field.name)
@@ -52,14 +54,19 @@ def _collect(record, name, records):
             _collect(value, f"{name}.{field.name}", records)
 
 
-def _remove(config, name):
+def _remove(config: dict[str, Any], name: str) -> None:
     *path, last = name.split(".")[1:]
     for key in path:
         config = config[key]
     del config[last]
 
 
-def _rebuild(value, name, records, absent):
+def _rebuild(
+    value: Mapping[str, Any],
+    name: str,
+    records: Mapping[str, set[type]],
+    absent: dict[str, Any],
+) -> Any:
     if name not in records:
         raise ValueError(f"{name} holds fields")
     # The run stored one of these records: the one that shares most fields with it.
@@ -67,28 +74,29 @@ def _rebuild(value, name, records, absent):
     choice = max(choices, key=lambda record: len(_names(record) & set(value)))
     if unknown := sorted(set(value) - _names(choice)):
         raise ValueError(f"{name} has {', '.join(unknown)}, which this version does not know")
-    known, kinds = {}, typing.get_type_hints(choice)
+    known: dict[str, Any] = {}
+    kinds = typing.get_type_hints(choice)
     for field in dataclasses.fields(choice):
-        path = f"{name}.{field.name}"
-        if field.name in value:
-            known[field.name] = _value(value[field.name], path, kinds[field.name], records, absent)
-        elif field.default is dataclasses.MISSING:
-            raise ValueError(f"{name} lacks {field.name}")
-        else:
+        path, kind = f"{name}.{field.name}", kinds[field.name]
+        if field.name not in value:
+            if field.default is dataclasses.MISSING:
+                raise ValueError(f"{name} lacks {field.name}")
             absent[path] = field.default
+        elif isinstance(value[field.name], Mapping):
+            known[field.name] = _rebuild(value[field.name], path, records, absent)
+        elif path == "config.method":
+            known[field.name] = value[field.name]
+        else:
+            limits = limits_of(choice, field.name)
+            known[field.name] = _checked(value[field.name], path, kind, limits)
     return choice(**known)
 
 
-def _value(value, name, kind, records, absent):
-    """The value of a field: a record, or what `check_value` lets through."""
-    if isinstance(value, Mapping):
-        return _rebuild(value, name, records, absent)
-    if name == "config.method":
-        return value
+def _checked(value: Any, name: str, kind: Any, limits: Limits) -> Any:
+    """Return the value of a field that holds no record, if `check_value` lets it through."""
     if is_plain(kind):
-        value = _plain(value)
         try:
-            return check_value(name, value, kind)
+            return check_value(_from_json(value), kind, limits)
         except ValueError as error:
             raise ValueError(f"{name} must be {error}") from None
     if value is None and type(None) in typing.get_args(kind):
@@ -96,11 +104,11 @@ def _value(value, name, kind, records, absent):
     raise ValueError(f"{name} must hold fields")
 
 
-def _plain(value):
+def _from_json(value: Any) -> Any:
     if isinstance(value, list):
-        return tuple(map(_plain, value))
+        return tuple(map(_from_json, value))
     return math.inf if value == "inf" else value
 
 
-def _names(record):
+def _names(record: type) -> set[str]:
     return {field.name for field in dataclasses.fields(record)}

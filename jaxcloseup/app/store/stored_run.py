@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxcloseup.app.methods import Preset
+from jaxcloseup.app.methods.method import Preset
 from jaxcloseup.app.methods.settings import with_settings
 from jaxcloseup.app.run import manifest
 from jaxcloseup.app.run.loop import TrainingError

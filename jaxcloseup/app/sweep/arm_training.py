@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcloseup.app import progress
-from jaxcloseup.app.methods import Preset
+from jaxcloseup.app.methods.method import Preset
 from jaxcloseup.app.run.fine_tuning import target_data
 from jaxcloseup.app.run.kept_detail import FindDetail, detail_finder
 from jaxcloseup.app.run.logs import TrainLog

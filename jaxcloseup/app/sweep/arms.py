@@ -5,8 +5,9 @@ from typing import Any, NamedTuple
 
 import jax
 
-from jaxcloseup.app.methods import LabelConfig, Preset, pseudo_settings
+from jaxcloseup.app.methods.method import Preset
 from jaxcloseup.app.methods.settings import with_settings
+from jaxcloseup.labels.config import LabelConfig, pseudo_settings
 from jaxcloseup.labels.make import PseudoSettings
 from jaxcloseup.photos.scene import Scene
 

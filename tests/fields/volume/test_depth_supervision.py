@@ -6,7 +6,7 @@ import numpy as np
 import plane
 import pytest
 
-from jaxcloseup.app.methods.sightings import find_sightings
+from jaxcloseup.app.methods.shared.sightings import find_sightings
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.fields.volume.depth_supervision import DepthSupervision, Sightings, depth_divergence
 from jaxcloseup.fields.volume.rays import Traced, VolumeAux, ray_field

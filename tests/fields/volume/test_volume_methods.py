@@ -13,7 +13,7 @@ from reference import nerf_network
 from tiny_runs import TINY
 from tiny_training import assert_same_step
 
-from jaxcloseup.app.methods import METHODS
+from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.methods.settings import plain_config
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.setup import initial_state
