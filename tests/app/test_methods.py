@@ -14,9 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 import plane
 import pytest
+from absl import flags
+from absl.testing import flagsaver
 from tiny_runs import TINY_MIP, TINY_SURFELS
 
 from jaxcloseup.app import methods
+from jaxcloseup.app.cli import render, run, sweep
 from jaxcloseup.app.methods import registry
 from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.methods.shared import splat_training
