@@ -10,7 +10,9 @@ __all__, __getattr__, __dir__ = lazy_names(
     __name__,
     {
         "geometry.cameras": "Camera",
-        "labels.make": "PseudoLabel PseudoSettings best_source label_views make_label",
+        "labels.config": "LabelConfig pseudo_settings",
+        "labels.make": "PseudoLabel PseudoSettings make_label",
+        "labels.target_views": "best_source label_views",
         "fields.contract": "RadianceField Rendering",
         "photos.scene": "Scene SceneError",
         "fields.splats.surfels": "Surfels surfels_from_points",

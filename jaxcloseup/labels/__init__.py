@@ -9,8 +9,11 @@ __all__, __getattr__, __dir__ = lazy_names(
         "config": "LabelConfig pseudo_settings",
         "make": (
             "LabelSources label_sources PseudoSettings PseudoLabel sample_virtual_camera "
-            "make_label label_pixels label_views best_source"
+            "sample_closeups make_label label_pixels"
         ),
-        "rules": "label_depth undivided_label_depth add_label_loss pool_label_loss LabelRule",
+        "target_views": "best_source label_views render_depths",
+        "rules": (
+            "LABEL_RULES LabelRule add_label_loss label_depth pool_label_loss undivided_label_depth"
+        ),
     },
 )

@@ -22,9 +22,10 @@ Loss = tuple[jax.Array, dict[str, jax.Array]]
 def label_depth(
     rendering: Rendering, *, near: float = 0.0, far: float = math.inf, min_alpha: float = 0.5
 ) -> jax.Array:
-    """Z-depth `[...]` of a rendering where labels can use it, 0 elsewhere.
+    """Return the z-depth `[...]` of a rendering where labels can use it, 0 elsewhere.
 
-    Labels cannot use depth where alpha is below `min_alpha` or depth outside [near, far].
+    Labels cannot use depth where alpha is below `min_alpha`, nor depth outside [near, far]. It is
+    compiled here, so that callers that are not compiled themselves get the same digits.
     """
     defined = rendering.alpha >= min_alpha
     defined &= (rendering.depth >= near) & (rendering.depth <= far)
@@ -32,7 +33,7 @@ def label_depth(
 
 
 def undivided_label_depth(rendering: Rendering, **limits: float) -> jax.Array:
-    """`label_depth` of the weighted sum of depths, which the script does not divide by alpha."""
+    """Return `label_depth` of the sum of weighted depths, not divided by alpha, as released."""
     return label_depth(rendering._replace(depth=rendering.depth * rendering.alpha), **limits)
 
 
@@ -42,10 +43,10 @@ def add_label_loss(
     labels: tuple[Batch, jax.Array],
     weight: jax.Array,
 ) -> Loss:
-    """(1 - w) L_c + w L_pl, each a mean over its own pixels: the paper's total loss with w = 1/2.
+    """Return (1 - w) L_c + w L_pl, each a mean over its own pixels; w = 1/2 in the paper.
 
     Args:
-      loss_of: loss and metrics of a batch and a random key.
+      loss_of: `(batch, key) -> (loss, metrics)`.
       photographs: pixels of photographs, and a key.
       labels: labeled pixels, and a key.
       weight: `[]` w.
@@ -53,10 +54,8 @@ def add_label_loss(
     Returns:
       The loss, and the metrics of both; those of labels as `label_<name>`.
     """
-    (photograph_loss, metrics), (label_loss, label_metrics) = (
-        loss_of(*photographs),
-        loss_of(*labels),
-    )
+    photograph_loss, metrics = loss_of(*photographs)
+    label_loss, label_metrics = loss_of(*labels)
     named = {f"label_{name}": value for name, value in label_metrics.items()}
     return (1 - weight) * photograph_loss + weight * label_loss, metrics | named
 
@@ -67,7 +66,7 @@ def pool_label_loss(
     labels: tuple[Batch, jax.Array],
     weight: jax.Array,
 ) -> Loss:
-    """One mean over all pixels of both, as released. Arguments as in `add_label_loss`.
+    """Return one mean over the pixels of both, as released. Arguments as in `add_label_loss`.
 
     Any `weight` above 0 counts as 1.
     """
@@ -76,10 +75,11 @@ def pool_label_loss(
     return loss_of(_pool(batch, labeled._replace(weight=counts * labeled.weight)), key)
 
 
-def _pool(batch, labeled):
-    """One batch of the pixels of both; the second has one camera for all its pixels."""
+def _pool(batch: Batch, labeled: Batch) -> Batch:
+    """Return one batch with the pixels of both; `labeled` has one camera for all its pixels."""
+    count = labeled.weight.size
     cameras = jax.tree.map(
-        lambda leaf: jnp.broadcast_to(leaf, (len(labeled.pixels), *leaf.shape)), labeled.cameras
+        lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), labeled.cameras
     )
     return jax.tree.map(
         lambda *leaves: jnp.concatenate(leaves), batch, labeled._replace(cameras=cameras)
@@ -87,7 +87,7 @@ def _pool(batch, labeled):
 
 
 class LabelRule(NamedTuple):
-    """How a step makes and weighs labels of single pixels.
+    """Functions by which a step makes and weighs labels of single pixels.
 
     Attributes:
       depth: `(rendering, near=, far=) -> [...]`, the z-depth of labels, 0 where undefined.

@@ -7,14 +7,8 @@ from tiny_training import settings
 
 from jaxcloseup.geometry.cameras import pixel_grid
 from jaxcloseup.geometry.poses import PoseSettings
-from jaxcloseup.labels.make import (
-    PseudoSettings,
-    best_source,
-    label_sources,
-    label_views,
-    make_label,
-    sample_virtual_camera,
-)
+from jaxcloseup.labels.make import PseudoSettings, label_sources, make_label, sample_virtual_camera
+from jaxcloseup.labels.target_views import best_source, label_views
 
 
 label = jax.jit(make_label)

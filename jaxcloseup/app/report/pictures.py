@@ -13,13 +13,8 @@ from jaxcloseup.app.score.scores import Target
 from jaxcloseup.artifacts.images import colorize_depth, colorize_error, side_by_side, write_png
 from jaxcloseup.captures.load import Scene
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
-from jaxcloseup.labels.make import (
-    LabelSources,
-    PseudoSettings,
-    best_source,
-    label_pixels,
-    sample_virtual_camera,
-)
+from jaxcloseup.labels.make import LabelSources, PseudoSettings, label_pixels, sample_virtual_camera
+from jaxcloseup.labels.target_views import best_source
 
 
 SHOWN_LABELS = 6  # pictures of labels for each kind of camera

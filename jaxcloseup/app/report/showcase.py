@@ -10,7 +10,8 @@ import numpy as np
 from jaxcloseup.app.score.scores import Target
 from jaxcloseup.artifacts.images import to_uint8
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points, points_to_pixels
-from jaxcloseup.labels.make import LabelSources, best_source
+from jaxcloseup.labels.make import LabelSources
+from jaxcloseup.labels.target_views import best_source
 from jaxcloseup.photos.pyramids import Pyramid
 from jaxcloseup.photos.views import camera_at
 

@@ -30,10 +30,10 @@ from jaxcloseup.labels.make import (
     LabelSources,
     PseudoSettings,
     label_sources,
-    label_views,
     sample_virtual_camera,
 )
 from jaxcloseup.labels.rules import LABEL_RULES, label_depth
+from jaxcloseup.labels.target_views import label_views
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.views import Views, camera_at
 from jaxcloseup.training.steps import TrainState, init_state

@@ -23,12 +23,12 @@ from jaxcloseup.geometry.warp import backward_warp
 from jaxcloseup.labels.make import (
     LabelSources,
     PseudoSettings,
-    best_source,
     label_pixels,
     label_sources,
     sample_virtual_camera,
 )
 from jaxcloseup.labels.rules import label_depth
+from jaxcloseup.labels.target_views import best_source
 from jaxcloseup.photos.views import camera_at, to_float
 
 

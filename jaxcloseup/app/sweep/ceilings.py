@@ -12,9 +12,9 @@ from jaxcloseup.labels.make import (
     LabelSources,
     PseudoSettings,
     label_sources,
-    label_views,
     sample_virtual_camera,
 )
+from jaxcloseup.labels.target_views import label_views
 from jaxcloseup.photos.views import Views, camera_at
 
 

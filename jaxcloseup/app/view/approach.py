@@ -12,8 +12,9 @@ from jaxcloseup.app.view.camera_paths import dolly, named_cameras
 from jaxcloseup.artifacts.images import to_uint8
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera, pixels_to_points, points_to_pixels
-from jaxcloseup.labels.make import LabelSources, best_source
+from jaxcloseup.labels.make import LabelSources
 from jaxcloseup.labels.rules import label_depth
+from jaxcloseup.labels.target_views import best_source
 
 
 FRAMES = 24
