@@ -1,7 +1,6 @@
-"""Damage to files, that knows their formats: a mutation changes one file in a folder.
+"""Damage to files, by format: a mutation changes one file of a folder.
 
-Every function takes a `random.Random` and the bytes of a file, and returns other bytes. `mutate`
-chooses one that fits the file's name.
+A function of a format takes a `random.Random` and the bytes of a file, and returns other bytes.
 """
 
 import io
@@ -21,33 +20,32 @@ VALUES = [
     *(-1, 0, 1, 2, 0.5, 255, 2**31, -(2**31), 2**63, 10**30, 1e-300, 1e-9, 1e9, 1e30, 1e39, 1e300),
     *(float("nan"), float("inf"), -float("inf"), [], {}, [[]], [0], {"a": 1}, NESTED),
 ]
-NUMBERS = "0 -1 1 2 0.5 nan inf -inf 1e9 1e39 1e300 1e-300 255 4294967296 18446744073709551616 x -"
+WORDS = "0 -1 1 2 0.5 nan inf -inf 1e9 1e39 1e300 1e-300 255 4294967296 18446744073709551616 x -"
+NUMBERS = {  # by little-endian type
+    "<d": [float("nan"), float("inf"), -1e300, 1e39, 0.0, 1e-300],
+    "<f": [float("nan"), float("inf"), -1e38, 0.0],
+    "<q": [-1, 2**62, -(2**63), 10**6],
+    "<Q": [2**64 - 1, 2**40, 10**12, 0],
+    "<i": [-1, 2**31 - 1, 0, 12345, 7],
+}
 PNG_START = b"\x89PNG\r\n\x1a\n"
 
 
 def damage_bytes(rng, data):
     """Cut, overwrite, insert, repeat or drop bytes anywhere."""
-    data = bytearray(data)
-    kind = rng.randrange(8)
     at = rng.randrange(len(data) + 1)
     length = min(rng.choice([1, 1, 2, 4, 8, 64, 1000]), len(data) - at)
     noise = rng.choice([rng.randbytes(length), b"\0" * length, b"\xff" * length])
-    if kind == 0:
-        return bytes(data[:at])
-    if kind == 1:
-        return b""
-    if kind == 2:
-        return bytes(data) + rng.randbytes(rng.choice([1, 100, 5000]))
-    if kind == 3:
-        return bytes(data[:at] + noise + data[at:])
-    if kind == 4:
-        return bytes(data[:at] + data[at + length :])
-    if kind == 5:
-        return bytes(data[:at] + data[at : at + length] * rng.choice([2, 50]) + data[at + length :])
-    data[at : at + length] = noise
-    if kind == 6 and data:
-        data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
-    return bytes(data)
+    before, part, after = data[:at], data[at : at + length], data[at + length :]
+    flipped = bytearray(data)
+    if data:
+        flipped[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+    added = data + rng.randbytes(rng.choice([1, 100, 5000]))
+    repeated = before + part * rng.choice([2, 50]) + after
+    inserted, overwritten = before + noise + part + after, before + noise + after
+    return rng.choice(
+        [before, b"", added, inserted, before + after, repeated, overwritten, bytes(flipped)]
+    )
 
 
 def damage_json(rng, data):
@@ -62,7 +60,7 @@ def damage_json(rng, data):
         holder *= rng.choice([0, 2, 300])
     elif kind == 1:
         holder[str(key)[::-1]] = holder.pop(key)
-    elif kind == 2 and _is_number(holder[key]):
+    elif kind == 2 and type(holder[key]) in (int, float):
         holder[key] *= rng.choice([-1, 1e-12, 1e3, 1e9, 1e38, 1e300])
     elif kind == 3:
         other, place = rng.choice(places)
@@ -86,51 +84,42 @@ def _places(node):
         yield from _places(node[key])
 
 
-def _is_number(value):
-    return isinstance(value, int | float) and not isinstance(value, bool)
+def damage_lines(rng, data):
+    """Change one line of JSON lines."""
+    lines = data.split(b"\n")
+    at = rng.randrange(len(lines))
+    lines[at] = damage_json(rng, lines[at]) if lines[at].startswith(b"{") else b"[[]]"
+    return b"\n".join(lines)
 
 
 def damage_text(rng, data):
     """Change words and lines of a text of numbers."""
     lines = data.decode("latin-1").split("\n")
     at = rng.randrange(len(lines))
-    words, kind = lines[at].split(" "), rng.randrange(7)
-    if kind == 0:
-        del lines[at]
-    elif kind == 1:
-        lines[at:at] = [lines[at]] * rng.choice([1, 1000])
-    elif kind == 2:
-        lines[at] = " ".join(words + words[: rng.randrange(3)])
-    elif kind == 3:
-        lines[at] = " ".join(words[: rng.randrange(len(words))])
-    elif kind == 4:
+    words = lines[at].split(" ")
+    others = list(words)
+    for _ in range(rng.choice([1, 1, 3])):
+        others[rng.randrange(len(words))] = rng.choice(WORDS.split())
+    change = rng.randrange(7)
+    if change == 0:
         rng.shuffle(lines)
     else:
-        for _ in range(rng.choice([1, 1, 3])):
-            words[rng.randrange(len(words))] = rng.choice(NUMBERS.split())
-        lines[at] = " ".join(words)
+        more, fewer = words + words[: rng.randrange(3)], words[: rng.randrange(len(words))]
+        kept = [[lines[at]] * rng.choice([0, 2, 1000]), [" ".join(more)], [" ".join(fewer)]]
+        lines[at : at + 1] = kept[change - 1] if change <= 3 else [" ".join(others)]
     return "\n".join(lines).encode("latin-1")
 
 
 def damage_numbers(rng, data):
     """Overwrite a count, an identity or a floating-point number in little-endian binary."""
-    data = bytearray(data)
     if len(data) < 8:
-        return damage_bytes(rng, bytes(data))
-    kind = rng.choice(["<d", "<q", "<Q", "<i", "<f"])
-    size = struct.calcsize(kind)
-    value = {
-        "<d": [float("nan"), float("inf"), -1e300, 1e39, 0.0, 1e-300],
-        "<f": [float("nan"), float("inf"), -1e38, 0.0],
-        "<q": [-1, 2**62, -(2**63), 10**6],
-        "<Q": [2**64 - 1, 2**40, 10**12, 0],
-        "<i": [-1, 2**31 - 1, 0, 12345, 7],
-    }[kind]
+        return damage_bytes(rng, data)
+    kind = rng.choice(list(NUMBERS))
+    value = struct.pack(kind, rng.choice(NUMBERS[kind]))
     # Counts and identities lie at the beginning, and everything at multiples of four, or nearly.
     at = rng.choice([0, 8, 12, 16, 20, 4 * rng.randrange(len(data) // 4), rng.randrange(len(data))])
-    at = min(at, len(data) - size)
-    data[at : at + size] = struct.pack(kind, rng.choice(value))
-    return bytes(data)
+    at = min(at, len(data) - len(value))
+    return data[:at] + value + data[at + len(value) :]
 
 
 def damage_ply(rng, data):
@@ -146,7 +135,7 @@ def damage_ply(rng, data):
         lines.insert(at, rng.choice(lines))
     elif kind == 2:
         count = rng.choice([0, -1, 1, 10**6, 10**12, 2**63, 10**30])
-        lines = [b"element vertex %d" % count if b"vertex" in one else one for one in lines]
+        lines = [b"element vertex %d" % count if b"vertex" in line else line for line in lines]
     elif kind == 3:
         types = [b"double", b"uchar", b"int", b"list uchar int", b"complex", b"float128", b"short"]
         lines[at] = lines[at].replace(b"float", rng.choice(types))
@@ -161,31 +150,26 @@ def damage_ply(rng, data):
 def damage_npy(rng, data):
     """Change the header of an array, or its numbers."""
     if len(data) < 80 or rng.random() < 0.4:
-        body = data[128:] if len(data) > 136 else data
-        return data[: len(data) - len(body)] + damage_numbers(rng, body)
+        start = 128 if len(data) > 136 else 0
+        return data[:start] + damage_numbers(rng, data[start:])
     (length,) = struct.unpack("<H", data[8:10])
-    header = data[10 : 10 + length].decode("latin-1")
-    kinds = ["<f4", ">f8", "<f2", "<c16", "|O", "|S8", "<U4", "|b1", "<i8", "<M8[s]", "|V8", "x"]
+    header = data[10 : 10 + length]
+    kinds = [b"<f4", b">f8", b"<f2", b"<c16", b"|O", b"|S8", b"<U4", b"|b1", b"<M8[s]", b"|V8"]
     shapes = ["()", "(0, 17)", "(3,)", "(-3, 17)", "(1000000000000, 17)", "(3, 0)", "(17, 3)", "3"]
-    change = rng.randrange(5)
-    if change == 0:
-        header = header.replace("<f8", rng.choice(kinds))
-    elif change == 1:
-        header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {rng.choice(shapes)}, }}\n"
-    elif change == 2:
-        header = header.replace("False", rng.choice(["True", "None", "1", "[]"]))
-    elif change == 3:
-        header = damage_bytes(rng, header.encode("latin-1")).decode("latin-1")
-    version = data[6:8] if change != 4 else bytes([rng.randrange(5), rng.randrange(3)])
-    body = header.encode("latin-1")
-    return (
-        data[:6] + version + struct.pack("<H", min(len(body), 65535)) + body + data[10 + length :]
-    )
-
-
-def png_chunk(kind, data):
-    """A chunk with its checksum."""
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    claim = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {rng.choice(shapes)}, }}\n"
+    changes = [
+        header.replace(b"<f8", rng.choice(kinds)),
+        claim.encode(),
+        header.replace(b"False", rng.choice([b"True", b"None", b"1", b"[]"])),
+        damage_bytes(rng, header),
+        header,
+    ]
+    header = rng.choice(changes)
+    version = data[6:8]
+    if header == changes[-1]:
+        version = bytes([rng.randrange(5), rng.randrange(3)])
+    size = struct.pack("<H", min(len(header), 65535))
+    return data[:6] + version + size + header + data[10 + length :]
 
 
 def damage_png(rng, data):
@@ -195,34 +179,32 @@ def damage_png(rng, data):
         (length,) = struct.unpack(">I", data[at : at + 4])
         chunks.append((data[at + 4 : at + 8], data[at + 8 : at + 8 + length]))
         at += 12 + length
-    kind = rng.randrange(6)
+    at, kind = rng.randrange(len(chunks)), rng.randrange(6)
     if kind <= 2:
         width, height, depth, color, *rest = struct.unpack(">IIBBBBB", chunks[0][1])
         side = rng.choice([0, 1, 3, 100, 30000, 2**16, 2**31 - 1, 2**32 - 1])
-        width, height = (
-            (side, height) if kind == 0 else (width, side) if kind == 1 else (side, side)
-        )
-        if kind == 2 and rng.random() < 0.5:
-            width, height = struct.unpack(">II", chunks[0][1][:8])
+        sizes = [(side, height), (width, side), (side, side), (width, height)]
+        width, height = rng.choice(sizes)
+        if kind == 2:
             depth, color = rng.choice([1, 2, 4, 8, 16, 32]), rng.choice([0, 2, 3, 4, 6, 9])
         chunks[0] = (b"IHDR", struct.pack(">IIBBBBB", width, height, depth, color, *rest))
     elif kind == 3:
-        del chunks[rng.randrange(len(chunks))]
+        del chunks[at]
     elif kind == 4:
         noise = rng.randbytes(rng.choice([0, 8, 300]))
         name = rng.choice([b"PLTE", b"tRNS", b"gAMA", b"iCCP", b"eXIf", b"acTL", b"fcTL", b"tEXt"])
-        chunks.insert(rng.randrange(len(chunks) + 1), (name, noise))
+        chunks.insert(at, (name, noise))
     else:
-        at = rng.randrange(len(chunks))
         chunks[at] = (chunks[at][0], damage_bytes(rng, chunks[at][1]))
-    return PNG_START + b"".join(png_chunk(*one) for one in chunks)
+    return PNG_START + b"".join(
+        struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+        for name, body in chunks
+    )
 
 
 def damage_jpeg(rng, data):
     """Change the size or the components that a JPEG claims, or add a segment."""
-    at = next(
-        (i for i in range(len(data) - 9) if data[i : i + 2] in (b"\xff\xc0", b"\xff\xc2")), -1
-    )
+    at = max(data.find(b"\xff\xc0"), data.find(b"\xff\xc2"))
     kind = rng.randrange(4)
     if at < 0 or kind == 0:
         return damage_bytes(rng, data)
@@ -239,48 +221,37 @@ def damage_jpeg(rng, data):
 
 
 def damage_torch(rng, data):
-    """Change the pickle in a zip of tensors, or what it names."""
+    """Change a part of a zip of tensors, most often the pickle and what it names."""
     if not zipfile.is_zipfile(io.BytesIO(data)) or rng.random() < 0.1:
         return damage_bytes(rng, data)
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        parts = [(name, archive.read(name)) for name in archive.namelist()]
-    at, kind = rng.randrange(len(parts)), rng.randrange(7)
-    pickled = next(i for i, (name, _) in enumerate(parts) if name.endswith("data.pkl"))
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    name, kind = rng.choice(list(parts)), rng.randrange(7)
+    pickled = next(name for name in parts if name.endswith("data.pkl"))
+    body = parts[pickled]
     if kind == 0:
-        del parts[at]
+        del parts[name]
     elif kind == 1:
-        parts[at] = (parts[at][0][::-1], parts[at][1])
+        parts[name[::-1]] = parts.pop(name)
     elif kind == 2:
-        parts[at] = (parts[at][0], damage_bytes(rng, parts[at][1]))
-    elif kind == 3:  # an integer of one or two bytes becomes another: a shape, a stride, an offset
-        name, body = parts[pickled]
-        spots = [i for i in range(len(body) - 2) if body[i : i + 1] in (b"K", b"M", b"J")]
-        spot = rng.choice(spots or [0])
-        new = rng.choice(
-            [b"K\x00", b"K\xff", b"J\xff\xff\xff\xff", b"J\xff\xff\xff\x7f", b"N", b"]"]
-        )
-        old = {b"K": 2, b"M": 3, b"J": 5}.get(body[spot : spot + 1], 1)
-        parts[pickled] = (name, body[:spot] + new + body[spot + old :])
+        parts[name] = damage_bytes(rng, parts[name])
+    elif kind == 3:  # an integer of one, two or four bytes becomes another: a shape, an offset
+        sizes = {b"K": 2, b"M": 3, b"J": 5}
+        spot = rng.choice([i for i in range(len(body) - 2) if body[i : i + 1] in sizes] or [0])
+        new = [b"K\x00", b"K\xff", b"J\xff\xff\xff\xff", b"J\xff\xff\xff\x7f", b"N", b"]"]
+        end = spot + sizes.get(body[spot : spot + 1], 1)
+        parts[pickled] = body[:spot] + rng.choice(new) + body[end:]
     elif kind == 4:
-        name, body = parts[pickled]
         types = [b"FloatStorage", b"LongStorage", b"OrderedDict", b"_rebuild_tensor_v2", b"torch"]
-        body = body.replace(rng.choice(types), rng.choice([*types, b"system", b"os", b"eval"]), 1)
-        parts[pickled] = (name, body)
+        other = rng.choice([*types, b"system", b"os", b"eval"])
+        parts[pickled] = body.replace(rng.choice(types), other, 1)
     else:
-        parts[pickled] = (parts[pickled][0], damage_bytes(rng, parts[pickled][1]))
+        parts[pickled] = damage_bytes(rng, body)
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
-        for name, body in dict(parts).items():
+        for name, body in parts.items():
             archive.writestr(name, body)
     return file.getvalue()
-
-
-def damage_lines(rng, data):
-    """Change one line of JSON lines."""
-    lines = data.split(b"\n")
-    at = rng.randrange(len(lines))
-    lines[at] = damage_json(rng, lines[at]) if lines[at].startswith(b"{") else b"[[]]"
-    return b"\n".join(lines)
 
 
 BY_ENDING = {
@@ -292,34 +263,23 @@ BY_ENDING = {
 
 def replace_file(rng, path):
     """Put something else in the file's place, that may be no ordinary file."""
-    kind = rng.randrange(7)
-    others = [one for one in path.parent.iterdir() if one.is_file() and one != path]
+    others = [other for other in path.parent.iterdir() if other.is_file() and other != path]
     path.unlink()
-    if kind == 0:
-        path.mkdir()
-    elif kind == 1:
-        os.mkfifo(path)
-    elif kind == 2:
-        path.symlink_to(path)
-    elif kind == 3:
-        path.symlink_to("/dev/zero")
-    elif kind == 4:
-        path.touch()
-        os.truncate(path, 2**40)
-    elif kind == 5 and others:
-        shutil.copy(rng.choice(others), path)
+    changes = [
+        path.mkdir,
+        lambda: os.mkfifo(path),
+        lambda: path.symlink_to(path),
+        lambda: path.symlink_to("/dev/zero"),
+        lambda: path.touch() or os.truncate(path, 2**40),
+        lambda: others and shutil.copy(rng.choice(others), path),
+        lambda: None,
+    ]
+    rng.choice(changes)()
 
 
 def mutate(rng: random.Random, folder: pathlib.Path, only: str = "*") -> str:
-    """Damage one file of a folder; returns which and how.
-
-    Args:
-      rng: decides.
-      folder: is changed.
-      only: pattern of the names of files to damage.
-    """
-    files = sorted(path for path in folder.rglob(only) if path.is_file())
-    path = rng.choice(files)
+    """Damage one file of a folder whose name fits the pattern `only`; return which and how."""
+    path = rng.choice(sorted(path for path in folder.rglob(only) if path.is_file()))
     if rng.random() < 0.07:
         replace_file(rng, path)
         return f"{path.relative_to(folder)} replaced"

@@ -8,6 +8,7 @@ import pathlib
 from collections.abc import Iterable, Sequence
 
 import cv2
+import imageio.v3 as imageio
 import jax
 import numpy as np
 
@@ -37,6 +38,7 @@ def to_uint8(image: Image) -> np.ndarray:
 
 def encode_png(image: Image) -> bytes:
     """Encode an image as the bytes of an 8-bit PNG."""
+    # By OpenCV, because it takes a twentieth of Pillow's time, at any level of compression.
     return cv2.imencode(".png", to_uint8(image)[..., ::-1])[1].tobytes()
 
 
@@ -69,11 +71,10 @@ def encode_webp_animation(frames: Sequence[Image], *, fps: float, quality: int =
       fps: frames per second.
       quality: WebP's, 1 to 100.
     """
-    animation = cv2.Animation()
-    animation.frames = [np.ascontiguousarray(to_uint8(frame)[..., ::-1]) for frame in frames]
-    animation.durations = np.full(len(frames), round(1000 / fps), np.int32)
-    options = [cv2.IMWRITE_WEBP_QUALITY, quality]
-    return cv2.imencodeanimation(".webp", animation, options)[1].tobytes()
+    shown = [to_uint8(frame) for frame in frames]
+    return imageio.imwrite(
+        "<bytes>", shown, extension=".webp", duration=round(1000 / fps), loop=0, quality=quality
+    )
 
 
 def colorize_depth(

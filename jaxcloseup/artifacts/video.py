@@ -1,20 +1,19 @@
-"""Write videos: MP4 if the extra `video` is installed, otherwise WebM or AVI with OpenCV."""
+"""Write videos: MP4 by FFmpeg if the extra `video` is installed, otherwise WebM by OpenCV."""
 
 import contextlib
-import functools
+import itertools
 import os
 import pathlib
-import subprocess
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 
 import cv2
+import imageio.v2 as imageio
 import numpy as np
 
 from jaxcloseup.artifacts.images import Image, to_uint8
 
 
-# OpenCV's wheels can write VP8, which browsers play, and Motion JPEG, which needs no codec.
-_OPENCV = {".webm": "VP80", ".avi": "MJPG"}
+_CODEC = "VP80"  # VP8, which OpenCV's wheels can write and browsers play
 
 
 def write_video(stem: str | pathlib.Path, frames: Iterable[Image], *, fps: float) -> pathlib.Path:
@@ -36,61 +35,83 @@ def write_video(stem: str | pathlib.Path, frames: Iterable[Image], *, fps: float
     stem = pathlib.Path(stem)
     frames = _even(frames)
     first = next(frames)
-    size = first.shape[1], first.shape[0]
+    ending = ".mp4" if _has_ffmpeg() else ".webm"
+    path = stem.with_name(stem.name + ending)
+    part = stem.with_name(f".{stem.name}.{os.getpid()}.part{ending}")
     try:
-        stem.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise _unwritable(stem, error.strerror) from error
-    for ending, open_writer in _formats():
-        path = stem.with_name(stem.name + ending)
-        part = stem.with_name(f".{stem.name}.{os.getpid()}.part{ending}")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        writer = (_Mp4 if ending == ".mp4" else _WebM)(part, first.shape, fps)
+        count = 0
         try:
-            writer = open_writer(part, size, fps)
-            if writer is None:
-                continue
-            add, close = writer
-            count = 0
-            try:
-                for frame in _all_of(first, frames):
-                    add(frame)
-                    count += 1
-            finally:
-                close()
-            # Codecs do not report a full disk.
-            if _count(part) != count:
-                raise _unwritable(path, "frames are missing, perhaps because the disk is full")
-            part.replace(path)
-        except OSError as error:
-            if error.args and str(path) in str(error):
-                raise
-            reason = error.strerror or str(error).strip().splitlines()[-1]
-            raise _unwritable(path, reason) from error
+            for frame in itertools.chain([first], frames):
+                writer.add(frame)
+                count += 1
         finally:
+            writer.close()
+        # Codecs do not report a full disk.
+        if _count(part) != count:
+            raise OSError("frames are missing, perhaps because the disk is full")
+        part.replace(path)
+    except OSError as error:
+        reason = error.strerror or str(error).strip().splitlines()[-1]
+        raise _unwritable(path, reason) from error
+    finally:
+        with contextlib.suppress(NotADirectoryError):
             part.unlink(missing_ok=True)
-        return path
-    raise _unwritable(stem, "this OpenCV writes neither WebM nor AVI; install the extra `video`")
+    return path
 
 
-def _formats() -> Iterator[tuple[str, Callable]]:
+def _has_ffmpeg() -> bool:
     try:
         import imageio_ffmpeg
 
-        program = imageio_ffmpeg.get_ffmpeg_exe()
+        imageio_ffmpeg.get_ffmpeg_exe()
     except (ImportError, RuntimeError):  # not installed, or installed without FFmpeg
-        pass
-    else:
-        yield ".mp4", functools.partial(_open_ffmpeg, program)
-    for ending, codec in _OPENCV.items():
+        return False
+    return True
 
-        def open_opencv(path, size, fps, codec=codec):
-            fourcc = cv2.VideoWriter_fourcc(*codec)
-            with _silent():
-                writer = cv2.VideoWriter(str(path), fourcc, fps, size)
-            if not writer.isOpened():
-                return None
-            return (lambda frame: writer.write(frame[..., ::-1])), writer.release
 
-        yield ending, open_opencv
+class _Mp4:
+    """H.264 by FFmpeg, at a quality that eyes do not tell from the frames."""
+
+    def __init__(self, path: pathlib.Path, shape: tuple[int, ...], fps: float) -> None:
+        # Otherwise imageio-ffmpeg forks, which JAX's threads forbid.
+        os.environ["IMAGEIO_FFMPEG_NO_PREVENT_SIGINT"] = "1"
+        self._writer = imageio.get_writer(
+            path,
+            format="FFMPEG",
+            mode="I",
+            fps=fps,
+            codec="libx264",
+            quality=None,
+            pixelformat="yuv420p",
+            macro_block_size=2,
+            ffmpeg_log_level="error",
+            output_params=["-crf", "16", "-movflags", "+faststart"],
+        )
+
+    def add(self, frame: np.ndarray) -> None:
+        self._writer.append_data(frame)
+
+    def close(self) -> None:
+        self._writer.close()
+
+
+class _WebM:
+    """WebM by OpenCV."""
+
+    def __init__(self, path: pathlib.Path, shape: tuple[int, ...], fps: float) -> None:
+        fourcc = cv2.VideoWriter.fourcc(*_CODEC)
+        with _silent():
+            self._writer = cv2.VideoWriter(str(path), fourcc, fps, (shape[1], shape[0]))
+        if not self._writer.isOpened():
+            raise OSError("this OpenCV writes no WebM; install the extra `video`")
+
+    def add(self, frame: np.ndarray) -> None:
+        self._writer.write(frame[..., ::-1])
+
+    def close(self) -> None:
+        self._writer.release()
 
 
 @contextlib.contextmanager
@@ -104,28 +125,6 @@ def _silent() -> Iterator[None]:
         os.dup2(held, 2)
         os.close(held)
         os.close(nothing)
-
-
-def _open_ffmpeg(program, path, size, fps):
-    """Open a pipe into FFmpeg; imageio-ffmpeg's own writer forks, which JAX's threads forbid."""
-    frames = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", f"{fps:g}"]
-    codec = ["-c:v", "libx264", "-crf", "16", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
-    command = [program, "-y", "-v", "error", *frames, "-i", "-", *codec, str(path)]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
-    process = subprocess.Popen(command, **pipes)
-
-    def add(frame):
-        # If FFmpeg fails, the pipe is gone; `close` raises the reason.
-        with contextlib.suppress(BrokenPipeError):
-            process.stdin.write(np.ascontiguousarray(frame))
-
-    def close():
-        _, said = process.communicate()
-        if process.returncode:
-            lines = said.decode(errors="replace").strip().splitlines()
-            raise OSError(f"FFmpeg failed: {lines[-1] if lines else process.returncode}")
-
-    return add, close
 
 
 def _even(frames: Iterable[Image]) -> Iterator[np.ndarray]:
@@ -144,12 +143,7 @@ def _even(frames: Iterable[Image]) -> Iterator[np.ndarray]:
         raise ValueError("a video needs at least one frame.")
 
 
-def _all_of(first, rest):
-    yield first
-    yield from rest
-
-
-def _count(path):
+def _count(path: pathlib.Path) -> int:
     video, count = cv2.VideoCapture(str(path)), 0
     while video.grab():
         count += 1
@@ -157,7 +151,7 @@ def _count(path):
     return count
 
 
-def _unwritable(path, reason):
+def _unwritable(path: pathlib.Path, reason: str) -> OSError:
     return OSError(
         f"{path} cannot be written ({reason}): choose another output folder or make room in this "
         "one."

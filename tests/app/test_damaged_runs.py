@@ -1,13 +1,12 @@
 """Files of a run that somebody edited, or that a disk damaged: one sentence names what is wrong."""
 
 import json
-import os
-import shutil
 
 import pytest
 from absl import flags
 from absl.testing import flagsaver
 from tiny_runs import KEPT, copy_of
+from wrong_input import endless, pipe, terabyte
 
 from jaxcloseup.app.cli import render, sweep
 from jaxcloseup.app.methods.registry import METHODS
@@ -92,31 +91,16 @@ def test_an_edited_run_is_one_sentence(kept, tmp_path, name, change, message):
     assert "\n" not in str(error.value) and str(tmp_path / "run") in str(error.value)
 
 
-def pipe(path):
-    os.mkfifo(path)
-
-
-def endless(path):
-    path.symlink_to("/dev/zero")
-
-
-def terabyte(path):
-    path.touch()
-    os.truncate(path, 2**40)
-
-
 @pytest.mark.parametrize("make", [pipe, endless, terabyte])
 def test_a_file_that_does_not_end_is_not_read(kept, tmp_path, make):
     copy_of(kept, tmp_path, None, None)
-    (tmp_path / RUN).unlink()
-    make(tmp_path / RUN)
+    make(RUN)(tmp_path)
     message = r"run\.json cannot be read \((Not an ordinary file|More than 1024 MiB)"
     with pytest.raises(RunError, match=message):
         read_run(tmp_path)
     with pytest.raises(CheckpointError, match=message):
         Checkpoints(tmp_path / "checkpoints", {})
-    shutil.copy(kept / RUN, tmp_path / "copy.json")
-    make(tmp_path / "transforms.json")
+    make("transforms.json")(tmp_path)
     with pytest.raises(SceneError, match=r"transforms\.json cannot be read"):
         read_object(tmp_path / "transforms.json", "frames")
 
@@ -176,8 +160,7 @@ def test_damaged_lines_of_the_log_are_left_out(tmp_path):
 
 
 def test_a_log_that_is_a_pipe_is_one_sentence(tmp_path):
-    (tmp_path / "stats").mkdir()
-    pipe(tmp_path / "stats" / "train.jsonl")
+    pipe("stats/train.jsonl")(tmp_path)
     with pytest.raises(
         OSError, match=r"^/.*train\.jsonl cannot be read .* ordinary file\): remove it"
     ):

@@ -49,10 +49,11 @@ def test_webm_by_opencv_keeps_every_frame(tmp_path, opencv_only, size, capfd):
     check(path, ".webm", images)
 
 
-def test_avi_without_webm(tmp_path, opencv_only, monkeypatch):
-    monkeypatch.delitem(video._OPENCV, ".webm")
-    images = frames(64, 96)
-    check(write_video(tmp_path / "a.b", images, fps=12), ".avi", images)
+def test_opencv_without_webm_is_an_os_error(tmp_path, opencv_only, monkeypatch):
+    monkeypatch.setattr(video, "_CODEC", "none")
+    with pytest.raises(OSError, match=r"a\.webm cannot be written .*install the extra `video`"):
+        write_video(tmp_path / "a", frames(64, 96), fps=12)
+    assert not list(tmp_path.iterdir())
 
 
 def test_mp4_with_the_extra(tmp_path):
