@@ -16,6 +16,7 @@ from experiments.benchmarks.timing import interleaved_medians
 from jaxcloseup.fields.volume.config import NerfConfig
 from jaxcloseup.fields.volume.nerf import nerf_field
 from jaxcloseup.fields.volume.networks import rays_in_cache
+from jaxcloseup.fields.volume.rays import Extent
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.photos.views import Batch
 from jaxcloseup.training.loss import rendered_loss
@@ -107,7 +108,7 @@ def product(dtype: str, rows: int) -> Callable[[], jax.Array]:
 
 def training_step(config: NerfConfig, *, recompute: bool = False, num_rays: int = NUM_RAYS):
     """Return a training step on random pixels, and its temporary memory in MB."""
-    field = nerf_field(config, near=0.5, far=4.0)
+    field = nerf_field(config, Extent(0.5, 4.0))
     params, buffers = jax.jit(field.init)(jax.random.key(0), jnp.zeros((1, 3)), jnp.zeros((1, 3)))
     optimizer = optax.adam(5e-4)
     key_pixels, key_rgb, key_step = jax.random.split(jax.random.key(1), 3)
@@ -127,7 +128,7 @@ def training_step(config: NerfConfig, *, recompute: bool = False, num_rays: int 
 
 def depth_image(config: NerfConfig):
     """Return a call that renders the depth of IMAGE x IMAGE pixels, and its temporary MB."""
-    field = nerf_field(config, near=0.5, far=4.0)
+    field = nerf_field(config, Extent(0.5, 4.0))
     params, buffers = jax.jit(field.init)(jax.random.key(0), jnp.zeros((1, 3)), jnp.zeros((1, 3)))
     return compiled(lambda p: field.render(p, buffers, CAMERA, None, None).depth, params)
 

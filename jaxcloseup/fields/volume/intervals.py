@@ -16,7 +16,7 @@ from jaxcloseup.fields.contract import RadianceField, Rendering
 from jaxcloseup.fields.volume.compositing import composite_intervals
 from jaxcloseup.fields.volume.coordinates import unspaced
 from jaxcloseup.fields.volume.depth_supervision import DepthSupervision
-from jaxcloseup.fields.volume.rays import Rays, Traced, VolumeAux, ray_field
+from jaxcloseup.fields.volume.rays import Extent, Rays, Traced, VolumeAux, ray_field
 from jaxcloseup.fields.volume.renderer import Samples
 from jaxcloseup.fields.volume.samplers import interval_quantiles, resample
 
@@ -46,15 +46,11 @@ class IntervalConfig:
     """How rays are cut and rendered.
 
     Attributes:
-      near: z-depth of the first edge, world units.
-      far: z-depth of the last edge, world units.
       spacing: exponent of the first round's spacing, see `spaced`: 1 is even in depth.
       background: gray level in [0, 1] behind the scene; None adds nothing, which is black.
       chunk: rays rendered, and in training differentiated, at once; None for all.
     """
 
-    near: float
-    far: float
     spacing: float = 1.0
     background: float | None = None
     chunk: int | None = None
@@ -62,37 +58,29 @@ class IntervalConfig:
 
 def interval_field(
     config: IntervalConfig,
+    extent: Extent,
     *,
     init: Callable[[jax.Array, jax.Array, jax.Array], tuple[Any, Any]],
     rounds: Sequence[Round],
     penalty: Callable[[Any, Any, Sequence[Histogram]], jax.Array] | None = None,
     blur: Callable[[jax.Array], jax.Array] = lambda weights: weights,
-    center: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    scale: float = 1.0,
     loss: Callable[..., tuple[jax.Array, dict[str, jax.Array]]] | None = None,
     supervision: DepthSupervision | None = None,
 ) -> RadianceField:
-    """A radiance field that renders by cutting rays into intervals, round after round.
+    """Return a radiance field that cuts rays into intervals, round after round.
 
     Args:
-      config: depths, spacing and chunking.
+      config: spacing and chunking.
+      extent: z-depths of the first and the last edge, and the field's coordinates.
       init: `(key, points [P, 3], rgb [P, 3]) -> (params, buffers)`.
       rounds: first to last.
       penalty: `(params, buffers, histograms) -> [R]`, added to the loss of each ray; gets one
         histogram a round.
       blur: `[R, S] -> [R, S]`, what weights become before the next round is drawn from them.
-      center: world position that becomes the origin of the field's coordinates.
-      scale: field units per world unit.
       loss: `photometric_loss` by default.
       supervision: see `ray_field`.
-
-    Raises:
-      ValueError: the depth range is empty.
     """
-    near, far = config.near, config.far
-    if not 0 < near < far:
-        raise ValueError(f"near and far must satisfy 0 < near < far, not {near} and {far}")
-    span = near * scale, far * scale
+    near, far = extent.near * extent.scale, extent.far * extent.scale
 
     def trace(params: Any, buffers: Any, key: jax.Array | None, rays: Rays) -> Traced:
         keys = [None] * 2 * len(rounds) if key is None else jax.random.split(key, 2 * len(rounds))
@@ -103,7 +91,7 @@ def interval_field(
             else:
                 before = histograms[-1]
                 edges = resample(keys[2 * i], before.edges, blur(before.weights), count)
-            depth = unspaced(edges, *span, spacing=config.spacing) / scale
+            depth = unspaced(edges, near, far, spacing=config.spacing) / extent.scale
             samples = query(params, buffers, keys[2 * i + 1], rays, depth)
             light = composite_intervals(samples.rgb, samples.density, depth, rays.length)
             histograms.append(Histogram(edges, light.weights))
@@ -116,10 +104,9 @@ def interval_field(
         return Traced(Rendering(fine.rgb, fine.depth, fine.alpha, aux), colored)
 
     return ray_field(
+        extent,
         init=init,
         trace=trace,
-        center=center,
-        scale=scale,
         chunk=config.chunk,
         loss=loss,
         supervision=supervision,

@@ -13,7 +13,7 @@ from jaxcloseup.fields.volume.depth_supervision import DepthSupervision
 from jaxcloseup.fields.volume.encodings import positional_encoding
 from jaxcloseup.fields.volume.intervals import IntervalConfig, Round, interval_field
 from jaxcloseup.fields.volume.networks import apply_network, init_network, rays_in_cache
-from jaxcloseup.fields.volume.rays import photometric_loss
+from jaxcloseup.fields.volume.rays import Extent, photometric_loss
 from jaxcloseup.fields.volume.renderer import Samples
 from jaxcloseup.fields.volume.samplers import widen
 
@@ -22,22 +22,12 @@ _PADDING = 0.001  # colors reach this far beyond [0, 1], so that the loss can re
 
 
 def mipnerf_field(
-    config: MipNerfConfig,
-    *,
-    near: float,
-    far: float,
-    center: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    scale: float = 1.0,
-    supervision: DepthSupervision | None = None,
+    config: MipNerfConfig, extent: Extent, *, supervision: DepthSupervision | None = None
 ) -> RadianceField:
-    """A mip-NeRF between z-depths `near` and `far`, in world units.
+    """Return a mip-NeRF, whose network sees the extent's coordinates, roughly within [-1, 1].
 
-    The network sees `(position - center) * scale`, which should lie roughly within [-1, 1].
     Parameters are those of the network; there are no buffers. `supervision` adds a loss on depth,
     see `ray_field`.
-
-    Raises:
-      ValueError: the depth range is empty.
     """
 
     def init(key: jax.Array, points: jax.Array, rgb: jax.Array) -> tuple[Any, tuple[()]]:
@@ -61,17 +51,16 @@ def mipnerf_field(
         looking = positional_encoding(rays.unit, config.direction_octaves)
         raw = apply_network(params, encoded, looking)
         rgb = (1 + 2 * _PADDING) * jax.nn.sigmoid(raw.rgb) - _PADDING
-        density = scale * jax.nn.softplus(raw.density - 1)
+        density = extent.scale * jax.nn.softplus(raw.density - 1)
         return Samples(density.reshape(shape), jnp.moveaxis(rgb.reshape(3, *shape), 0, -1))
 
     chunk = config.chunk or rays_in_cache(config.num_coarse + config.num_fine, config.width)
     return interval_field(
-        IntervalConfig(near, far, config.spacing, config.background, chunk),
+        IntervalConfig(spacing=config.spacing, background=config.background, chunk=chunk),
+        extent,
         init=init,
         rounds=[Round(config.num_coarse, query), Round(config.num_fine, query)],
         blur=widen,
-        center=center,
-        scale=scale,
         loss=functools.partial(photometric_loss, coarse_weight=config.coarse_weight),
         supervision=supervision,
     )

@@ -10,26 +10,20 @@ from jaxcloseup.fields.volume.config import NerfConfig
 from jaxcloseup.fields.volume.depth_supervision import DepthSupervision
 from jaxcloseup.fields.volume.encodings import positional_encoding
 from jaxcloseup.fields.volume.networks import apply_network, init_network, rays_in_cache
+from jaxcloseup.fields.volume.rays import Extent
 from jaxcloseup.fields.volume.renderer import Samples, VolumeConfig, volume_field
 
 
 def nerf_field(
-    config: NerfConfig,
-    *,
-    near: float,
-    far: float,
-    center: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    scale: float = 1.0,
-    supervision: DepthSupervision | None = None,
+    config: NerfConfig, extent: Extent, *, supervision: DepthSupervision | None = None
 ) -> RadianceField:
-    """A NeRF that samples rays between z-depths `near` and `far`, in world units.
+    """Return a NeRF, whose network sees the extent's coordinates, roughly within [-1, 1].
 
-    The network sees `(position - center) * scale`, which should lie roughly within [-1, 1].
     Parameters are `{"coarse": ..., "fine": ...}`; there are no buffers. `supervision` adds a loss
     on depth, see `ray_field`.
 
     Raises:
-      ValueError: the depth range is empty, or `config.compute_dtype` is unknown.
+      ValueError: `config.compute_dtype` is unknown.
     """
     if config.compute_dtype not in ("float32", "bfloat16"):
         raise ValueError(
@@ -62,12 +56,9 @@ def nerf_field(
     )
     return volume_field(
         volume,
+        extent,
         init=init,
         query=query,
-        near=near,
-        far=far,
-        center=center,
-        scale=scale,
         supervision=supervision,
     )
 

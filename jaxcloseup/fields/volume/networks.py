@@ -13,6 +13,9 @@ import jax
 import jax.numpy as jnp
 from jax.experimental.layout import Layout, with_layout_constraint
 
+from jaxcloseup.fields.volume.encodings import positional_encoding
+from jaxcloseup.fields.volume.rays import Rays
+
 
 Params = Any
 _LARGEST_LOG_DENSITY = 15.0
@@ -129,6 +132,31 @@ def apply_mlp(layers: Params, x: jax.Array, of_rays: jax.Array | None = None) ->
             bias = dense(weights[1:], bias, (of_rays,), False)
         x = dense(weights[:1], bias, (x,), i + 1 < len(layers))
     return x
+
+
+def init_colors(key: jax.Array, widths: Sequence[int], octaves: int) -> Params:
+    """Layers of a network for `apply_colors`; `key` is consumed.
+
+    Args:
+      key: random key.
+      widths: number of inputs of a sample, and of each hidden layer's outputs.
+      octaves: octaves of the positional encoding of view directions.
+    """
+    return init_mlp(key, (*widths, 3), ray_features=3 + 6 * octaves)
+
+
+def apply_colors(layers: Params, x: jax.Array, rays: Rays, octaves: int) -> jax.Array:
+    """Colors `[R, S, 3]` in [0, 1] of samples, seen along their rays (NeRF, section 3).
+
+    Args:
+      layers: from `init_colors`.
+      x: `[I, R * S]` features of the samples, with the samples of a ray side by side.
+      rays: `[R]`.
+      octaves: as in `init_colors`.
+    """
+    directions = positional_encoding(rays.unit, octaves)
+    rgb = jax.nn.sigmoid(apply_mlp(layers, x, directions))
+    return jnp.moveaxis(rgb.reshape(3, directions.shape[1], -1), 0, -1)
 
 
 def exponential_density(raw: jax.Array) -> jax.Array:

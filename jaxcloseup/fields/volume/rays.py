@@ -4,6 +4,7 @@ Rays are `[R]`. They go through in chunks, one after another, in training as for
 working set stays in the cache, and memory does not grow with the number of rays.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -19,6 +20,33 @@ from jaxcloseup.geometry.numerics import safe_divide, safe_norm
 
 
 _SUPERVISED = 1  # folded into the key of rays through known points
+
+
+@dataclasses.dataclass(frozen=True)
+class Extent:
+    """The depths that a field covers, and its own coordinates: `(position - center) * scale`.
+
+    Attributes:
+      near: z-depth of the first samples, world units.
+      far: z-depth of the last samples, world units.
+      center: world position of the origin of the field's coordinates.
+      scale: field units per world unit.
+
+    Raises:
+      ValueError: the depth range is empty.
+    """
+
+    near: float
+    far: float
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Refuse an empty depth range."""
+        if not 0 < self.near < self.far:
+            raise ValueError(
+                f"near and far must satisfy 0 < near < far, not {self.near} and {self.far}"
+            )
 
 
 class Rays(NamedTuple):
@@ -44,6 +72,10 @@ class Rays(NamedTuple):
     def at(self, depth: jax.Array) -> jax.Array:
         """Positions `[3, R, S]` at z-depths `[R, S]`."""
         return self.origins.T[..., None] + self.directions.T[..., None] * depth[None]
+
+    def at_middles(self, edges: jax.Array) -> jax.Array:
+        """Positions `[3, R * S]` in the middle of intervals with edges `[R, S + 1]`."""
+        return self.at(0.5 * (edges[..., 1:] + edges[..., :-1])).reshape(3, -1)
 
 
 class VolumeAux(NamedTuple):
@@ -80,26 +112,23 @@ Trace = Callable[[Any, Any, jax.Array | None, Rays], Traced]
 
 
 def ray_field(
+    extent: Extent,
     *,
     init: Callable[[jax.Array, jax.Array, jax.Array], tuple[Any, Any]],
     trace: Trace,
-    center: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    scale: float = 1.0,
     chunk: int | None = None,
     loss: Callable[..., tuple[jax.Array, dict[str, jax.Array]]] | None = None,
     supervision: DepthSupervision | None = None,
 ) -> RadianceField:
-    """A radiance field that renders by tracing rays.
+    """Return a radiance field that renders by tracing rays.
 
-    The field's own coordinates are `(world position - center) * scale`. A field that keeps
-    `buffers` up to date adds its own `adapt` with `_replace`.
+    A field that keeps `buffers` up to date adds its own `adapt` with `_replace`.
 
     Args:
+      extent: the field's coordinates.
       init: `(key, points [P, 3], rgb [P, 3]) -> (params, buffers)`.
       trace: `(params, buffers, key, rays [R]) -> Traced`; `key` is None in a deterministic
         rendering.
-      center: world position that becomes the origin of the field's coordinates.
-      scale: field units per world unit.
       chunk: rays traced, and in training differentiated, at once; None for all.
       loss: `photometric_loss` by default.
       supervision: adds a loss on depth to the penalty of renderings with a key.
@@ -113,8 +142,13 @@ def ray_field(
 
         def trace_rays(rays):
             key, origins, directions, pixel = rays
-            own = (origins - jnp.array([center])) * scale, directions * scale
-            rays = Rays(*own, safe_norm(directions), pixel * scale)
+            scale = extent.scale
+            rays = Rays(
+                origins=(origins - jnp.array([extent.center])) * scale,
+                directions=directions * scale,
+                length=safe_norm(directions),
+                pixel=pixel * scale,
+            )
             return take(trace(params, buffers, key, rays))
 
         return _map_chunks(trace_rays, key, _rays(camera, pixels), chunk)

@@ -5,6 +5,7 @@ pass and compositing are the same for all of them. Rays are `[R]`, their samples
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 from jaxcloseup.fields.contract import RadianceField, Rendering
 from jaxcloseup.fields.volume.compositing import Composite, composite
 from jaxcloseup.fields.volume.depth_supervision import DepthSupervision
-from jaxcloseup.fields.volume.rays import Rays, Traced, VolumeAux, ray_field
+from jaxcloseup.fields.volume.rays import Extent, Rays, Traced, VolumeAux, ray_field
 from jaxcloseup.fields.volume.samplers import importance, stratified
 
 
@@ -53,61 +54,51 @@ Query = Callable[[Any, Any, str, jax.Array | None, jax.Array, jax.Array], Sample
 
 def volume_field(
     config: VolumeConfig,
+    extent: Extent,
     *,
     init: Callable[[jax.Array, jax.Array, jax.Array], tuple[Any, Any]],
     query: Query,
-    near: float,
-    far: float,
-    center: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    scale: float = 1.0,
     supervision: DepthSupervision | None = None,
 ) -> RadianceField:
-    """A radiance field that renders by sampling rays between z-depths `near` and `far`.
-
-    The field's own coordinates are `(world position - center) * scale`. A field that keeps
-    `buffers` up to date adds its own `adapt` with `_replace`.
+    """Return a radiance field that samples rays twice, the second time where the first saw light.
 
     Args:
       config: sampling and chunking.
+      extent: z-depths of the first and the last samples, and the field's coordinates.
       init: `(key, points [P, 3], rgb [P, 3]) -> (params, buffers)`.
       query: `(params, buffers, stage, key, positions [3, R, S], directions [3, R]) -> Samples`.
         `stage` is "coarse" or "fine"; a field with one set of parameters ignores it. `key` is None
         in a deterministic rendering, else the query may use it, to add noise for instance.
         Positions are in the field's coordinates, directions are unit vectors; both have their
         coordinates first.
-      near: z-depth of the first samples, world units.
-      far: z-depth of the last samples, world units.
-      center: world position that becomes the origin of the field's coordinates.
-      scale: field units per world unit.
       supervision: see `ray_field`.
 
     Returns:
       A field whose `render` takes single pixels, also with stacked cameras, whose `loss` is
       `photometric_loss` and whose `aux` is a `VolumeAux`.
-
-    Raises:
-      ValueError: the depth range is empty.
     """
-    if not 0 < near < far:
-        raise ValueError(f"near and far must satisfy 0 < near < far, not {near} and {far}")
 
     def trace(params: Any, buffers: Any, key: jax.Array | None, rays: Rays) -> Traced:
-        return _two_passes(
-            lambda *args: query(params, buffers, *args), key, rays, near, far, config
-        )
+        return _two_passes(config, extent, functools.partial(query, params, buffers), key, rays)
 
     return ray_field(
+        extent,
         init=init,
         trace=trace,
-        center=center,
-        scale=scale,
         chunk=config.chunk,
         supervision=supervision,
     )
 
 
-def _two_passes(query, key, rays, near, far, config):
-    """Coarse pass, importance samples, fine pass."""
+def _two_passes(
+    config: VolumeConfig,
+    extent: Extent,
+    query: Callable[..., Samples],
+    key: jax.Array | None,
+    rays: Rays,
+) -> Traced:
+    """Trace a coarse pass, and a fine pass with importance samples beside the coarse ones."""
+    near, far = extent.near, extent.far
     keys = (None,) * 4 if key is None else jax.random.split(key, 4)
     key_coarse, key_fine, key_coarse_query, key_fine_query = keys
 

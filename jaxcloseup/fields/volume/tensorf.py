@@ -19,8 +19,8 @@ from jaxcloseup.fields.volume.depth_supervision import DepthSupervision
 from jaxcloseup.fields.volume.encodings import positional_encoding
 from jaxcloseup.fields.volume.interpolation import weighted_rows
 from jaxcloseup.fields.volume.intervals import IntervalConfig, Round, interval_field
-from jaxcloseup.fields.volume.networks import apply_mlp, init_mlp
-from jaxcloseup.fields.volume.rays import Rays
+from jaxcloseup.fields.volume.networks import apply_colors, apply_mlp, init_colors, init_mlp
+from jaxcloseup.fields.volume.rays import Extent, Rays
 from jaxcloseup.fields.volume.renderer import Samples
 
 
@@ -37,23 +37,13 @@ class TensorfBuffers:
 
 
 def tensorf_field(
-    config: TensorfConfig,
-    *,
-    near: float,
-    far: float,
-    center: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    scale: float = 1.0,
-    supervision: DepthSupervision | None = None,
+    config: TensorfConfig, extent: Extent, *, supervision: DepthSupervision | None = None
 ) -> RadianceField:
-    """A TensoRF between z-depths `near` and `far`, in world units.
+    """Return a TensoRF of the unit cube of the extent's coordinates.
 
-    The field's coordinates are `(position - center) * scale`; what matters should lie within the
-    unit cube, others are taken to its surface. Parameters are factors `"density"` and `"color"`,
-    each of planes `[3, N, N, C]` and lines `[3, N, C]`, a `"basis"` and a `"network"`; buffers are
-    `TensorfBuffers`. `supervision` adds a loss on depth, see `ray_field`.
-
-    Raises:
-      ValueError: the depth range is empty.
+    Positions outside the cube are moved to its surface. Parameters are factors `"density"` and
+    `"color"`, each of planes `[3, N, N, C]` and lines `[3, N, C]`, a `"basis"` and a `"network"`;
+    buffers are `TensorfBuffers`. `supervision` adds a loss on depth, see `ray_field`.
     """
     size = max(config.sizes)
 
@@ -65,19 +55,15 @@ def tensorf_field(
             "density": _init_factors(keys[0], size, config.density_components),
             "color": _init_factors(keys[1], size, config.color_components),
             "basis": init_mlp(keys[2], (3 * config.color_components, config.appearance)),
-            "network": init_mlp(
-                keys[3],
-                (inputs, config.width, config.width, 3),
-                ray_features=3 + 6 * config.octaves,
-            ),
+            "network": init_colors(keys[3], (inputs, config.width, config.width), config.octaves),
         }
         return params, TensorfBuffers(jnp.asarray(config.sizes[0], jnp.int32))
 
     def density(params, buffers, rays: Rays, edges: jax.Array) -> tuple[jax.Array, jax.Array]:
-        positions = rays.at(0.5 * (edges[..., 1:] + edges[..., :-1])).reshape(3, -1)
+        positions = rays.at_middles(edges)
         total = jnp.sum(factor_products(params["density"], buffers.vertices, positions), (0, 1))
         per_field_unit = config.density_scale * jax.nn.softplus(total + config.density_shift)
-        return positions, scale * per_field_unit.reshape(edges.shape[0], -1)
+        return positions, extent.scale * per_field_unit.reshape(edges.shape[0], -1)
 
     def look(params, buffers, key, rays, edges) -> Samples:
         del key
@@ -89,9 +75,7 @@ def tensorf_field(
         products = factor_products(params["color"], buffers.vertices, positions)
         features = apply_mlp(params["basis"], products.reshape(-1, positions.shape[1]))
         encoded = positional_encoding(features, config.octaves)
-        looking = positional_encoding(rays.unit, config.octaves)
-        rgb = jax.nn.sigmoid(apply_mlp(params["network"], encoded, looking))
-        return Samples(absorbed, jnp.moveaxis(rgb.reshape(3, *absorbed.shape), 0, -1))
+        return Samples(absorbed, apply_colors(params["network"], encoded, rays, config.octaves))
 
     def penalty(params, buffers, histograms):
         n = buffers.vertices
@@ -108,12 +92,11 @@ def tensorf_field(
         return state
 
     field = interval_field(
-        IntervalConfig(near, far, config.spacing, config.background, config.chunk),
+        IntervalConfig(config.spacing, config.background, config.chunk),
+        extent,
         init=init,
         rounds=[Round(config.num_coarse, look), Round(config.num_fine, render)],
         penalty=penalty,
-        center=center,
-        scale=scale,
         supervision=supervision,
     )
     return field._replace(adapt=adapt)

@@ -5,7 +5,6 @@ Gaussian counts less. The paper also hands the networks how much each level coun
 which is not done here; densities are exponential as in Instant-NGP, which learns faster at first.
 """
 
-import functools
 import itertools
 from typing import Any
 
@@ -18,83 +17,63 @@ from jaxcloseup.fields.volume.cones import frustum_samples
 from jaxcloseup.fields.volume.config import HashGridConfig, ZipNerfConfig
 from jaxcloseup.fields.volume.coordinates import contract, contraction_scale
 from jaxcloseup.fields.volume.depth_supervision import DepthSupervision
-from jaxcloseup.fields.volume.encodings import positional_encoding
-from jaxcloseup.fields.volume.hash_grid import hash_features, init_hash_grid
-from jaxcloseup.fields.volume.intervals import IntervalConfig, Round, interval_field
-from jaxcloseup.fields.volume.networks import apply_mlp, exponential_density, init_mlp
+from jaxcloseup.fields.volume.hash_fields import (
+    GEOMETRY,
+    hash_field,
+    init_color_network,
+    init_part,
+    proposal_counts,
+)
+from jaxcloseup.fields.volume.hash_grid import hash_features
+from jaxcloseup.fields.volume.intervals import Histogram
+from jaxcloseup.fields.volume.networks import Params
+from jaxcloseup.fields.volume.rays import Extent, Rays
 from jaxcloseup.fields.volume.regularizers import antialiased_proposal_penalty, distortion
-from jaxcloseup.fields.volume.renderer import Samples
 
 
-_GEOMETRY = 16  # outputs of the density network; the first is the logarithm of density
-_PULSES = (0.03, 0.003)  # half widths of the blur of the interlevel loss, of each proposal
+# Half widths of the pulses that blur the last round for each proposal (section 3). The wider one
+# lets the first, coarser proposal learn of light that lies intervals away.
+_PULSES = (0.03, 0.003)
 
 
 def zipnerf_field(
-    config: ZipNerfConfig,
-    *,
-    near: float,
-    far: float,
-    center: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    scale: float = 1.0,
-    supervision: DepthSupervision | None = None,
+    config: ZipNerfConfig, extent: Extent, *, supervision: DepthSupervision | None = None
 ) -> RadianceField:
-    """A Zip-NeRF between z-depths `near` and `far`, in world units.
+    """Return a Zip-NeRF of the unit ball, or without `contracted` the unit cube, of coordinates.
 
-    The field's coordinates are `(position - center) * scale`; what matters should lie within the
-    unit ball or, without `contracted`, the unit cube. Parameters are `{"fine": ..., "proposal":
-    [...]}`; there are no buffers. `supervision` adds a loss on depth, see `ray_field`.
-
-    Raises:
-      ValueError: the depth range is empty.
+    Parameters are `{"fine": ..., "proposal": [...]}`: each proposal has a grid. There are no
+    buffers. `supervision` adds a loss on depth, see `ray_field`.
     """
-    counts = [count for count in (config.num_coarse, config.num_middle) if count]
 
-    def init(key: jax.Array, points: jax.Array, rgb: jax.Array) -> tuple[Any, tuple[()]]:
+    def init(key: jax.Array, points: jax.Array, rgb: jax.Array) -> tuple[Params, tuple[()]]:
         del points, rgb
-        key_color, *keys = jax.random.split(key, 2 + len(counts))
+        key_color, key_fine, *keys = jax.random.split(key, 2 + len(proposal_counts(config)))
+        fine = init_part(*jax.random.split(key_fine), config.grid, config.width, GEOMETRY)
+        fine["color"] = init_color_network(key_color, config)
+        proposals = [
+            init_part(*jax.random.split(key), config.proposal, config.width) for key in keys
+        ]
+        return {"fine": fine, "proposal": proposals}, ()
 
-        def part(key, grid, outputs):
-            key_grid, key_density = jax.random.split(key)
-            density = init_mlp(key_density, (grid.size, config.width, outputs))
-            return {"grid": init_hash_grid(key_grid, grid), "density": density}
-
-        fine = part(keys[0], config.grid, _GEOMETRY)
-        widths = (_GEOMETRY, *(config.width,) * config.color_layers, 3)
-        fine["color"] = init_mlp(key_color, widths, ray_features=3 + 6 * config.direction_octaves)
-        return {"fine": fine, "proposal": [part(k, config.proposal, 1) for k in keys[1:]]}, ()
-
-    def geometry(part, grid, points, key, rays, edges) -> jax.Array:
-        positions, deviation = frustum_samples(key, rays, edges, points)
+    def encode(
+        table: jax.Array, rendered: bool, key: jax.Array | None, rays: Rays, edges: jax.Array
+    ) -> jax.Array:
+        """Mean features of Gaussians in frustums (eq. 1 to 5)."""
+        grid, count = config.proposal, config.proposal_points
+        if rendered:
+            grid, count = config.grid, config.points
+        positions, deviation = frustum_samples(key, rays, edges, count)
         shape, half = deviation.shape, 1.0  # half of the side of the cube that grids fill
         if config.contracted:
             deviation = deviation * contraction_scale(positions)
             positions, half = contract(positions), 2.0
         positions = (positions / half).reshape(3, -1)
         features = downweighted_features(
-            part["grid"], grid, 0.5 * positions + 0.5, (0.5 / half * deviation).reshape(-1)
+            table, grid, 0.5 * positions + 0.5, (0.5 / half * deviation).reshape(-1)
         )
-        mean = jnp.mean(features.reshape(grid.size, -1, shape[-1]), axis=-1)
-        return apply_mlp(part["density"], mean)
+        return jnp.mean(features.reshape(grid.size, -1, shape[-1]), axis=-1)
 
-    def density(raw: jax.Array, edges: jax.Array) -> jax.Array:
-        return scale * exponential_density(raw[0]).reshape(edges.shape[0], -1)
-
-    def propose(index, params, buffers, key, rays, edges) -> Samples:
-        del buffers
-        part, points = params["proposal"][index], config.proposal_points
-        raw = geometry(part, config.proposal, points, key, rays, edges)
-        return Samples(density(raw, edges), None)
-
-    def render(params, buffers, key, rays, edges) -> Samples:
-        del buffers
-        raw = geometry(params["fine"], config.grid, config.points, key, rays, edges)
-        looking = positional_encoding(rays.unit, config.direction_octaves)
-        rgb = jax.nn.sigmoid(apply_mlp(params["fine"]["color"], raw, looking))
-        shape = edges.shape[0], edges.shape[1] - 1
-        return Samples(density(raw, edges), jnp.moveaxis(rgb.reshape(3, *shape), 0, -1))
-
-    def penalty(params, buffers, histograms):
+    def penalty(params: Params, buffers: Any, histograms: list[Histogram]) -> jax.Array:
         del buffers
         *proposals, last = histograms
         total = config.distortion_weight * distortion(*last)
@@ -104,14 +83,13 @@ def zipnerf_field(
         decay += sum(mean_squares(part["grid"], config.proposal) for part in params["proposal"])
         return total + config.decay_weight * decay
 
-    rounds = [Round(n, functools.partial(propose, i)) for i, n in enumerate(counts)]
-    return interval_field(
-        IntervalConfig(near, far, config.spacing, config.background, config.chunk),
+    return hash_field(
+        config,
+        extent,
         init=init,
-        rounds=[*rounds, Round(config.num_fine, render)],
+        encode=encode,
+        proposal=lambda params, index: params["proposal"][index],
         penalty=penalty,
-        center=center,
-        scale=scale,
         supervision=supervision,
     )
 

@@ -9,7 +9,7 @@ import pytest
 from jaxcloseup.app.methods.shared.sightings import find_sightings
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.fields.volume.depth_supervision import DepthSupervision, Sightings, depth_divergence
-from jaxcloseup.fields.volume.rays import Traced, VolumeAux, ray_field
+from jaxcloseup.fields.volume.rays import Extent, Traced, VolumeAux, ray_field
 from jaxcloseup.photos.scene import Scene, SceneError
 
 
@@ -82,7 +82,7 @@ def test_a_field_adds_the_loss_of_rays_through_points_to_steps_alone():
         stacked, np.array([0, 1, 1]), np.ones((3, 2), "f4"), *np.float32([[2.2] * 3, [0.1] * 3])
     )
     fields = [
-        ray_field(init=None, trace=trace, chunk=4, supervision=supervision)
+        ray_field(Extent(1.0, 3.0), init=None, trace=trace, chunk=4, supervision=supervision)
         for supervision in (None, DepthSupervision(points, 0.3, 0.5))
     ]
     params, pixels = jnp.array([0.25, 0.75]), jnp.ones((6, 2))

@@ -12,6 +12,7 @@ from jaxcloseup.fields.volume import samplers
 from jaxcloseup.fields.volume.compositing import composite_intervals
 from jaxcloseup.fields.volume.coordinates import contract, contraction_scale, spaced, unspaced
 from jaxcloseup.fields.volume.intervals import IntervalConfig, Round, interval_field
+from jaxcloseup.fields.volume.rays import Extent
 from jaxcloseup.fields.volume.regularizers import distortion, proposal_penalty
 from jaxcloseup.fields.volume.renderer import Samples
 from jaxcloseup.geometry.cameras import Camera
@@ -144,15 +145,11 @@ def test_a_second_round_closes_in_on_a_wall():
 
     errors = []
     for count in (1, 2):
-        config = IntervalConfig(0.5, 10.0, spacing=-1.0, chunk=6)
-        field = interval_field(config, init=lambda *_: ((), ()), rounds=[Round(16, wall)] * count)
+        config, extent = IntervalConfig(spacing=-1.0, chunk=6), Extent(0.5, 10.0)
+        field = interval_field(
+            config, extent, init=lambda *_: ((), ()), rounds=[Round(16, wall)] * count
+        )
         seen = jax.jit(functools.partial(field.render, (), (), camera, None))(None)
         np.testing.assert_allclose(seen.rgb, 0.25, atol=1e-3)
         errors.append(np.abs(np.asarray(seen.depth) - 3).max())
     assert errors[0] > 4 * errors[1]
-
-
-@pytest.mark.parametrize(("near", "far"), [(0.0, 1.0), (2.0, 1.0)])
-def test_an_empty_depth_range_is_refused(near, far):
-    with pytest.raises(ValueError, match="near and far"):
-        interval_field(IntervalConfig(near, far), init=None, rounds=[])

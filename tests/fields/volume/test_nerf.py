@@ -13,7 +13,7 @@ from jaxcloseup.fields.volume.config import NerfConfig
 from jaxcloseup.fields.volume.encodings import positional_encoding
 from jaxcloseup.fields.volume.nerf import nerf_field
 from jaxcloseup.fields.volume.networks import apply_network, init_network
-from jaxcloseup.fields.volume.rays import VolumeAux
+from jaxcloseup.fields.volume.rays import Extent, VolumeAux
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.photos.views import Batch
 from jaxcloseup.training.loss import rendered_loss
@@ -40,7 +40,7 @@ def camera(x=0.3):
 
 
 def field(**changes):
-    return nerf_field(dataclasses.replace(TINY, **changes), near=1.0, far=3.0)
+    return nerf_field(dataclasses.replace(TINY, **changes), Extent(1.0, 3.0))
 
 
 @functools.cache
@@ -94,7 +94,7 @@ def test_the_network_matches_the_oracle(key):
 
 
 def test_the_default_network_has_the_documented_shapes():
-    full = nerf_field(NerfConfig(), near=1.0, far=2.0)
+    full = nerf_field(NerfConfig(), Extent(1.0, 2.0))
     shapes = jax.eval_shape(full.init, jax.random.key(0), *[jnp.zeros((1, 3))] * 2)[0]["fine"]
     trunk = [[w.shape for w in layer["weights"]] for layer in shapes["trunk"]]
     plain = [(256, 256)]
@@ -152,7 +152,7 @@ def test_stacked_cameras_see_their_own_pixels():
 
 def test_scaled_coordinates_move_the_network_not_the_depth():
     """A scene seen through `center` and `scale` is the same scene, transformed."""
-    moved = nerf_field(TINY, near=2.0, far=6.0, center=(2.0, 0.0, 4.0), scale=0.5)
+    moved = nerf_field(TINY, Extent(2.0, 6.0, center=(2.0, 0.0, 4.0), scale=0.5))
     pose = camera().camtoworld.at[:, 3].set(jnp.array([2 + 2 * 0.3, 0.0, 4 - 2 * 2.0]))
     thin = jax.tree.map(jnp.copy, params())
     for network in thin.values():  # half the density, for twice the distance
@@ -267,14 +267,6 @@ def test_bfloat16_is_close():
     assert np.linalg.norm(flat - narrow_flat) < 0.03 * np.linalg.norm(flat)
 
 
-@pytest.mark.parametrize(
-    ("near", "far", "config", "message"),
-    [
-        (0.0, 1.0, NerfConfig(), "near and far"),
-        (2.0, 1.0, NerfConfig(), "near and far"),
-        (1.0, 2.0, NerfConfig(compute_dtype="float16"), "compute_dtype"),
-    ],
-)
-def test_bad_settings_are_refused(near, far, config, message):
-    with pytest.raises(ValueError, match=message):
-        nerf_field(config, near=near, far=far)
+def test_an_unknown_type_is_refused():
+    with pytest.raises(ValueError, match="compute_dtype"):
+        nerf_field(NerfConfig(compute_dtype="float16"), Extent(1.0, 2.0))

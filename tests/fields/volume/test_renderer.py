@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxcloseup.fields.volume.rays import Extent
 from jaxcloseup.fields.volume.renderer import Samples, VolumeConfig, volume_field
 from jaxcloseup.geometry.cameras import Camera
 
@@ -24,8 +25,8 @@ def ball(params, buffers, stage, key, positions, directions):
 
 def field(config=None, **changes):
     config = config or VolumeConfig(num_coarse=512, num_fine=512, background=0.5, chunk=20)
-    parts = dict(init=lambda *_: (DENSITY, ()), query=ball, near=0.5, far=6.0)
-    return volume_field(config, **(parts | dict(center=CENTER, scale=SCALE) | changes))
+    parts = {"init": lambda *_: (DENSITY, ()), "query": ball} | changes
+    return volume_field(config, Extent(0.5, 6.0, CENTER, SCALE), **parts)
 
 
 def closed_form():
@@ -94,4 +95,4 @@ def test_the_field_differentiates_as_many_pixels_at_once_as_it_renders():
 @pytest.mark.parametrize(("near", "far"), [(0.0, 1.0), (2.0, 1.0)])
 def test_an_empty_depth_range_is_refused(near, far):
     with pytest.raises(ValueError, match="near and far"):
-        field(near=near, far=far)
+        Extent(near, far)

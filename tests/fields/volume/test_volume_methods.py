@@ -29,6 +29,7 @@ from jaxcloseup.fields.volume.config import (
 )
 from jaxcloseup.fields.volume.mipnerf import mipnerf_field
 from jaxcloseup.fields.volume.ngp import ngp_field
+from jaxcloseup.fields.volume.rays import Extent
 from jaxcloseup.fields.volume.tensorf import (
     TensorfBuffers,
     factor_products,
@@ -160,7 +161,7 @@ def camera():
 @functools.cache
 def field(name):
     config, make, _ = FIELDS[name]
-    return make(config, near=NEAR, far=FAR, center=CENTER, scale=SCALE)
+    return make(config, Extent(NEAR, FAR, CENTER, SCALE))
 
 
 @functools.cache
@@ -309,7 +310,7 @@ def test_a_batch_of_steps_is_these_steps_alone(name, capture_folder):
 def test_a_grid_that_grows_shows_the_same_scene():
     """From 3 to 5 vertices: the old ones stay, and what lies between them is on their lines."""
     config = dataclasses.replace(TENSORF, finest=5, growths=1, grow_every=4)
-    grown = tensorf_field(config, near=NEAR, far=FAR)
+    grown = tensorf_field(config, Extent(NEAR, FAR))
     with jax.enable_x64(True):
         shapes, _ = jax.eval_shape(grown.init, jax.random.key(0), *[jnp.zeros((1, 3))] * 2)
         numbers = np.random.default_rng(5)

@@ -10,6 +10,7 @@ from jaxcloseup.app.methods.shared.sightings import find_sightings
 from jaxcloseup.app.methods.volumes import AdamConfig, DepthConfig
 from jaxcloseup.fields.contract import RadianceField
 from jaxcloseup.fields.volume.depth_supervision import DepthSupervision
+from jaxcloseup.fields.volume.rays import Extent
 from jaxcloseup.photos.scene import Scene
 
 
@@ -19,7 +20,7 @@ def build_field(
     """Return a field of the library between a scene's near and far.
 
     Args:
-      field: `(config, near=, far=, center=, scale=, supervision=) -> RadianceField`.
+      field: `(config, extent, supervision=) -> RadianceField`.
       config: its configuration, which is also a `DepthConfig`.
       scene: what was photographed.
       normalize: scale the scene to the unit cube.
@@ -28,14 +29,8 @@ def build_field(
       SceneError: depth is supervised, but the scene has no points for it.
     """
     center, scale = unit_cube(scene) if normalize else ((0.0, 0.0, 0.0), 1.0)
-    return field(
-        config,
-        near=scene.near,
-        far=scene.far,
-        center=center,
-        scale=scale,
-        supervision=_depth_supervision(config, scene),
-    )
+    extent = Extent(scene.near, scene.far, center, scale)
+    return field(config, extent, supervision=_depth_supervision(config, scene))
 
 
 def _depth_supervision(config: DepthConfig, scene: Scene) -> DepthSupervision | None:
