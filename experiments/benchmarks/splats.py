@@ -21,10 +21,11 @@ from experiments.benchmarks.timing import interleaved_medians
 from jaxcloseup.app.score.scores import exact_depths
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.fields.splats import RasterizeConfig, render_surfels, surfels_from_points
+from jaxcloseup.fields.splats.layout import pack
 from jaxcloseup.fields.splats.projection import project_discs, surfel_columns, to_camera
-from jaxcloseup.fields.splats.rasterize import for_image
+from jaxcloseup.fields.splats.raster_plan import plan_raster
 from jaxcloseup.fields.splats.spherical_harmonics import sh_to_rgb
-from jaxcloseup.fields.splats.splat_math import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, pack
+from jaxcloseup.fields.splats.splat_math import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from jaxcloseup.fields.splats.tile_test import reaches
 from jaxcloseup.fields.splats.tiling import tile_lists
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points
@@ -117,7 +118,8 @@ def _report(surfels, camera, rate):
 
 def config_for(surfels, camera):
     """The configuration for an image, with as much room as it needs."""
-    guess = for_image(RasterizeConfig(), height=camera.height, width=camera.width)
+    plan = plan_raster(RasterizeConfig(), height=camera.height, width=camera.width)
+    guess = RasterizeConfig(capacity=plan.capacity, tile=plan.tile)
     touched, _ = count_pairs(surfels, camera, guess, exact=False)
     return dataclasses.replace(guess, capacity=-(-touched // 2**14) * 2**14)
 

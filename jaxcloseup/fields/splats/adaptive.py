@@ -25,7 +25,6 @@ from jaxcloseup.geometry.numerics import matmul, safe_norm
 from jaxcloseup.geometry.rotations import quaternion_to_matrix
 
 
-@struct.dataclass
 class OffsetSurfels(Surfels):
     """Surfels with an image-plane offset: a parameter that stays 0 and whose gradient is recorded.
 

@@ -1,60 +1,71 @@
 """The compositor as Pallas kernels, for GPUs: one program a tile, one splat after another.
 
-Each program walks its tile's list as the loops of `loops` do, with all pixels of the tile at once.
-The derivative has no atomic additions, so it repeats to the last bit: a program writes the
+Each program walks its tile's list as the loops of `blend_lax` do, with all pixels of the tile at
+once. The derivative has no atomic additions, so it repeats to the last bit: a program writes the
 cotangent of each of its pairs to a place of its own, and a second kernel adds up those of each
 splat, always in the same order.
 """
 
 import functools
+import logging
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 from jax import lax
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
-from jaxcloseup.fields.splats.splat_math import (
+from jaxcloseup.fields.splats.config import RasterPlan
+from jaxcloseup.fields.splats.layout import (
     ANCHOR,
+    MOMENTS,
     PAYLOAD,
-    TRANSMITTANCE_MIN,
+    Channels,
+    Column,
     Trace,
+)
+from jaxcloseup.fields.splats.splat_math import (
+    TRANSMITTANCE_MIN,
+    Moments,
     Walk,
     channels,
     pass_splat,
     pull_back,
     row_bar,
     shade,
+    sum_pixels,
     worth,
 )
 from jaxcloseup.fields.splats.tiling import TileLists, longest_first, starts_of
 
 
 _TILE = plgpu.CompilerParams(num_warps=2)
+Ref = Any  # of an array in the memory of the device
 
 
 def forward(
-    config, table: jax.Array, lists: TileLists, *, interpret: bool = False
+    plan: RasterPlan, table: jax.Array, lists: TileLists
 ) -> tuple[jax.Array, jax.Array, Trace]:
-    """`loops.forward`; with `interpret`, on any platform, slowly."""
-    features, pixels = table.shape[1] - PAYLOAD, config.tile**2
+    """Compute what `blend_lax.forward` does."""
+    features, pixels = table.shape[1] - PAYLOAD, plan.tile**2
     tiles, dtype = lists.starts.shape[0], table.dtype
     order = longest_first(lists.counts)
     each = pl.BlockSpec((1, pixels), lambda i: (i, 0))
     values = jax.ShapeDtypeStruct((tiles, pixels), dtype)
     sums, median, *trace = pl.pallas_call(
-        functools.partial(_forward_tile, config, features),
+        functools.partial(_forward_tile, plan, features),
         grid=tiles,
-        out_specs=[pl.BlockSpec((1, features + 4, pixels), lambda i: (i, 0, 0)), *[each] * 4],
+        out_specs=[pl.BlockSpec((1, features + MOMENTS, pixels), lambda i: (i, 0, 0)), *[each] * 4],
         out_shape=[
-            jax.ShapeDtypeStruct((tiles, features + 4, pixels), dtype),
+            jax.ShapeDtypeStruct((tiles, features + MOMENTS, pixels), dtype),
             values,
             values,
             jax.ShapeDtypeStruct((tiles, pixels), jnp.int32),
             values,
         ],
-        interpret=interpret,
+        interpret=plan.interpret,
         compiler_params=_TILE,
     )(table, *_in_turn(lists, order))
     place = jnp.argsort(order)
@@ -63,16 +74,14 @@ def forward(
 
 
 def backward(
-    config,
+    plan: RasterPlan,
     table: jax.Array,
     lists: TileLists,
     trace: Trace,
     cotangents: tuple[jax.Array, jax.Array],
-    *,
-    interpret: bool = False,
 ) -> jax.Array:
-    """`loops.backward`; with `interpret`, on any platform, slowly."""
-    features, pixels = table.shape[1] - PAYLOAD, config.tile**2
+    """Compute what `blend_lax.backward` does."""
+    features, pixels = table.shape[1] - PAYLOAD, plan.tile**2
     tiles, capacity = lists.starts.shape[0], lists.splats.shape[0]
     order = longest_first(lists.counts)
     (sums_bar, median_bar), trace = jax.tree.map(lambda leaf: leaf[order], (cotangents, trace))
@@ -80,108 +89,175 @@ def backward(
     each = pl.BlockSpec((1, pixels), lambda i: (i, 0))
     whole = [pl.BlockSpec(a.shape, lambda i, n=a.ndim: (0,) * n) for a in (table, *in_turn)]
     pairs_bar = pl.pallas_call(
-        functools.partial(_backward_tile, config, features),
+        functools.partial(_backward_tile, plan, features),
         grid=tiles,
         in_specs=[
             *whole,
             *[each] * 3,
-            pl.BlockSpec((1, features + 4, pixels), lambda i: (i, 0, 0)),
+            pl.BlockSpec((1, features + MOMENTS, pixels), lambda i: (i, 0, 0)),
             each,
         ],
         out_shape=jax.ShapeDtypeStruct((capacity, table.shape[1]), table.dtype),
-        interpret=interpret,
+        interpret=plan.interpret,
         compiler_params=_TILE,
-    )(table, *in_turn, *trace, sums_bar, median_bar)
-    return _add_pairs(pairs_bar, lists, table.shape[0], interpret)
+    )(
+        table,
+        *in_turn,
+        trace.transmittance,
+        trace.stop,
+        trace.reference,
+        sums_bar,
+        median_bar,
+    )
+    return _add_pairs(pairs_bar, lists, table.shape[0], interpret=plan.interpret)
 
 
-def _in_turn(lists, order):
-    """Lists in an order of tiles, longest first, so that long lists begin first."""
+@functools.cache
+def kernels_compile(tile: int) -> bool:
+    """Return whether this GPU runs the kernels for tiles of a size; log once why not."""
+    plan = RasterPlan(capacity=1, near=1.0, tile=tile)
+
+    def example() -> tuple[jax.Array, TileLists]:
+        one = jnp.zeros(1, jnp.int32)
+        lists = TileLists(one, one, one, origins=jnp.zeros((1, 2), jnp.int32), overflow=one)
+        return jnp.zeros((1, PAYLOAD + 1), jnp.float32), lists
+
+    def both(table: jax.Array, lists: TileLists) -> jax.Array:
+        sums, median, trace = forward(plan, table, lists)
+        return backward(plan, table, lists, trace, (sums, median))
+
+    try:
+        jax.jit(both).lower(*jax.eval_shape(example)).compile()
+    except Exception as error:  # whatever stops the compiler
+        reason = str(error).splitlines() or [type(error).__name__]
+        logging.getLogger(__name__).warning(
+            "splats are blended by jax.lax, for this GPU cannot run the kernels: %s", reason[0]
+        )
+        return False
+    return True
+
+
+def _in_turn(lists: TileLists, order: jax.Array) -> tuple[jax.Array, ...]:
+    """Return lists in an order of tiles, longest first, so that long lists begin first."""
     return lists.splats, lists.starts[order], lists.counts[order], lists.origins[order]
 
 
-def _pixels(tile: int, dtype: Any) -> tuple[jax.Array, jax.Array]:
+def _pixels(tile: int, dtype: jnp.dtype) -> tuple[jax.Array, jax.Array]:
+    """Return pixel centers x and y `[P]` of a tile, without arrays that Triton cannot make."""
     place = jnp.arange(tile * tile, dtype=jnp.int32)
-    return tuple(part(place, jnp.int32(tile)).astype(dtype) + 0.5 for part in (lax.rem, lax.div))
+    x, y = (part(place, jnp.int32(tile)).astype(dtype) + 0.5 for part in (lax.rem, lax.div))
+    return x, y
 
 
-def _column(table, splat, origin):
-    """Columns `[]` of a splat's row, whose anchor is made local to the tile."""
+def _column(table: Ref, splat: jax.Array, origin: list[jax.Array]) -> Column:
+    """Return a function of columns `[]` of a splat's row, whose anchor is local to the tile."""
 
-    def column(i):
+    def column(i: int) -> jax.Array:
         value = table[splat, i]
-        return value - origin[i] if i in (ANCHOR, ANCHOR + 1) else value
+        return value - origin[i - ANCHOR] if i in (ANCHOR, ANCHOR + 1) else value
 
     return column
 
 
-def _forward_tile(config, features, *refs):
+class _ForwardState(struct.PyTreeNode):
+    """State of a tile's forward loop.
+
+    Attributes:
+      position: `[]` of the next splat in the list.
+      before: `[P]` product of 1 - alpha so far.
+      walk: of the pixels.
+      sums: so far.
+    """
+
+    position: jax.Array
+    before: jax.Array
+    walk: Walk
+    sums: Channels
+
+
+def _forward_tile(plan: RasterPlan, features: int, *refs: Ref) -> None:
+    """Write the sums, the median and the trace of one tile."""
     table, splats, starts, counts, origins, *out = refs
     sums_out, median_out, transmittance_out, stop_out, reference_out = out
     i, dtype = pl.program_id(0), table.dtype
     start, count = starts[i], counts[i]
     origin = [origins[i, axis].astype(dtype) for axis in range(2)]
-    x, y = _pixels(config.tile, dtype)
+    x, y = _pixels(plan.tile, dtype)
 
-    def unfinished(state):
-        position, product = state[:2]
-        return (position < count) & (jnp.max(product) >= TRANSMITTANCE_MIN)
+    def unfinished(state: _ForwardState) -> jax.Array:
+        return (state.position < count) & (jnp.max(state.before) >= TRANSMITTANCE_MIN)
 
-    def step(state):
-        position, before, walk, sums = state
+    def step(state: _ForwardState) -> _ForwardState:
+        position, before = state.position, state.before
         column = _column(table, splats[start + position], origin)
-        seen = shade(column, x, y, config.near)
+        seen = shade(column, x, y, plan.near)
         after = before - seen.alpha * before
         weight, walk = pass_splat(
-            walk, seen.alpha, seen.inverse_depth, seen.z, before, after, position
+            state.walk, seen.alpha, seen.inverse_depth, seen.z, before, after, position
         )
         new = channels(column, features, seen, walk.reference)
-        sums = tuple(total + weight * value for total, value in zip(sums, new, strict=True))
-        return position + 1, after, walk, sums
+        sums = jax.tree.map(lambda total, value: total + weight * value, state.sums, new)
+        return _ForwardState(position + 1, after, walk, sums)
 
     ones, zeros = jnp.ones_like(x), jnp.zeros_like(x)
     walk = Walk(ones, jnp.zeros(x.shape, jnp.int32), zeros, zeros)
-    state = (jnp.int32(0), ones, walk, (zeros,) * (features + 4))
-    _, _, walk, sums = lax.while_loop(unfinished, step, state)
-    for channel, total in enumerate(sums):
+    sums = Channels.of((zeros,) * (features + MOMENTS))
+    state = lax.while_loop(unfinished, step, _ForwardState(jnp.int32(0), ones, walk, sums))
+    for channel, total in enumerate(state.sums.listed()):
         sums_out[0, channel] = total
+    walk = state.walk
     median_out[0] = walk.median
-    transmittance_out[0], stop_out[0], reference_out[0] = walk[:3]
+    transmittance_out[0] = walk.remaining
+    stop_out[0] = walk.stop
+    reference_out[0] = walk.reference
 
 
-def _backward_tile(config, features, *refs):
-    table, splats, starts, counts, origins, *trace, sums_bar, median_bar, pairs_bar = refs
+class _BackwardState(struct.PyTreeNode):
+    """State of a tile's backward loop.
+
+    Attributes:
+      position: `[]` of the next splat in front.
+      behind: `[P]` sum of weight times worth of the splats behind it.
+      after: `[P]` transmittance behind it.
+    """
+
+    position: jax.Array
+    behind: jax.Array
+    after: jax.Array
+
+
+def _backward_tile(plan: RasterPlan, features: int, *refs: Ref) -> None:
+    """Write the cotangents of the pairs of one tile."""
+    table, splats, starts, counts, origins, *trace_refs, sums_bar_ref, median_bar, pairs_bar = refs
     i, dtype = pl.program_id(0), table.dtype
     start, count = starts[i], counts[i]
     origin = [origins[i, axis].astype(dtype) for axis in range(2)]
-    x, y = _pixels(config.tile, dtype)
-    middle = config.tile / 2
-    trace = Trace(*(leaf[0] for leaf in trace))
-    each_bar = [sums_bar[0, channel] for channel in range(features + 4)]
-    bars = (each_bar[-4], each_bar[-2], each_bar[-1], median_bar[0])
+    x, y = _pixels(plan.tile, dtype)
+    middle = plan.tile / 2
+    trace = Trace(*(leaf[0] for leaf in trace_refs))
+    sums_bar = Channels.of([sums_bar_ref[0, channel] for channel in range(features + MOMENTS)])
+    median_bar = median_bar[0]
 
-    def moments(values):
+    def moments(values: jax.Array) -> Moments:
         return tuple(jnp.sum(values * by) for by in (jnp.ones_like(x), x - middle, y - middle))
 
-    def step(state):
-        position, behind, after = state
+    def step(state: _BackwardState) -> _BackwardState:
+        position, after = state.position, state.after
         column = _column(table, splats[start + position], origin)
-        seen = shade(column, x, y, config.near)
+        seen = shade(column, x, y, plan.near)
         alpha = jnp.where(position < trace.stop, seen.alpha, 0)
-        value = worth(column, seen, trace.reference, each_bar)
+        value = worth(column, seen, trace.reference, sums_bar)
         before = after * (1 / (1 - alpha))
-        weight, pulled = pull_back(seen, alpha, before, after, behind, value, trace, bars)
-        sums = pulled._replace(
-            **{name: moments(getattr(pulled, name)) for name in ("u", "v", "w", "low_pass")},
-            clip=jnp.sum(pulled.clip),
-            scaled=jnp.sum(pulled.scaled),
+        weight, pulled = pull_back(
+            seen, alpha, before, after, state.behind, value, trace, sums_bar, median_bar
         )
-        payload = [jnp.sum(weight * each_bar[f]) for f in range(features)]
+        sums = sum_pixels(pulled, moments, jnp.sum)
+        payload = [jnp.sum(weight * bar) for bar in sums_bar.payload]
         for c, bar in enumerate(row_bar(column, middle, sums, payload)):
             pairs_bar[start + position, c] = bar
-        return position - 1, behind + weight * value, before
+        return _BackwardState(position - 1, state.behind + weight * value, before)
 
-    def blank(position):
+    def blank(position: jax.Array) -> jax.Array:
         for c in range(PAYLOAD + features):
             pairs_bar[start + position, c] = jnp.zeros((), dtype)
         return position + 1
@@ -189,13 +265,14 @@ def _backward_tile(config, features, *refs):
     # Pairs behind the last one that counts have no cotangent.
     longest = jnp.minimum(jnp.max(trace.stop), count)
     lax.while_loop(lambda position: position < count, blank, longest)
-    state = (longest - 1, jnp.zeros_like(x), trace.transmittance)
-    lax.while_loop(lambda state: state[0] >= 0, step, state)
+    state = _BackwardState(longest - 1, jnp.zeros_like(x), trace.transmittance)
+    lax.while_loop(lambda state: state.position >= 0, step, state)
 
 
-def _add_pairs(pairs_bar, lists, count, interpret):
-    """Sums `[N, C]` of the pairs' cotangents, splat by splat."""
+def _add_pairs(pairs_bar: jax.Array, lists: TileLists, count: int, *, interpret: bool) -> jax.Array:
+    """Return sums `[N, C]` of the pairs' cotangents, splat by splat."""
     capacity = lists.splats.shape[0]
+    # Merged images leave room between their lists, whose places belong to no splat.
     begins, ends = lists.starts, lists.starts + lists.counts
     changes = jnp.zeros(capacity + 1, jnp.int32).at[begins].add(1).at[ends].add(-1)
     listed = jnp.cumsum(changes[:-1]) > 0
@@ -203,18 +280,18 @@ def _add_pairs(pairs_bar, lists, count, interpret):
     owner, pair = lax.sort((jnp.where(listed, lists.splats, count), place), num_keys=1)
     bounds = starts_of(owner, count)
 
-    def add(pairs_bar, pair, bounds, out):
+    def add(pairs_bar: Ref, pair: Ref, bounds: Ref, out: Ref) -> None:
         i = pl.program_id(0)
 
-        def step(state):
+        def step(state: tuple[jax.Array, tuple[jax.Array, ...]]) -> Any:
             position, sums = state
             row = [pairs_bar[pair[position], c] for c in range(out.shape[1])]
             return position + 1, tuple(a + b for a, b in zip(sums, row, strict=True))
 
         zeros = (jnp.zeros((), out.dtype),) * out.shape[1]
         end = bounds[i + 1]
-        state = lax.while_loop(lambda state: state[0] < end, step, (bounds[i], zeros))
-        for c, total in enumerate(state[1]):
+        _, sums = lax.while_loop(lambda state: state[0] < end, step, (bounds[i], zeros))
+        for c, total in enumerate(sums):
             out[0, c] = total
 
     return pl.pallas_call(

@@ -1,115 +1,138 @@
-"""Blends the splats of all tiles, by the compositor that suits the platform."""
+"""Blends the splats of all tiles, by the compositor of a plan."""
 
 import functools
-import logging
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from types import ModuleType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from jaxcloseup.fields.splats import blend_lax as loops
-from jaxcloseup.fields.splats import blend_pallas as gpu_kernel
-from jaxcloseup.fields.splats.batching import broadcast_batch, merge_images, split_images
-from jaxcloseup.fields.splats.splat_math import PAYLOAD, Trace
+from jaxcloseup.fields.splats import blend_lax, blend_pallas
+from jaxcloseup.fields.splats.config import RasterPlan
+from jaxcloseup.fields.splats.layout import Trace
 from jaxcloseup.fields.splats.tiling import TileLists
 
 
+# Modules with `forward(plan, table, lists) -> sums, median, trace`, and
+# `backward(plan, table, lists, trace, (sums_bar, median_bar)) -> table_bar`.
+COMPOSITOR_MODULES: dict[str, ModuleType] = {"loops": blend_lax, "kernel": blend_pallas}
+
+Blended = tuple[jax.Array, jax.Array]  # sums and median, or their cotangents
+
+
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def blend_tiles(config, table: jax.Array, lists: TileLists) -> tuple[jax.Array, jax.Array]:
+def blend_tiles(plan: RasterPlan, table: jax.Array, lists: TileLists) -> Blended:
     """Blend splats front to back in all tiles; only `table` is differentiated.
 
+    A custom derivative, since autodiff through the loops would store every product of every splat
+    and pixel: it took 7 to 19 times as long.
+
     Args:
-      config: a `RasterizeConfig`; static.
+      plan: static.
       table: `[N, C]` from `pack`.
-      lists: result of `tile_lists` with the config's tile.
+      lists: result of `tile_lists` with the plan's tile.
 
     Returns:
-      Sums `[T, F + 4, P]` over splats of weight times payload, z, 1, and the first and second power
-      of 1 / z minus its value at the pixel's first splat; and the median z-depth `[T, P]`. Tiles
-      are in row-major order.
+      Sums `[T, F + MOMENTS, P]` over splats of weight times `Channels`: payload, z, 1, and the
+      first and second power of 1 / z minus its value at the pixel's first splat; and the median
+      z-depth `[T, P]`. Tiles are in row-major order.
     """
-    return _blend_forward(config, table, lists)[0]
+    return _blend_forward(plan, table, lists)[0]
 
 
-def _blend_forward(config, table, lists):
-    sums, median, trace = _batched_forward(config)(table, lists)
+def _blend_forward(
+    plan: RasterPlan, table: jax.Array, lists: TileLists
+) -> tuple[Blended, tuple[jax.Array, TileLists, Trace]]:
+    sums, median, trace = _batched_forward(plan)(table, lists)
     return (sums, median), (table, lists, trace)
 
 
-def _blend_backward(config, residuals, cotangents):
-    return _batched_backward(config)(*residuals, cotangents), None
+def _blend_backward(
+    plan: RasterPlan, residuals: tuple[jax.Array, TileLists, Trace], cotangents: Blended
+) -> tuple[jax.Array, None]:
+    return _batched_backward(plan)(*residuals, cotangents), None
 
 
 blend_tiles.defvjp(_blend_forward, _blend_backward)
 
 
-def _compositor(config, name: str) -> Callable[..., Any]:
-    """The function `name` of the compositor that `config` asks for."""
-    on_gpu = jax.default_backend() == "gpu"
-    if config.compositor == "loops" or (
-        config.compositor == "auto" and not (on_gpu and _kernels_compile(config.tile))
-    ):
-        return functools.partial(getattr(loops, name), config)
-    return functools.partial(getattr(gpu_kernel, name), config, interpret=not on_gpu)
-
-
 @functools.cache
-def _kernels_compile(tile: int) -> bool:
-    """Whether this GPU runs the kernels; says why not, once."""
-    config, array = _Tiles(tile, near=1.0), jax.ShapeDtypeStruct
-    one = array((1,), jnp.int32)
-    lists = TileLists(one, one, one, array((1, 2), jnp.int32), one)
-    table = array((1, PAYLOAD + 1), jnp.float32)
-
-    def both(table, lists):
-        *sums, trace = gpu_kernel.forward(config, table, lists)
-        return gpu_kernel.backward(config, table, lists, trace, tuple(sums))
-
-    try:
-        jax.jit(both).lower(table, lists).compile()
-    except Exception as error:  # whatever stops the compiler
-        reason = str(error).splitlines() or [type(error).__name__]
-        logging.getLogger(__name__).warning(
-            "splats are blended by jax.lax, for this GPU cannot run the kernels: %s", reason[0]
-        )
-        return False
-    return True
-
-
-class _Tiles(NamedTuple):
-    """What compositors read of a `RasterizeConfig`."""
-
-    tile: int
-    near: float
-
-
-@functools.cache
-def _batched_forward(config):
-    """`forward` that blends a batch of images as one image with more tiles.
+def _batched_forward(plan: RasterPlan) -> Callable[..., tuple[jax.Array, jax.Array, Trace]]:
+    """Return `forward` that blends a batch of images as one image with more tiles.
 
     If `vmap` batched the loops instead, all images would wait for the slowest at every chunk.
     """
-    forward = jax.custom_batching.custom_vmap(_compositor(config, "forward"))
+    compositor = COMPOSITOR_MODULES[plan.compositor]
+    forward = jax.custom_batching.custom_vmap(functools.partial(compositor.forward, plan))
 
     @forward.def_vmap
-    def _(size, batched, table, lists):
-        table, lists = merge_images(*broadcast_batch(size, batched, (table, lists)))
-        return split_images(size, forward(table, lists)), (True, True, Trace(True, True, True))
+    def _(size: int, batched: Any, table: jax.Array, lists: TileLists) -> Any:
+        merged = merge_images(*broadcast_batch(size, batched, (table, lists)))
+        result = split_images(size, forward(*merged))
+        return result, jax.tree.map(lambda leaf: True, result)
 
     return forward
 
 
 @functools.cache
-def _batched_backward(config):
-    """`backward` with the batching of `_batched_forward`."""
-    backward = jax.custom_batching.custom_vmap(_compositor(config, "backward"))
+def _batched_backward(plan: RasterPlan) -> Callable[..., jax.Array]:
+    """Return `backward` with the batching of `_batched_forward`."""
+    compositor = COMPOSITOR_MODULES[plan.compositor]
+    backward = jax.custom_batching.custom_vmap(functools.partial(compositor.backward, plan))
 
     @backward.def_vmap
-    def _(size, batched, table, lists, trace, cotangents):
+    def _(
+        size: int,
+        batched: Any,
+        table: jax.Array,
+        lists: TileLists,
+        trace: Trace,
+        cotangents: Blended,
+    ) -> Any:
         arguments = broadcast_batch(size, batched, (table, lists, trace, cotangents))
         table, lists = merge_images(*arguments[:2])
         more = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), arguments[2:])
         return split_images(size, backward(table, lists, *more)), True
 
     return backward
+
+
+def broadcast_batch(
+    size: int, batched: Sequence[Any], arguments: tuple[Any, ...]
+) -> tuple[Any, ...]:
+    """Return the arguments of a batching rule, whose leaves all have the batch axis `[size, ...]`.
+
+    Args:
+      size: number of images.
+      batched: trees of bool like `arguments`, True where a leaf already has the batch axis.
+      arguments: trees of arrays.
+    """
+    return jax.tree.map(
+        lambda leaf, has_axis: leaf if has_axis else jnp.broadcast_to(leaf, (size, *leaf.shape)),
+        arguments,
+        tuple(batched),
+    )
+
+
+def merge_images(table: jax.Array, lists: TileLists) -> tuple[jax.Array, TileLists]:
+    """Merge tables `[M, N, C]` and tile lists of M images into those of one image."""
+    count, capacity = table.shape[1], lists.splats.shape[1]
+
+    def flat(leaf: jax.Array, shift: int = 0) -> jax.Array:
+        image = jnp.arange(leaf.shape[0], dtype=leaf.dtype)
+        leaf = leaf + shift * image.reshape(-1, *(1,) * (leaf.ndim - 1))
+        return leaf.reshape(-1, *leaf.shape[2:])
+
+    return table.reshape(-1, table.shape[-1]), TileLists(
+        splats=flat(lists.splats, count),
+        starts=flat(lists.starts, capacity),
+        counts=flat(lists.counts),
+        origins=flat(lists.origins),
+        overflow=lists.overflow.sum(),
+    )
+
+
+def split_images(size: int, tree: Any) -> Any:
+    """Split the leading axis `[size * n, ...]` of every leaf into `[size, n, ...]`."""
+    return jax.tree.map(lambda leaf: leaf.reshape(size, -1, *leaf.shape[1:]), tree)

@@ -8,6 +8,7 @@ from jaxcloseup.setting import setting
 
 
 COMPOSITORS = ("auto", "loops", "kernel")
+PLATFORMS = ("cpu", "gpu", "tpu")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +58,7 @@ class RasterizeConfig:
     """Static settings of the rasterizer; the sizes change no image whose pairs fit.
 
     Raises:
-      ValueError: there is no such compositor.
+      ValueError: there is no such compositor or platform.
     """
 
     capacity: int = setting(
@@ -71,7 +72,7 @@ class RasterizeConfig:
     antialias: bool = setting(False, "convolve splats with the pixel, see `project_discs`")
     tile: int | None = setting(
         None,
-        "side of a tile in pixels; none chooses by the image's size, see `for_image`",
+        "side of a tile in pixels; none chooses by the image's size, see `plan_raster`",
         low=1,
         high=64,
     )
@@ -91,13 +92,47 @@ class RasterizeConfig:
         "GPUs run fast; auto by kernels on a GPU that runs them, else by loops",
         choices=COMPOSITORS,
     )
+    platform: str | None = setting(
+        None,
+        "platform for which sizes and the compositor that are left open are chosen; none asks JAX",
+        choices=PLATFORMS,
+    )
 
     def __post_init__(self) -> None:
-        """Check the compositor's name."""
+        """Check the names."""
         if self.compositor not in COMPOSITORS:
             raise ValueError(
                 f'RasterizeConfig.compositor must be one of {COMPOSITORS}, not "{self.compositor}"'
             )
+        if self.platform not in (None, *PLATFORMS):
+            raise ValueError(
+                f"RasterizeConfig.platform must be None or one of {PLATFORMS}, not {self.platform}"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class RasterPlan:
+    """A `RasterizeConfig` for one image, with nothing left open; see `plan_raster`.
+
+    Attributes:
+      capacity: largest number of pairs of splats and tiles.
+      near: z-depth before which nothing is drawn.
+      tile: side of a tile in pixels.
+      chunk: number of a tile's splats that loops evaluate at once.
+      block: largest number of tiles that loops evaluate at once.
+      pairs_at_once: largest number of pairs that are listed at once.
+      compositor: one of `COMPOSITORS` but "auto".
+      interpret: whether kernels are interpreted.
+    """
+
+    capacity: int
+    near: float
+    tile: int
+    chunk: int = 8
+    block: int = 256
+    pairs_at_once: int = 2**14
+    compositor: str = "loops"
+    interpret: bool = False
 
 
 @dataclasses.dataclass(frozen=True)

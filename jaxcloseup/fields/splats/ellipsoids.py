@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxcloseup.fields.splats.filters import widen_ellipse
+from jaxcloseup.fields.splats.layout import Footprints
 from jaxcloseup.fields.splats.projection import Discs
-from jaxcloseup.fields.splats.rasterize import Footprints
 from jaxcloseup.fields.splats.splat_math import ALPHA_MIN
 from jaxcloseup.geometry.cameras import Camera
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxcloseup.fields.splats.filters import LOW_PASS, pixel_spread, widen
-from jaxcloseup.fields.splats.rasterize import Footprints
+from jaxcloseup.fields.splats.layout import Footprints
 from jaxcloseup.fields.splats.splat_math import ALPHA_MIN
 from jaxcloseup.fields.splats.surfels import Surfels
 from jaxcloseup.fields.splats.vectors import Vector, cross, dot, scaled

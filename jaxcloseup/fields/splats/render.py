@@ -11,10 +11,10 @@ from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.fields.splats.config import RasterizeConfig
 from jaxcloseup.fields.splats.culling import map_shown, may_show
 from jaxcloseup.fields.splats.ellipsoids import project_ellipsoids
+from jaxcloseup.fields.splats.layout import pack
 from jaxcloseup.fields.splats.projection import offsets, project_discs, surfel_columns, to_camera
 from jaxcloseup.fields.splats.rasterize import blend
 from jaxcloseup.fields.splats.spherical_harmonics import sh_to_channels
-from jaxcloseup.fields.splats.splat_math import pack
 from jaxcloseup.fields.splats.surfels import Surfels
 from jaxcloseup.geometry.cameras import Camera
 

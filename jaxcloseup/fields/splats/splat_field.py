@@ -36,8 +36,7 @@ _RENEWED_EVERY = 100  # steps between renewals of sampling intervals without den
 _UNCHANGED_SHARE = 0.3  # share of the image loss on unchanged colors when images may change theirs
 
 
-@struct.dataclass
-class SurfelBuffers:
+class SurfelBuffers(struct.PyTreeNode):
     """State of the surfel field that is not differentiated.
 
     Attributes:

@@ -1,61 +1,62 @@
 """What one splat does to a pixel, and its derivative: the arithmetic of every compositor.
 
-Functions take a `column`: the value of a column of the splat's table row, in whatever shape
-broadcasts against the pixels. `loops` has chunks of splats in it, `gpu_kernel` one splat.
+Functions take a `column`: the value of a column of the splat's table row (see `layout`), in
+whatever shape broadcasts against the pixels. `blend_lax` has chunks of splats in it, `blend_pallas`
+one splat.
+
+The derivative must test the same thresholds on the same bits as the forward pass, so both call
+`shade`. Names in formulas are those of 2D Gaussian splatting (Huang et al. 2024), written in terms
+of 1 / z, which is affine in the pixel.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
+from flax import struct
 
+from jaxcloseup.fields.splats.layout import (
+    ANCHOR,
+    HOMOGRAPHY,
+    INVERSE_DEPTH,
+    LOW_PASS,
+    OPACITY,
+    PAYLOAD,
+    Channels,
+    Column,
+    Trace,
+)
 from jaxcloseup.geometry.numerics import safe_divide
 
 
-ALPHA_MIN = 1 / 255  # the kernel skips fainter contributions
+# As published for 3-D Gaussian splatting (Kerbl et al. 2023), appendix C.
+ALPHA_MIN = 1 / 255  # fainter contributions are skipped
 ALPHA_MAX = 0.99  # keeps a gradient for splats behind an opaque one
 TRANSMITTANCE_MIN = 1e-4  # a pixel is finished before its transmittance falls below this
 
-# First columns of the packed table; the payload comes last.
-ANCHOR, HOMOGRAPHY, OPACITY, LOW_PASS, RANGE, PAYLOAD = 0, 2, 11, 12, 13, 15
 
-Column = Callable[[int], jax.Array]
+class Shade(struct.PyTreeNode):
+    """Splats at pixels.
 
+    Attributes:
+      alpha: opacity, 0 where not drawn.
+      inverse_depth: 1 / z, clipped to the disc's range where the low-pass determines rho.
+      z: its inverse.
+      u_numerator: u / z.
+      v_numerator: v / z.
+      rho: squared distance from the center in standard deviations.
+      on_plane: bool, True where the disc, not the low-pass, determines rho.
+      clipped: bool, True where `inverse_depth` is a limit of the disc's range.
+    """
 
-def pack(footprints) -> jax.Array:
-    """Pack `Footprints` into one table `[N, C]`, whose rows compositors read."""
-    columns = [
-        footprints.anchor,
-        footprints.homography.reshape(9, -1),
-        footprints.opacity[None],
-        lax.stop_gradient(footprints.low_pass)[None],
-        lax.stop_gradient(footprints.inverse_depth),
-        footprints.payload,
-    ]
-    return jnp.concatenate(columns).T
-
-
-class Trace(NamedTuple):
-    """What the forward pass keeps for the derivative, per pixel of all tiles `[T, P]`."""
-
-    transmittance: jax.Array  # behind the last drawn splat
-    stop: jax.Array  # position in the list at which the pixel was finished
-    reference: jax.Array  # inverse depth of the first drawn splat
-
-
-class Shade(NamedTuple):
-    """Splats at pixels."""
-
-    alpha: jax.Array  # 0 where not drawn
+    alpha: jax.Array
     inverse_depth: jax.Array
     z: jax.Array
     u_numerator: jax.Array
     v_numerator: jax.Array
     rho: jax.Array
-    on_plane: jax.Array  # bool: the disc, not the low-pass, gives rho
-    clipped: jax.Array  # bool: the low-pass gives rho and the depth is clipped to the disc's range
+    on_plane: jax.Array
+    clipped: jax.Array
 
 
 def shade(column: Column, x: jax.Array, y: jax.Array, near: float) -> Shade:
@@ -66,19 +67,23 @@ def shade(column: Column, x: jax.Array, y: jax.Array, near: float) -> Shade:
         for i in (HOMOGRAPHY, HOMOGRAPHY + 3, HOMOGRAPHY + 6)
     )
     squared = u * u + v * v
+    # The object-space low-pass of 2DGS (equation 11): no splat is narrower than a pixel.
     low_pass = column(LOW_PASS) * (dx * dx + dy * dy)
     # Compare rho without dividing; where w <= 0 the ray misses the plane and the low-pass counts.
     on_plane = (w > 0) & (squared <= low_pass * (w * w))
-    low, high = column(RANGE), column(RANGE + 1)
+    low, high = column(INVERSE_DEPTH), column(INVERSE_DEPTH + 1)
+    # Beside a nearly edge-on disc, the plane's own depth has no bound.
     inverse = jnp.where(on_plane, w, jnp.clip(w, low, high))
     z = 1 / inverse
     rho = jnp.where(on_plane, squared * (z * z), low_pass)
     alpha = jnp.minimum(column(OPACITY) * jnp.exp(-0.5 * rho), ALPHA_MAX)
+    # The near plane cuts each intersection, not each splat; w <= 0 passes, for the low-pass.
     alpha = jnp.where((alpha >= ALPHA_MIN) & (w * near <= 1), alpha, 0)
-    return Shade(alpha, inverse, z, u, v, rho, on_plane, ~on_plane & ((w < low) | (w > high)))
+    clipped = ~on_plane & ((w < low) | (w > high))
+    return Shade(alpha, inverse, z, u, v, rho, on_plane, clipped)
 
 
-class Walk(NamedTuple):
+class Walk(struct.PyTreeNode):
     """Where pixels are on their way through a list, front to back.
 
     Attributes:
@@ -103,47 +108,96 @@ def pass_splat(
     after: jax.Array,
     position: jax.Array | int,
 ) -> tuple[jax.Array, Walk]:
-    """The weight of the splat at `position`, with the transmittance before and after it."""
-    open_ = after >= TRANSMITTANCE_MIN
+    """Return the weight of the splat at `position`, and the walk behind it.
+
+    Args:
+      walk: in front of the splat.
+      alpha: from `shade`.
+      inverse_depth: from `shade`.
+      z: from `shade`.
+      before: product of 1 - alpha of all splats in front, which keeps falling when the pixel is
+        finished, unlike `walk.remaining`.
+      after: the same behind the splat.
+      position: in the tile's list.
+    """
+    # The splat that would take the transmittance below the limit is not drawn itself.
+    unfinished = after >= TRANSMITTANCE_MIN
     drawn = alpha > 0
-    return jnp.where(open_, alpha * before, 0), Walk(
-        remaining=jnp.where(open_, after, walk.remaining),
-        stop=jnp.where(open_, position + 1, walk.stop),
+    return jnp.where(unfinished, alpha * before, 0), Walk(
+        remaining=jnp.where(unfinished, after, walk.remaining),
+        stop=jnp.where(unfinished, position + 1, walk.stop),
+        # Only in front of the first drawn splat is the product exactly 1.
         reference=jnp.where(drawn & (before == 1), inverse_depth, walk.reference),
         median=jnp.where(drawn & (before > 0.5), z, walk.median),
     )
 
 
-def channels(column: Column, features: int, seen: Shade, reference: jax.Array) -> list[jax.Array]:
-    """What the weights of splats multiply: payload, z, 1, and the shifted inverse depth's powers.
+def channels(column: Column, features: int, seen: Shade, reference: jax.Array) -> Channels:
+    """Return what the weights of splats multiply.
 
     Splats in front of the first drawn one have weight 0, so one reference serves all.
     """
     shifted = seen.inverse_depth - reference
-    payload = [column(PAYLOAD + f) for f in range(features)]
-    return [*payload, seen.z, jnp.ones_like(seen.z), shifted, shifted * shifted]
+    return Channels(
+        payload=tuple(column(PAYLOAD + f) for f in range(features)),
+        depth=seen.z,
+        alpha=jnp.ones_like(seen.z),
+        first=shifted,
+        second=shifted * shifted,
+    )
 
 
-def worth(
-    column: Column, seen: Shade, reference: jax.Array, sums_bar: Sequence[jax.Array]
-) -> jax.Array:
-    """Derivative of the loss with respect to splats' weights, by the sums' cotangents."""
-    *payload_bar, z_bar, alpha_bar, first_bar, second_bar = sums_bar
+def worth(column: Column, seen: Shade, reference: jax.Array, sums_bar: Channels) -> jax.Array:
+    """Return the derivative of the loss with respect to splats' weights.
+
+    Args:
+      column: of the splats.
+      seen: from `shade`.
+      reference: of the pixels' trace.
+      sums_bar: cotangents of the sums.
+    """
     shifted = seen.inverse_depth - reference
-    total = sum(column(PAYLOAD + f) * bar for f, bar in enumerate(payload_bar))
-    total = total + alpha_bar + seen.z * z_bar
-    return total + shifted * (first_bar + shifted * second_bar)
+    total = sum(column(PAYLOAD + f) * bar for f, bar in enumerate(sums_bar.payload))
+    total = total + sums_bar.alpha + seen.z * sums_bar.depth
+    return total + shifted * (sums_bar.first + shifted * sums_bar.second)
 
 
-class Pulled(NamedTuple):
-    """Cotangents of what splats are at pixels; `u`, `v`, `w` are those of the homography's rows."""
+class Pulled(struct.PyTreeNode):
+    """Cotangents of splats at pixels.
+
+    Attributes:
+      u: of the homography's first row, the numerator of u.
+      v: of the second row.
+      w: of the third row, 1 / z.
+      low_pass: of -rho / 2 where the low-pass determines it.
+      clip: of the depth at the anchor, where the depth is clipped.
+      scaled: of log(alpha).
+    """
 
     u: jax.Array
     v: jax.Array
     w: jax.Array
-    low_pass: jax.Array  # of -rho / 2 where the low-pass gives it
-    clip: jax.Array  # of the depth at the anchor, where the depth is clipped
-    scaled: jax.Array  # of log(alpha)
+    low_pass: jax.Array
+    clip: jax.Array
+    scaled: jax.Array
+
+
+Moments = Sequence[jax.Array]  # three: sums over pixels of values times 1, x and y
+
+
+class PulledSums(struct.PyTreeNode):
+    """Sums of `Pulled` over the pixels of a tile.
+
+    The homography and the low-pass are affine in the pixel, or a circle about the anchor, so
+    moments are all that their parameters' cotangents need.
+    """
+
+    u: Moments
+    v: Moments
+    w: Moments
+    low_pass: Moments
+    clip: jax.Array
+    scaled: jax.Array
 
 
 def pull_back(
@@ -154,9 +208,10 @@ def pull_back(
     behind: jax.Array,
     value: jax.Array,
     trace: Trace,
-    bars: tuple[jax.Array, ...],
+    sums_bar: Channels,
+    median_bar: jax.Array,
 ) -> tuple[jax.Array, Pulled]:
-    """The weights of splats, and their cotangents.
+    """Return the weights of splats, and their cotangents.
 
     Args:
       seen: from `shade`.
@@ -166,17 +221,19 @@ def pull_back(
       behind: sum of weight times worth of all splats behind it.
       value: from `worth`.
       trace: of these pixels.
-      bars: cotangents of the sums of z and of the shifted inverse depth's powers, and the median's.
+      sums_bar: cotangents of the sums.
+      median_bar: cotangent of the median depth.
     """
-    z_bar, first_bar, second_bar, median_bar = bars
     shifted = seen.inverse_depth - trace.reference
     weight = alpha * before
     # The median splat takes transmittance to 1/2, else it is the last drawn one.
     last = (after <= 0.5) | (after == trace.transmittance)
     median = (alpha > 0) & (before > 0.5) & last
-    depth_bar = weight * z_bar + jnp.where(median, median_bar, 0)
-    inverse_bar = weight * (first_bar + 2 * shifted * second_bar)
-    inverse_bar = inverse_bar - seen.z * seen.z * depth_bar
+    depth_bar = weight * sums_bar.depth + jnp.where(median, median_bar, 0)
+    inverse_bar = weight * (sums_bar.first + 2 * shifted * sums_bar.second)
+    inverse_bar = inverse_bar - seen.z * seen.z * depth_bar  # dz = -z^2 d(1 / z)
+    # A splat adds its own worth and dims all splats behind it by 1 / (1 - alpha). `behind` is a sum
+    # from the back: a total minus a prefix would cancel where many faint splats lie in a row.
     scaled = alpha * (before * value - behind * (1 / (1 - alpha)))
     scaled = jnp.where(alpha < ALPHA_MAX, scaled, 0)
     plane = jnp.where(seen.on_plane, scaled * seen.z, 0)
@@ -190,18 +247,41 @@ def pull_back(
     )
 
 
-def row_bar(column: Column, middle: float, sums: Pulled, payload: Sequence[Any]) -> list[jax.Array]:
-    """Cotangents of the columns of table rows, from sums over a tile's pixels.
+def sum_pixels(
+    pulled: Pulled,
+    moments: Callable[[jax.Array], Moments],
+    total: Callable[[jax.Array], jax.Array],
+) -> PulledSums:
+    """Sum cotangents over the pixels of a tile, by functions for moments and for plain sums."""
+    return PulledSums(
+        u=moments(pulled.u),
+        v=moments(pulled.v),
+        w=moments(pulled.w),
+        low_pass=moments(pulled.low_pass),
+        clip=total(pulled.clip),
+        scaled=total(pulled.scaled),
+    )
+
+
+def row_bar(
+    column: Column, middle: float, sums: PulledSums, payload: Sequence[jax.Array]
+) -> list[jax.Array]:
+    """Return the cotangents of the columns of table rows, from sums over a tile's pixels.
 
     Args:
       column: of the rows.
       middle: x and y about which moments are taken.
-      sums: of u, v, w and low_pass, triples of moments: sums of 1, x and y about the middle.
+      sums: from `sum_pixels`.
       payload: cotangents of the payload.
     """
     ax, ay = column(ANCHOR) - middle, column(ANCHOR + 1) - middle
-    about_anchor = lambda m: (m[0], m[1] - ax * m[0], m[2] - ay * m[0])  # noqa: E731
+
+    def about_anchor(m: Moments) -> tuple[jax.Array, jax.Array, jax.Array]:
+        return m[0], m[1] - ax * m[0], m[2] - ay * m[0]
+
     u, v, w, low_pass = map(about_anchor, (sums.u, sums.v, sums.w, sums.low_pass))
+    # The numerators depend on the pixel minus the anchor: the anchor's cotangent is minus the
+    # homography's slopes times theirs. The low-pass circle moves with the anchor too.
     anchor_bar = [
         column(LOW_PASS) * low_pass[1 + axis]
         - sum(bar[0] * column(HOMOGRAPHY + 3 * i + 1 + axis) for i, bar in enumerate((u, v, w)))

@@ -18,8 +18,7 @@ from jaxcloseup.geometry.cameras import Camera, pixels_to_points, points_to_pixe
 from jaxcloseup.geometry.masks import in_bounds
 
 
-@struct.dataclass
-class Surfels:
+class Surfels(struct.PyTreeNode):
     """`N` discs, or volumetric Gaussians, in world units.
 
     Attributes:

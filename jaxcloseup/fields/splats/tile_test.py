@@ -7,14 +7,15 @@ perspective.
 import jax
 import jax.numpy as jnp
 
-from jaxcloseup.fields.splats.splat_math import (
-    ALPHA_MIN,
+from jaxcloseup.fields.splats.layout import (
     ANCHOR,
     HOMOGRAPHY,
+    INVERSE_DEPTH,
     LOW_PASS,
     OPACITY,
-    RANGE,
+    PAYLOAD,
 )
+from jaxcloseup.fields.splats.splat_math import ALPHA_MIN
 
 
 _MARGIN = 0.01  # pixels, and with the factor below more than rounding
@@ -41,7 +42,7 @@ def reaches(
       near: z-depth before which nothing is drawn.
     """
     column = lambda i: rows[:, i]  # noqa: E731
-    rows = table[:, : RANGE + 2][splat]
+    rows = table[:, :PAYLOAD][splat]
     opacity = jnp.maximum(column(OPACITY) / ALPHA_MIN, 1)
     cutoff = _WIDER * jnp.sqrt(2 * jnp.log(opacity))
     # Pixel centers of the tile about the anchor, and the one that is nearest to the anchor.
@@ -65,4 +66,4 @@ def reaches(
 
     disc = meets(x, low[:, 1], 1) | meets(low[:, 0], y, 0)
     low_pass = column(LOW_PASS) * (x * x + y * y) <= cutoff * cutoff
-    return disc | low_pass | (column(RANGE + 1) * near >= 1 / _WIDER)
+    return disc | low_pass | (column(INVERSE_DEPTH + 1) * near >= 1 / _WIDER)

@@ -17,11 +17,9 @@ from jax import lax
 LARGEST = 2**31 - 1
 _LARGE = 2**16  # room for pairs that is worth shortcuts
 _FEW = 2**12  # splats that are worth a shortcut
-_AT_ONCE = 2**14  # pairs that a CPU looks at before the next ones
 
 
-@struct.dataclass
-class TileLists:
+class TileLists(struct.PyTreeNode):
     """The lists of all `T` tiles, in row-major order.
 
     Attributes:
@@ -48,6 +46,7 @@ def tile_lists(
     width: int,
     tile: int,
     capacity: int,
+    at_once: int | None = None,
     reaches: Callable[[jax.Array, jax.Array], jax.Array] | None = None,
 ) -> TileLists:
     """Sort (tile, splat) pairs by tile, then by `order[N]`, then by index.
@@ -60,8 +59,10 @@ def tile_lists(
       width: image width in pixels; static.
       tile: side of a tile in pixels; static.
       capacity: largest number of pairs of splats and tiles that their boxes touch; static.
-      reaches: says of `[P]` indices of splats and `[P, 2]` corners x, y of tiles, in pixels, which
-        of these pairs are worth listing, `[P]` bool; None lists all.
+      at_once: largest number of pairs that are made before the next ones, so that a CPU keeps their
+        data in its cache; static. None makes all at once.
+      reaches: `(splats[P], corners[P, 2]) -> [P]` bool, True where a pair of a splat's index and a
+        tile's corner x, y, in pixels, is worth listing; None lists all.
     """
     chex.assert_shape(box, (order.shape[0], 4))
     across, down = -(-width // tile), -(-height // tile)
@@ -73,8 +74,17 @@ def tile_lists(
     too_many = jnp.sum(pairs.astype(jnp.float32)) > LARGEST / 2  # int32 may have wrapped
 
     by_depth = _nearest_first_shown(order, pairs)
-    touched = first[by_depth], extent[by_depth], by_depth
-    tile_of, rank = _touched_tiles(*touched, reaches, capacity, tile=tile, across=across, down=down)
+    tile_of, rank = _touched_tiles(
+        first[by_depth],
+        extent[by_depth],
+        by_depth,
+        reaches,
+        tile=tile,
+        across=across,
+        down=down,
+        capacity=capacity,
+        at_once=min(capacity, at_once or capacity),
+    )
     starts, splats = _sorted_pairs(tile_of, rank, by_depth, total, across * down)
     tiles = jnp.arange(across * down, dtype=jnp.int32)
     return TileLists(
@@ -114,8 +124,19 @@ def _nearest_first_shown(order, pairs):
     return lax.cond(after < few, first_ones, lambda: _nearest_first(order))
 
 
-def _touched_tiles(first, extent, splats, reaches, capacity, *, tile, across, down):
-    """Tiles `[capacity]` of the pairs of splats, which are in order of depth, and their ranks.
+def _touched_tiles(
+    first: jax.Array,
+    extent: jax.Array,
+    splats: jax.Array,
+    reaches: Callable[[jax.Array, jax.Array], jax.Array] | None,
+    *,
+    tile: int,
+    across: int,
+    down: int,
+    capacity: int,
+    at_once: int,
+) -> tuple[jax.Array, jax.Array]:
+    """Return tiles `[capacity]` of the pairs of splats, which are in order of depth, and ranks.
 
     Pairs are laid out by rank, so those of the farthest splats overflow. The tile is
     `across * down` where there is no pair, or nothing worth listing.
@@ -124,8 +145,7 @@ def _touched_tiles(first, extent, splats, reaches, capacity, *, tile, across, do
     ends = jnp.cumsum(pairs)
     begins = ends - pairs
     tiles = across * down
-    size = min(capacity, _AT_ONCE) if jax.default_backend() == "cpu" else capacity
-    steps = -(-capacity // size)
+    size, steps = at_once, -(-capacity // at_once)
     # How many splats' pairs end in front of each pair.
     ended = jnp.zeros(steps * size, jnp.int32).at[ends].add(1, mode="drop").reshape(steps, size)
 

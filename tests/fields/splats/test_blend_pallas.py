@@ -22,9 +22,9 @@ from splat_scenes import (
     to_surfels,
 )
 
-from jaxcloseup.fields.splats import RasterizeConfig, blending
-from jaxcloseup.fields.splats import blend_pallas as gpu_kernel
-from jaxcloseup.fields.splats.splat_math import PAYLOAD
+from jaxcloseup.fields.splats import blend_pallas
+from jaxcloseup.fields.splats.config import RasterizeConfig, RasterPlan
+from jaxcloseup.fields.splats.layout import PAYLOAD
 from jaxcloseup.fields.splats.tiling import tile_lists
 
 
@@ -85,10 +85,11 @@ def test_kernels_become_programs_of_a_gpu():
     box = jnp.tile(jnp.array([[0.0, 0.0, width, height]]), (count, 1))
     lists = tile_lists(box, jnp.ones(count), height=height, width=width, tile=8, capacity=256)
     table = jnp.zeros((count, PAYLOAD + 6))
+    plan = RasterPlan(capacity=256, near=NEAR, tile=8)
 
     def both(table, lists):
-        *sums, trace = gpu_kernel.forward(CONFIG, table, lists)
-        return gpu_kernel.backward(CONFIG, table, lists, trace, tuple(sums))
+        *sums, trace = blend_pallas.forward(plan, table, lists)
+        return blend_pallas.backward(plan, table, lists, trace, tuple(sums))
 
     gpu = jax.sharding.AbstractDevice("NVIDIA H100", num_cores=None, platform="cuda")
     mesh = jax.sharding.AbstractMesh((), (), abstract_device=gpu)
@@ -97,19 +98,21 @@ def test_kernels_become_programs_of_a_gpu():
     assert lowered.as_text().count("triton") >= 3
 
 
-def test_a_gpu_that_cannot_run_them_falls_back_to_loops_and_says_so(monkeypatch, caplog):
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")  # but there is none to compile for
-    blending._kernels_compile.cache_clear()
-    config = RasterizeConfig(capacity=1024, near=NEAR, chunk=4, block=3)
+@pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated")
+def test_a_gpu_that_cannot_run_them_falls_back_to_loops_and_says_so(caplog):
+    blend_pallas.kernels_compile.cache_clear()
+    # There is no GPU to compile for.
+    config = RasterizeConfig(capacity=1024, near=NEAR, chunk=4, block=3, platform="gpu")
     surfels = to_surfels(SCENES["in front"])
     with caplog.at_level(logging.WARNING):
         found = [render(surfels, to_camera(), config=config)["rgb"] for _ in range(2)]
-    blending._kernels_compile.cache_clear()
+    blend_pallas.kernels_compile.cache_clear()
     said = [record.getMessage() for record in caplog.records if "blended" in record.getMessage()]
     assert len(said) == 1 and "\n" not in said[0]
     np.testing.assert_allclose(found[0], oracle(SCENES["in front"])["rgb"], atol=2e-5)
 
 
-def test_other_names_are_no_compositors():
-    with pytest.raises(ValueError, match="compositor"):
-        RasterizeConfig(compositor="cuda")
+@pytest.mark.parametrize("name", ["compositor", "platform"])
+def test_other_names_are_refused(name):
+    with pytest.raises(ValueError, match=f"{name} must be .*, not .*cuda"):
+        RasterizeConfig(**{name: "cuda"})

@@ -28,7 +28,7 @@ from splat_scenes import (
 )
 
 from jaxcloseup.fields.splats.config import RasterizeConfig
-from jaxcloseup.fields.splats.rasterize import for_image
+from jaxcloseup.fields.splats.raster_plan import plan_raster
 from jaxcloseup.geometry.rotations import euler_to_matrix
 
 
@@ -184,12 +184,19 @@ def test_tile_sizes_do_not_change_the_image(precision):
 
 
 def test_sizes_left_open_suit_the_image():
-    small = for_image(RasterizeConfig(capacity=1000), height=68, width=120)
-    large = for_image(RasterizeConfig(capacity=1000), height=540, width=960)
+    """A platform that the program names is not asked again."""
+    config = RasterizeConfig(capacity=1000, platform="cpu")
+    small = plan_raster(config, height=68, width=120)
+    large = plan_raster(config, height=540, width=960)
     assert (small.tile, small.capacity) == (4, 3000) and (large.tile, large.capacity) == (8, 1000)
     assert small.chunk == large.chunk > 0 and small.block == large.block > 0
-    given = RasterizeConfig(capacity=1000, tile=16, chunk=3, block=5)
-    assert for_image(given, height=68, width=120) == given
+    assert small.compositor == "loops" and plan_raster(
+        RasterizeConfig(capacity=1000), height=68, width=120
+    ) == small
+    sizes = {"capacity": 1000, "tile": 16, "chunk": 3, "block": 5}
+    for platform in ("cpu", "tpu"):
+        plan = plan_raster(RasterizeConfig(**sizes, platform=platform), height=68, width=120)
+        assert {name: getattr(plan, name) for name in sizes} == sizes
 
 
 @pytest.mark.parametrize("name", ["in front", "far and small"])

@@ -18,7 +18,7 @@ from splat_scenes import (
 )
 
 from jaxcloseup.fields.splats import projection
-from jaxcloseup.fields.splats.splat_math import pack
+from jaxcloseup.fields.splats.layout import pack
 from jaxcloseup.fields.splats.tile_test import reaches
 
 

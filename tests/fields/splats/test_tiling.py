@@ -42,11 +42,11 @@ def expected_lists(box, order):
 @pytest.mark.parametrize(("capacity", "shown"), [(512, 40), (60, 40), (40, 40), (512, 9)])
 def test_lists_hold_the_splats_of_a_tile_nearest_first(capacity, shown, monkeypatch):
     """In parts of the room, in all of it, in too little, and of a few splats alone."""
-    for name, value in {"_LARGE": 50, "_FEW": 10, "_AT_ONCE": 32}.items():
+    for name, value in {"_LARGE": 50, "_FEW": 10}.items():
         monkeypatch.setattr(tiling, name, value)
     box, order = random_boxes()
     box[shown:] = [0, 0, -1, -1]
-    make = functools.partial(tile_lists, height=HEIGHT, width=WIDTH, tile=TILE)
+    make = functools.partial(tile_lists, height=HEIGHT, width=WIDTH, tile=TILE, at_once=32)
     make = jax.jit(functools.partial(make, capacity=capacity))
     lists = jax.tree.map(np.asarray, make(jnp.asarray(box), jnp.asarray(order)))
     expected = expected_lists(box, order)

@@ -1,0 +1,48 @@
+"""What a rasterizer's configuration leaves open, settled for one image.
+
+Nothing else in splatting depends on the platform. To add a compositor, write a module with
+`forward` and `backward` like those of `blend_lax`, add it to `blending.COMPOSITOR_MODULES` and its
+name to `config.COMPOSITORS`, and say in `_compositor` where "auto" means it.
+"""
+
+import jax
+
+from jaxcloseup.fields.splats.blend_pallas import kernels_compile
+from jaxcloseup.fields.splats.config import RasterizeConfig, RasterPlan
+
+
+_SMALL = 2**17  # pixels of an image that is best cut into small tiles
+_CACHED_PAIRS = 2**14  # pairs whose data fit into a core's cache
+
+
+def plan_raster(config: RasterizeConfig, *, height: int, width: int) -> RasterPlan:
+    """Settle what a configuration leaves open by what is fastest for an image on its platform.
+
+    Small tiles evaluate fewer splats in vain, but more pairs have to be sorted; docs/speed.md
+    has the times on a CPU. Small tiles that are chosen here get three times the `capacity`, since
+    splats touch two to three times as many. A GPU evaluates thousands of tiles at once: its sizes
+    are a guess.
+    """
+    platform = config.platform or jax.default_backend()
+    on_cpu = platform == "cpu"
+    tile, capacity = config.tile, config.capacity
+    if tile is None:
+        small = on_cpu and height * width <= _SMALL
+        tile, capacity = (4, 3 * capacity) if small else (8, capacity)
+    return RasterPlan(
+        capacity=capacity,
+        near=config.near,
+        tile=tile,
+        chunk=config.chunk or 8,
+        block=config.block or (256 if on_cpu else 4096),
+        pairs_at_once=_CACHED_PAIRS if on_cpu else capacity,
+        compositor=_compositor(config.compositor, platform, tile),
+        interpret=platform != "gpu",
+    )
+
+
+def _compositor(name: str, platform: str, tile: int) -> str:
+    """Return the name of a compositor, where "auto" is the fastest that runs on a platform."""
+    if name != "auto":
+        return name
+    return "kernel" if platform == "gpu" and kernels_compile(tile) else "loops"
