@@ -190,9 +190,10 @@ def test_sizes_left_open_suit_the_image():
     large = plan_raster(config, height=540, width=960)
     assert (small.tile, small.capacity) == (4, 3000) and (large.tile, large.capacity) == (8, 1000)
     assert small.chunk == large.chunk > 0 and small.block == large.block > 0
-    assert small.compositor == "loops" and plan_raster(
-        RasterizeConfig(capacity=1000), height=68, width=120
-    ) == small
+    assert (
+        small.compositor == "loops"
+        and plan_raster(RasterizeConfig(capacity=1000), height=68, width=120) == small
+    )
     sizes = {"capacity": 1000, "tile": 16, "chunk": 3, "block": 5}
     for platform in ("cpu", "tpu"):
         plan = plan_raster(RasterizeConfig(**sizes, platform=platform), height=68, width=120)

@@ -44,7 +44,12 @@ _REFINED_AT = 4  # times the photographs' training size, at which new surfels ar
 def make_field(config: SplatTrainingConfig, scene: Scene, growth: int) -> RadianceField:
     """Return splats sized for a scene; `growth` multiplies the rasterizer's capacity."""
     size, capacity = extent(scene), config.raster.capacity * growth
-    raster = dataclasses.replace(config.raster, capacity=capacity, near=_near(config, scene))
+    raster = dataclasses.replace(
+        config.raster,
+        capacity=capacity,
+        near=_near(config, scene),
+        platform=config.raster.platform or jax.default_backend(),
+    )
     config = dataclasses.replace(config, raster=raster)
     center = jnp.mean(jnp.asarray(scene.train.cameras.position), axis=0)
     return surfel_field(config, extent=size, center=center, photographs=_photographs(config, scene))
