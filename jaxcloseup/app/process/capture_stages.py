@@ -1,4 +1,4 @@
-"""`process.json`: what a capture was made from, and which of its stages are finished."""
+"""Keep the sources and the finished stages of a capture in `process.json`."""
 
 import pathlib
 import time
@@ -13,18 +13,18 @@ NAME = "process.json"
 
 
 class Stages:
-    """The finished stages of a capture; each one is kept as soon as it ends.
+    """Finished stages of a capture; each is kept as soon as it ends.
 
     Args:
       folder: folder of the capture.
-      made_from: what determines the capture: flags, files and versions.
+      made_from: flags, files and versions, which determine the capture.
 
     Raises:
       ProcessingError: the folder holds a capture that was made from something else.
     """
 
     def __init__(self, folder: pathlib.Path, made_from: Mapping[str, Any]) -> None:
-        """Read what the folder holds; write nothing."""
+        """Read the file in the folder, if there is one; write nothing."""
         self._file = folder / NAME
         self._held: dict[str, Any] = {"made_from": dict(made_from), "stages": {}}
         if not self._file.exists():
@@ -38,7 +38,7 @@ class Stages:
                 f"{self._file} cannot be read ({error}): name a new folder, or remove it"
             ) from error
         other = [name for name, value in made_from.items() if before.get(name) != value]
-        if not stages:  # nothing came of it
+        if not stages:  # its first stage did not end
             return
         if other:
             name = other[0]
@@ -56,7 +56,7 @@ class Stages:
         Args:
           name: name of the stage.
           proof: file or folder that the stage leaves in the capture; without it, it runs again.
-          make: runs it; returns what JSON holds.
+          make: runs the stage; returns values for JSON.
         """
         stages = self._held["stages"]
         if name not in stages or not (self._file.parent / proof).exists():

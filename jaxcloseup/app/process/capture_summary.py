@@ -1,4 +1,4 @@
-"""Say what a capture holds, what was left out and why, and draw it from above."""
+"""Summarize a capture, explain which photographs it leaves out, and draw it from above."""
 
 import io
 import pathlib
@@ -30,13 +30,13 @@ def why_left_out(
     partners: Mapping[str, int],
     models: Sequence[Mapping[str, Any]],
 ) -> dict[str, str]:
-    """Say for each photograph without a pose in the first model why it has none.
+    """Return why photographs have no pose in the first model, by name.
 
     Args:
       names: all photographs.
       features: number of features of each.
-      partners: number of other photographs that show the same as each.
-      models: what `solver.map_photographs` returned.
+      partners: for each, number of other photographs that show the same.
+      models: result of `solver.map_photographs`.
     """
     solved, *others = (set(model["photographs"]) for model in models)
     reasons = {}
@@ -55,7 +55,7 @@ def why_left_out(
 
 
 def other_models(models: Sequence[Mapping[str, Any]]) -> list[int]:
-    """Count the photographs of each further model that no larger model has; too few are none."""
+    """Count the photographs that each further model adds; leave out models that add too few."""
     known, sizes = set(models[0]["photographs"]), []
     for model in models[1:]:
         new = set(model["photographs"]) - known
@@ -65,7 +65,7 @@ def other_models(models: Sequence[Mapping[str, Any]]) -> list[int]:
 
 
 def summary_lines(summary: Mapping[str, Any]) -> list[str]:
-    """Lines for the terminal, from the field `summary` of `process.json`."""
+    """Describe the field `summary` of `process.json` in lines for the terminal."""
     registered, total = summary["registered"], summary["photographs"]
     error, track = summary["reprojection_error"], summary["track_length"]
     lines = [
@@ -101,8 +101,8 @@ def summary_lines(summary: Mapping[str, Any]) -> list[str]:
 def draw_from_above(model: pathlib.Path, images: pathlib.Path, path: pathlib.Path) -> None:
     """Draw the cameras and points of a model from above, as a PNG.
 
-    Up is perpendicular to the cameras' horizontal axes, as far as possible, since few people tilt
-    a camera sideways.
+    Up is as perpendicular as possible to the cameras' horizontal axes, since few people tilt a
+    camera sideways.
 
     Raises:
       SceneError: the model cannot be read.
@@ -122,7 +122,7 @@ def draw_from_above(model: pathlib.Path, images: pathlib.Path, path: pathlib.Pat
         low, high = np.minimum(low, near), np.maximum(high, far)
     side = max(high - low)
     figure, axes = plt.subplots(figsize=(8, 8), layout="constrained")
-    axes.scatter(*flat.T, s=3, c=np.clip(rgb, 0, 1), linewidths=0)
+    axes.scatter(flat[:, 0], flat[:, 1], s=3, c=np.clip(rgb, 0, 1), linewidths=0)
     length = side / 25
     across = forward[:, ::-1] * [-1, 1]
     wedges = [
@@ -131,7 +131,7 @@ def draw_from_above(model: pathlib.Path, images: pathlib.Path, path: pathlib.Pat
     ]
     order = np.arange(len(cameras))
     axes.add_collection(LineCollection(wedges, array=order, cmap="viridis", linewidths=1))
-    shown = axes.scatter(*cameras.T, s=14, c=order, cmap="viridis", zorder=3)
+    shown = axes.scatter(cameras[:, 0], cameras[:, 1], s=14, c=order, cmap="viridis", zorder=3)
     ticks = MaxNLocator(integer=True)
     figure.colorbar(shown, ax=axes, shrink=0.6, label="photographs, by name", ticks=ticks)
     middle = (low + high) / 2
@@ -147,10 +147,10 @@ def draw_from_above(model: pathlib.Path, images: pathlib.Path, path: pathlib.Pat
 
 
 def _horizontal(rotations: np.ndarray) -> np.ndarray:
-    """Two horizontal axes `[2, 3]` for camera-to-world rotations `[V, 3, 3]`; x is to the right."""
+    """Return horizontal axes `[2, 3]`, x to the right, for rotations `[V, 3, 3]` to the world."""
     right, up = rotations[:, :, 0], -rotations[:, :, 1].mean(0)
     values, vectors = np.linalg.eigh(right.T @ right)
-    # Cameras that all look the same way have no such direction, but agree on up.
+    # Horizontal axes of cameras that look the same way are alike and leave up open: take their own.
     axis = vectors[:, 0] if values[0] < values[1] / 4 else up / np.linalg.norm(up)
     axis = axis * np.sign(axis @ up)
     mean = right.mean(0) - axis * (axis @ right.mean(0))

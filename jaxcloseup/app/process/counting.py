@@ -1,4 +1,4 @@
-"""What a stage has done, how fast, and how long it will still take."""
+"""Show how far a stage is, how fast it works, and how long it will still take."""
 
 import contextlib
 import time
@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from jaxcloseup.app.progress import saying
 
 
-Report = Callable[[int, int | None], None]  # (done, of how many; None where nobody knows)
+Report = Callable[[int, int | None], None]  # (done, total; None if unknown)
 
 
 @contextlib.contextmanager
@@ -15,12 +15,12 @@ def progress(what: str, unit: str) -> Iterator[Report]:
     """Show the progress of a stage while it works, and leave a line when it ends.
 
     Args:
-      what: what the stage does.
-      unit: what it counts, in the plural.
+      what: description of the stage.
+      unit: unit of its progress, in the plural.
 
     Yields:
-      A function to call with the count that is done and that of all. What its first call says was
-      done before is not part of the rate.
+      A function that takes the count that is done and the total. The count of its first call was
+      done before, so the rate leaves it out.
     """
     began, first, line = time.monotonic(), None, what
     with saying(what) as shown:

@@ -1,7 +1,7 @@
 """Choose which photographs to match with each other.
 
-All pairs cost the square of the number of photographs. Frames of a video show the same as their
-neighbors; of many photographs, those with similar features are likely to overlap.
+The number of all pairs grows with the square of the number of photographs. Frames of a video
+overlap with their neighbors; photographs with similar features are likely to overlap.
 """
 
 from collections.abc import Sequence
@@ -28,12 +28,12 @@ def choose_pairing(pairing: str, count: int, *, video: bool) -> str:
 def pairs_to_match(pairing: str, descriptors: Sequence[np.ndarray]) -> list[tuple[int, int]]:
     """List the pairs (i, j), i < j, of photographs to match, in order.
 
-    `exhaustive` takes all. `sequential` takes the 10 next ones, those 16, 32, 64, ... later, and
-    for loops the 5 most similar ones. `retrieval` takes the 30 most similar ones and both
+    `exhaustive` takes all. `sequential` takes the next 10, the ones 16, 32, 64, ... later, and the
+    5 most similar ones, which close loops. `retrieval` takes the 30 most similar ones and both
     neighbors, since photographs are often numbered in the order in which they were taken.
 
     Args:
-      pairing: one of `names.PAIRINGS`.
+      pairing: one of `choices.PAIRINGS`.
       descriptors: for each photograph, `[F, 128]` SIFT descriptors; F may be 0.
     """
     count = len(descriptors)
@@ -51,7 +51,7 @@ def pairs_to_match(pairing: str, descriptors: Sequence[np.ndarray]) -> list[tupl
 
 
 def similarity(descriptors: Sequence[np.ndarray]) -> np.ndarray:
-    """Cosine similarity `[V, V]` of photographs by their VLAD descriptors.
+    """Return the cosine similarity `[V, V]` of photographs by their VLAD descriptors.
 
     Each photograph is the sum, for each word of a vocabulary, of how its descriptors differ from
     the word (Jegou et al. 2010, with the signed square roots and the norms for each word of
@@ -60,9 +60,9 @@ def similarity(descriptors: Sequence[np.ndarray]) -> np.ndarray:
     roots = [_roots(each) for each in descriptors]
     words = _vocabulary(np.concatenate(roots))
     vlad = np.zeros((len(roots), *words.shape), np.float32)
-    for total, own in zip(vlad, roots, strict=True):
-        chosen = _nearest(own, words)
-        total[:] = chosen.T @ own - chosen.sum(0)[:, None] * words
+    for total, units in zip(vlad, roots, strict=True):
+        chosen = _nearest(units, words)
+        total[:] = chosen.T @ units - chosen.sum(0)[:, None] * words
     vlad = np.sign(vlad) * np.sqrt(np.abs(vlad))
     vlad /= np.maximum(np.linalg.norm(vlad, axis=-1, keepdims=True), 1e-6)
     flat = vlad.reshape(len(vlad), -1)
@@ -71,7 +71,7 @@ def similarity(descriptors: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _roots(descriptors: np.ndarray) -> np.ndarray:
-    """Unit vectors, whose products compare descriptors as COLMAP's matcher does."""
+    """Return unit vectors, whose products compare descriptors as COLMAP's matcher does."""
     values = np.asarray(descriptors, np.float32).reshape(-1, 128)
     return values / np.maximum(np.linalg.norm(values, axis=-1, keepdims=True), 1e-6)
 
@@ -92,6 +92,6 @@ def _vocabulary(descriptors: np.ndarray) -> np.ndarray:
 
 
 def _nearest(descriptors: np.ndarray, words: np.ndarray) -> np.ndarray:
-    """One-hot float32 `[F, K]`: which word is nearest to each descriptor."""
+    """Return the nearest word of each descriptor as one-hot float32 `[F, K]`."""
     nearest = np.argmin(np.sum(words**2, -1) - 2 * descriptors @ words.T, axis=-1)
     return np.eye(len(words), dtype=np.float32)[nearest]

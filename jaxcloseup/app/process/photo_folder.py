@@ -1,4 +1,4 @@
-"""Copy photographs into a capture: upright, each once, under names that every format holds."""
+"""Copy photographs into a capture: upright, without duplicates, under portable names."""
 
 import concurrent.futures
 import hashlib
@@ -25,7 +25,7 @@ from jaxcloseup.io.messages import printable
 from jaxcloseup.photos.scene import SceneError
 
 
-_AT_ONCE = 4  # in memory
+_AT_ONCE = 4  # photographs in memory
 _LONGEST_STEM = 60  # characters
 _QUALITY = 95  # of a JPEG that was turned
 _KEPT = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}  # formats that COLMAP reads everywhere
@@ -38,7 +38,7 @@ class Copied(NamedTuple):
     Attributes:
       name: its name in the folder `images`.
       source: name of the file that it was made from.
-      lens: what tells lenses apart: size in pixels and, if EXIF has them, camera and focal length.
+      lens: identifies the lens: size in pixels and, if EXIF has them, camera and focal length.
     """
 
     name: str
@@ -81,22 +81,25 @@ def copy_photographs(
     formats become PNG. EXIF's focal lengths stay.
 
     Returns:
-      The copies, in the order of the photographs, and why others are left out, by name: what cannot
-      be read, and files that are equal to one before.
+      The copies, in the order of the photographs, and the reasons by name why others are left out:
+      unreadable files, and duplicates of earlier ones.
 
     Raises:
       ProcessingError: fewer than 3 photographs remain.
       OSError: a copy cannot be written.
     """
-    copied, left_out, taken, first = [], {}, set(), {}
+    copied: list[Copied] = []
+    left_out: dict[str, str] = {}
+    taken: set[str] = set()  # names of copies
+    first: dict[bytes, str] = {}  # first source with each hash
     workers = min(_AT_ONCE, os.cpu_count() or 1)
     with (
         warnings.catch_warnings(),
         concurrent.futures.ThreadPoolExecutor(workers) as pool,
         progress("copying photographs", "photographs") as report,
     ):
-        warnings.simplefilter("ignore")  # Pillow's, of damaged EXIF and of many pixels
-        # Not all at once: what waits in a queue is in memory.
+        warnings.simplefilter("ignore")  # Pillow warns of damaged EXIF and of many pixels
+        # In parts, because all that waits in a queue is in memory.
         for start in range(0, len(photographs), workers):
             part = photographs[start : start + workers]
             for path, made in zip(part, pool.map(_read, part), strict=True):
@@ -121,7 +124,7 @@ def copy_photographs(
 
 
 class _Made(NamedTuple):
-    """The file of a copy: its bytes and ending, the lens, and a hash of the original."""
+    """File of a copy: its bytes and ending, the lens, and a hash of the original."""
 
     data: bytes
     ending: str
@@ -130,7 +133,7 @@ class _Made(NamedTuple):
 
 
 def _read(path: pathlib.Path) -> _Made | str:
-    """Read a photograph, or say why it cannot be."""
+    """Read a photograph, or return the reason why it is unreadable."""
     try:
         held = read_file(path)
         rgb = read_image(path, data=held)
@@ -139,20 +142,21 @@ def _read(path: pathlib.Path) -> _Made | str:
         return printable(reason.rstrip(".").split(": ")[0])
     data = held.tobytes()
     digest = hashlib.sha256(data).digest()
-    ending, lens, turn = _about(data)
+    kept, lens, turn = _about(data)
+    ending = kept or ".png"
     if turn:
         try:
             data, ending = _turned(data)
             rgb = read_image(path, data=np.frombuffer(data, np.uint8))
         except Exception as error:  # Pillow reads less than OpenCV, and raises various types
             return f"cannot be turned as its EXIF says ({type(error).__name__}): export it upright"
-    elif ending is None:
-        data, ending = encode_png(rgb), ".png"
+    elif kept is None:
+        data = encode_png(rgb)
     return _Made(data, ending, [rgb.shape[1], rgb.shape[0], *lens], digest)
 
 
 def _about(data: bytes) -> tuple[str | None, list[Any], bool]:
-    """The ending of a file that needs no conversion, EXIF's lens, and whether EXIF turns it."""
+    """Return the ending of a copy without conversion, EXIF's lens, and whether EXIF turns it."""
     try:
         with PIL.Image.open(io.BytesIO(data)) as image:
             exif = image.getexif()
@@ -160,18 +164,18 @@ def _about(data: bytes) -> tuple[str | None, list[Any], bool]:
             focal = [detail.get(tag) for tag in (Base.FocalLength, Base.FocalLengthIn35mmFilm)]
             lens = [str(exif.get(tag)) for tag in (Base.Make, Base.Model)] + list(map(str, focal))
             turn = exif.get(Base.Orientation, 1) in range(2, 9)
-            return _KEPT.get(image.format), lens if any(focal) else [], turn
+            return _KEPT.get(image.format or ""), lens if any(focal) else [], turn
     except Exception:  # not known to Pillow, or damaged EXIF: OpenCV has read the pixels
         return None, [], False
 
 
 def _turned(data: bytes) -> tuple[bytes, str]:
-    """Turn a photograph upright; returns the bytes and the ending of its new file."""
+    """Turn a photograph upright; return the bytes and the ending of its new file."""
     with PIL.Image.open(io.BytesIO(data)) as image:
         upright = PIL.ImageOps.exif_transpose(image)
         kept = {"exif": upright.getexif(), "icc_profile": image.info.get("icc_profile")}
         file = io.BytesIO()
-        if _KEPT.get(image.format) == ".jpg":
+        if _KEPT.get(image.format or "") == ".jpg":
             upright.save(file, "JPEG", quality=_QUALITY, subsampling=0, **kept)
             return file.getvalue(), ".jpg"
         upright.save(file, "PNG", **kept)
@@ -179,7 +183,7 @@ def _turned(data: bytes) -> tuple[bytes, str]:
 
 
 def _new_name(stem: str, ending: str, taken: set[str]) -> str:
-    """A new name for a file; COLMAP's lists of names are divided by spaces."""
+    """Return an unused name without spaces, which separate the names in COLMAP's lists."""
     stem = re.sub(r"[^\w.+-]+", "_", stem)[:_LONGEST_STEM].lstrip(".-") or "photograph"
     name, count = stem + ending, 1
     while name.lower() in taken:

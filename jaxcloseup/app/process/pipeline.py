@@ -1,11 +1,12 @@
 """Make a capture in four stages: photographs, features, matches, mapping."""
 
+import dataclasses
 import hashlib
 import importlib.metadata
 import pathlib
 import shutil
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 from jaxcloseup.app.process.capture_stages import Stages
 from jaxcloseup.app.process.capture_summary import draw_from_above, other_models, why_left_out
@@ -22,15 +23,16 @@ IMAGES, MODEL, PICTURE = "images", "sparse/0", "cameras.png"  # in the capture's
 _WORK, _DATABASE = "colmap", "colmap/database.db"
 
 
-class Request(NamedTuple):
-    """What a capture is made from.
+@dataclasses.dataclass(frozen=True)
+class Request:
+    """Sources and settings of a capture.
 
     Attributes:
       images: folder of photographs, or None.
-      video: a video file where `images` is None.
+      video: a video file, or None; exactly one of both is given.
       count: largest number of frames of the video.
-      lens: a key of `names.LENSES`.
-      pairs: which photographs are matched: `auto` or one of `names.PAIRINGS`.
+      lens: a key of `choices.LENSES`.
+      pairs: which photographs are matched: `auto` or one of `choices.PAIRINGS`.
     """
 
     images: pathlib.Path | None
@@ -40,13 +42,14 @@ class Request(NamedTuple):
     pairs: str
 
     def identity(self) -> dict[str, Any]:
-        """All that determines the capture, as JSON holds it.
+        """Return all that determines the capture, for JSON.
 
         Raises:
           ProcessingError: the folder or the video cannot be read, or holds too little.
           OSError: likewise.
         """
-        files = [self.video] if self.images is None else list_files(self.images)[0]
+        files = [] if self.images is None else list_files(self.images)[0]
+        files += [] if self.video is None else [self.video]
         held = [[path.name, path.stat().st_size] for path in files]
         return {
             "images": None if self.images is None else str(self.images.resolve()),
@@ -66,12 +69,12 @@ def make_capture(request: Request, folder: pathlib.Path, stages: Stages) -> dict
     """Make a capture, or continue one, and return the summary that `process.json` keeps.
 
     Args:
-      request: what it is made from.
+      request: its sources and settings.
       folder: folder of the capture.
-      stages: the stages of the capture that are finished.
+      stages: the finished stages of the capture.
 
     Raises:
-      ProcessingError: no model comes out; the message says why.
+      ProcessingError: the photographs give no model; the message says why.
       SceneError: the model cannot be read again.
       OSError: a file cannot be written.
     """
@@ -129,11 +132,12 @@ def make_capture(request: Request, folder: pathlib.Path, stages: Stages) -> dict
 
 
 def _gather(request: Request, folder: pathlib.Path) -> dict[str, Any]:
-    """Write the photographs of the capture, instead of what an interrupted process wrote."""
+    """Write the photographs of the capture; remove the ones of an interrupted process."""
     shutil.rmtree(folder, ignore_errors=True)
-    if request.images is None:
+    if request.video is not None:
         copied, frames = extract_frames(request.video, request.count, folder)
         return {"copied": [each._asdict() for each in copied], "left_out": {}, "frames": frames}
+    assert request.images is not None
     photographs, left_out = list_files(request.images)
     copied, unread = copy_photographs(photographs, folder)
     return {"copied": [each._asdict() for each in copied], "left_out": left_out | unread}

@@ -1,4 +1,4 @@
-"""What pycolmap does, in a process of its own: features, matches and mapping.
+"""Run pycolmap in a separate process: features, matches and mapping.
 
 pycolmap and OpenCV bring different copies of the libraries that write PNG files, and crash where
 both are used in one process, so this module must not import OpenCV. A process can also be stopped
@@ -6,9 +6,9 @@ at any time, and keeps COLMAP's messages out of the terminal.
 
     python -m jaxcloseup.app.process.solver
 
-reads one job from a line of standard input, as JSON. It answers in lines of JSON: `{"done", "of"}`
-any number of times, then `{"result"}`. It ends when its input does, as when the program that
-started it was killed.
+reads one job from a line of standard input, as JSON. It writes lines of JSON: `{"done", "of"}`
+any number of times, then `{"result"}`. It ends with its input, so it dies with the program that
+started it.
 """
 
 import contextlib
@@ -19,7 +19,7 @@ import shutil
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import pycolmap
@@ -35,7 +35,7 @@ _AT_ONCE = 2  # photographs for each thread between two lines of progress
 _SECONDS = 2.0  # between two lines of progress on matches
 _ENOUGH = 30  # photographs of a lens, for eight parameters instead of four
 _RICHER = {"SIMPLE_RADIAL": "OPENCV", "SIMPLE_RADIAL_FISHEYE": "OPENCV_FISHEYE"}
-Say = Callable[[int, int], None]
+Say = Callable[[int, int], None]  # takes the count that is done and the total
 
 
 def find_features(
@@ -44,10 +44,10 @@ def find_features(
     """Find SIFT features of all photographs that lack them.
 
     Args:
-      say: called with the count of photographs that are done and that of all.
+      say: reports progress in photographs.
       database: path of COLMAP's database; made if missing.
       images: folder of the photographs.
-      lenses: names of the photographs that were taken with one lens, for each lens.
+      lenses: names of the photographs of each lens.
       model: COLMAP's name of the camera model.
 
     Returns:
@@ -91,13 +91,13 @@ def match(say: Say, *, database: str, pairing: str, names: Sequence[str]) -> dic
     """Match and verify pairs of photographs; those in the database are not matched again.
 
     Args:
-      say: called with the count of pairs that are done and that of all.
+      say: reports progress in pairs.
       database: path of COLMAP's database.
-      pairing: one of `names.PAIRINGS`.
+      pairing: one of `choices.PAIRINGS`.
       names: the photographs, in the order in which they were taken.
 
     Returns:
-      For each photograph, the number of others that show the same from elsewhere.
+      For each photograph, the number of others that show the same from another position.
     """
     with _opened(database) as opened:
         ids = {image.name: image.image_id for image in opened.read_all_images()}
@@ -126,24 +126,24 @@ def match(say: Say, *, database: str, pairing: str, names: Sequence[str]) -> dic
         by_id = {number: name for name, number in ids.items()}
         numbers, inliers = opened.read_two_view_geometry_num_inliers()
         for number, count in zip(numbers, inliers, strict=True):
-            for one in pycolmap.pair_id_to_image_pair(number) if count else ():
-                partners[by_id[one]] += 1
+            for image in pycolmap.pair_id_to_image_pair(number) if count else ():
+                partners[by_id[image]] += 1
     return partners
 
 
 def map_photographs(say: Say, *, database: str, images: str, folder: str) -> list[dict[str, Any]]:
     """Solve poses, lenses and points, and write the model with most photographs.
 
-    One thread, because sums over several depend on their order, and with them the results.
+    Uses one thread: sums over several threads depend on their order, and so would the results.
 
     Args:
-      say: called with the count of photographs that have a pose and that of all.
+      say: reports how many photographs have a pose.
       database: path of COLMAP's database.
       images: folder of the photographs.
       folder: existing empty folder for the binary files of the model.
 
     Returns:
-      A record of each model that was found, the written one first; empty if there is none.
+      A record for each model, the written one first; empty without any.
     """
     with _opened(database) as opened:
         total = opened.num_images()
@@ -169,7 +169,9 @@ def map_photographs(say: Say, *, database: str, images: str, folder: str) -> lis
     for written in pathlib.Path(folder).iterdir():  # each model in a folder of its own
         shutil.rmtree(written)
     ranked = sorted(
-        models.values(), key=lambda one: (one.num_reg_images(), one.num_points3D()), reverse=True
+        models.values(),
+        key=lambda model: (model.num_reg_images(), model.num_points3D()),
+        reverse=True,
     )
     if ranked:
         _refine(ranked[0])
@@ -178,18 +180,16 @@ def map_photographs(say: Say, *, database: str, images: str, folder: str) -> lis
 
 
 def _refine(model: pycolmap.Reconstruction) -> None:
-    """Let the lenses of enough photographs have more distortion, and solve everything again.
+    """Give lenses with enough photographs more distortion parameters, and solve all again.
 
-    A lens of many parameters from the start fits the first photographs with a wrong distortion,
-    which fits no others.
+    With many parameters from the start, the first photographs would be fitted with a wrong
+    distortion that fits no others.
     """
     changed = False
     for camera in model.cameras.values():
-        own = (one for one in model.images.values() if one.camera_id == camera.camera_id)
-        if sum(image.has_pose for image in own) >= _ENOUGH and camera.model_name in _RICHER:
+        if _posed(model, camera) >= _ENOUGH and camera.model_name in _RICHER:
             values = dict(zip(camera.params_info.split(", "), camera.params, strict=True))
-            kind = pycolmap.CameraModelId.__members__[_RICHER[camera.model_name]]
-            camera.model = kind
+            camera.model = pycolmap.CameraModelId.__members__[_RICHER[camera.model_name]]
             focal, center = [values["f"]] * 2, [values["cx"], values["cy"]]
             camera.params = [*focal, *center, values["k"], 0.0, 0.0, 0.0]
             changed = True
@@ -200,18 +200,26 @@ def _refine(model: pycolmap.Reconstruction) -> None:
         model.update_point_3d_errors()
 
 
+def _posed(model: pycolmap.Reconstruction, camera: pycolmap.Camera) -> int:
+    """Count the photographs of a lens that have a pose."""
+    images = model.images.values()
+    return sum(image.has_pose for image in images if image.camera_id == camera.camera_id)
+
+
 def _about(model: pycolmap.Reconstruction) -> dict[str, Any]:
     names = sorted(image.name for image in model.images.values() if image.has_pose)
     lenses = []
     for camera in model.cameras.values():
-        own = [image for image in model.images.values() if image.camera_id == camera.camera_id]
-        own = sum(image.has_pose for image in own)
-        about = {"model": camera.model_name, "size": [camera.width, camera.height]}
-        about["parameters"] = dict(
-            zip(camera.params_info.split(", "), map(float, camera.params), strict=True)
-        )
-        about["focal_length_in_exif"] = bool(camera.has_prior_focal_length)
-        lenses += [about | {"photographs": own}] if own else []
+        if posed := _posed(model, camera):
+            parameters = camera.params_info.split(", ")
+            about = {
+                "model": camera.model_name,
+                "size": [camera.width, camera.height],
+                "parameters": dict(zip(parameters, map(float, camera.params), strict=True)),
+                "focal_length_in_exif": bool(camera.has_prior_focal_length),
+                "photographs": posed,
+            }
+            lenses.append(about)
     return {
         "photographs": names,
         "points": model.num_points3D(),
@@ -222,7 +230,7 @@ def _about(model: pycolmap.Reconstruction) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def _opened(database: str):
+def _opened(database: str) -> Iterator[Any]:
     opened = pycolmap.Database.open(database)
     try:
         yield opened
@@ -236,13 +244,17 @@ def _threads() -> int:
     return os.cpu_count() or 1
 
 
-JOBS = {"features": find_features, "matches": match, "mapping": map_photographs}
+JOBS: dict[str, Callable[..., Any]] = {
+    "features": find_features,
+    "matches": match,
+    "mapping": map_photographs,
+}
 
 
 def main() -> None:
-    """Do the job that standard input holds."""
+    """Run the job that standard input describes."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8", buffering=1)
-    os.dup2(2, 1)  # whatever prints, it does not answer
+    os.dup2(2, 1)  # so that no library prints among the answers
     pycolmap.logging.minloglevel = pycolmap.logging.Level.WARNING.value
     job = json.loads(sys.stdin.readline())
 

@@ -1,4 +1,4 @@
-"""Start the process that solves, follow its progress, and say in a sentence why it failed."""
+"""Start the solver's process, show its progress, and explain its failure in one sentence."""
 
 import contextlib
 import importlib.util
@@ -15,7 +15,7 @@ from jaxcloseup.app.process.counting import progress
 
 
 class ProcessingError(RuntimeError):
-    """No capture can be made; the message is one sentence that says why, and what to do."""
+    """No capture can be made. The message is one sentence that says why, and what to do."""
 
 
 def check_pycolmap() -> None:
@@ -27,12 +27,12 @@ def check_pycolmap() -> None:
 
 
 def run_job(job: str, what: str, unit: str, log: pathlib.Path, **arguments: Any) -> Any:
-    """Do a job of `jaxcloseup.app.process.solver` in a process of its own.
+    """Run a job of `jaxcloseup.app.process.solver` in a separate process.
 
     Args:
       job: name of the job.
-      what: what it does, for the line of progress.
-      unit: what it counts, in the plural.
+      what: description for the line of progress.
+      unit: unit of its progress, in the plural.
       log: file that COLMAP's messages are appended to.
       **arguments: arguments of the job, as JSON holds them.
 
@@ -58,6 +58,7 @@ def run_job(job: str, what: str, unit: str, log: pathlib.Path, **arguments: Any)
         ) as process,
         progress(what, unit) as report,
     ):
+        assert process.stdin is not None and process.stdout is not None  # both are pipes
         answer: dict[str, Any] = {}
         try:
             process.stdin.write(json.dumps({"job": job, **arguments}) + "\n")
@@ -79,7 +80,7 @@ def run_job(job: str, what: str, unit: str, log: pathlib.Path, **arguments: Any)
     return answer["result"]
 
 
-def _signal(number):
+def _signal(number: int) -> str:
     try:
         return signal.Signals(number).name
     except ValueError:

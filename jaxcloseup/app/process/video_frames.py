@@ -1,8 +1,9 @@
-"""Choose frames of a video: sharp ones, spread evenly over what the camera's motion shows."""
+"""Choose sharp frames of a video, spread evenly over the camera's motion."""
 
+import itertools
 import os
 import pathlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -18,17 +19,17 @@ LARGEST = 2**42  # bytes of a video
 _SHARP_WIDTH, _MOTION_WIDTH = 960, 160  # pixels of the reduced frames
 _LEAST_MOTION = 0.1  # widths of a frame in the whole video; a tripod has less
 _ENOUGH = 3  # frames to compare in the middle of a part
-_BLURRED = 0.5  # of the sharpness of frames nearby
-_QUALITY = 95  # of the frames' JPEG files
+_BLURRED = 0.5  # share of the sharpness of frames nearby
+_QUALITY = 95  # of JPEG files
 
 
 def choose_frames(sharpness: np.ndarray, motion: np.ndarray, count: int) -> list[int]:
     """Choose frames of a video.
 
     The video is divided into `count` parts of equal motion, so a camera that stands still for a
-    while adds no frames. Each part gives its sharpest frame, unless frames near it are more than
-    twice as sharp. Sharpness depends on what a frame shows, so frames far apart are not compared.
-    Where the middle half of a part has at least three frames, only these are compared, which
+    while adds no frames. Each part contributes its sharpest frame, unless nearby frames are more
+    than twice as sharp. Sharpness depends on the content of a frame, so frames far apart are not
+    compared. If the middle half of a part has at least three frames, only these are compared, which
     spreads the chosen ones more evenly.
 
     Args:
@@ -66,7 +67,7 @@ def extract_frames(
       folder: folder for the frames, which are named by their index in the video.
 
     Returns:
-      The frames, and how many the video has.
+      The frames, and the number of frames of the video.
 
     Raises:
       ProcessingError: the video cannot be read, has fewer than 3 frames, or shows no motion.
@@ -80,26 +81,23 @@ def extract_frames(
             "that moves around the scene"
         )
     chosen = choose_frames(sharpness, motion, count)
-    wanted, copied = set(chosen), []
+    copied: list[Copied] = []
     with progress("writing frames", "frames") as report:
-        for index, frame in enumerate(_frames(video, wanted)):
-            if index in wanted:
-                name = f"frame_{index:06d}.jpg"
-                write_file(folder / name, _jpeg(frame))
-                copied.append(Copied(name, f"frame {index}", [frame.shape[1], frame.shape[0]]))
-                report(len(copied), len(chosen))
-            if index == chosen[-1]:
-                break
+        for index, frame in _frames(video, chosen):
+            name = f"frame_{index:06d}.jpg"
+            write_file(folder / name, _jpeg(frame))
+            copied.append(Copied(name, f"frame {index}", [frame.shape[1], frame.shape[0]]))
+            report(len(copied), len(chosen))
     return copied, len(sharpness)
 
 
 def _survey(video: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
-    """Sharpness `[F]`, and motion `[F]` in widths of a frame, of all frames of a video."""
-    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+    """Measure sharpness `[F]`, and motion `[F]` in widths of a frame, for all frames of a video."""
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
     before, sharpness, motion = None, [], []
     with progress("looking for sharp frames", "frames") as report:
         claimed = int(_open(video).get(cv2.CAP_PROP_FRAME_COUNT))
-        for frame in _frames(video):
+        for _, frame in _frames(video):
             gray = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
             sharpness.append(cv2.Laplacian(_reduced(gray, _SHARP_WIDTH), cv2.CV_32F).var())
             small = _reduced(gray, _MOTION_WIDTH)
@@ -117,7 +115,7 @@ def _survey(video: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _open(video: pathlib.Path) -> cv2.VideoCapture:
-    # FFmpeg and OpenCV print what is wrong with a file, in their own words.
+    # Without these levels, FFmpeg and OpenCV print errors of their own.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     level = cv2.utils.logging.getLogLevel()
     try:
@@ -134,21 +132,23 @@ def _open(video: pathlib.Path) -> cv2.VideoCapture:
         raise ProcessingError(
             f"--video={video} is not a video that can be read: export it again, as MP4"
         )
-    return opened  # which turns frames upright itself, as the file says
+    return opened  # it turns frames upright as the file says
 
 
-def _frames(video: pathlib.Path, wanted: set[int] | None = None) -> Iterator[np.ndarray | None]:
-    """All frames of a video, uint8 BGR `[H, W, 3]`; None in place of those that are not wanted."""
-    opened, index = _open(video), 0
+def _frames(
+    video: pathlib.Path, chosen: Sequence[int] | None = None
+) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield indices and frames of a video, uint8 BGR `[H, W, 3]`: the chosen ones, or all."""
+    opened = _open(video)
     try:
-        while opened.grab():
-            frame = None
-            if wanted is None or index in wanted:
+        for index in itertools.count():
+            if (chosen is not None and index > chosen[-1]) or not opened.grab():
+                return
+            if chosen is None or index in chosen:
                 good, frame = opened.retrieve()
                 if not good:
                     return
-            yield frame
-            index += 1
+                yield index, frame
     finally:
         opened.release()
 
