@@ -194,7 +194,7 @@ def test_a_run_that_does_not_fit_is_one_sentence(render, kept, tmp_path, name, c
 
 def test_other_photographs_than_it_was_trained_on_are_said(kept):
     record = read_run(kept)
-    other = record._replace(manifest={**record.manifest, "data_sha256": "0"})
+    other = dataclasses.replace(record, manifest={**record.manifest, "data_sha256": "0"})
     with pytest.warns(UserWarning, match="does not hold the photographs or cameras"):
         load_run_scene(other)
     load_run_scene(record)

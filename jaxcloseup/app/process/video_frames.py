@@ -103,7 +103,8 @@ def _survey(video: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
             small = _reduced(gray, _MOTION_WIDTH)
             moved = 0.0
             if before is not None:
-                moved = np.median(np.linalg.norm(flow.calc(before, small, None), axis=-1))
+                vectors = flow.calc(before, small, None)  # type: ignore[call-overload]
+                moved = np.median(np.linalg.norm(vectors, axis=-1))
             motion.append(moved / small.shape[1])
             before = small
             report(len(motion), claimed if claimed >= len(motion) else None)

@@ -1,9 +1,10 @@
-"""A stored run, finished or cut off, loaded again: its scene, its preset, a stage's state."""
+"""Load a stored run, finished or interrupted: its scene, its preset, and the state of a stage."""
 
+import dataclasses
 import pathlib
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,10 +24,10 @@ from jaxcloseup.photos.scene import Scene
 from jaxcloseup.training.steps import TrainState
 
 
-# Which stage is rendered by default: the first of these that a run has.
+# The stage to render by default is the first of these that a run has.
 _BY_DEFAULT = ("closeup", "control", "baseline")
-# What rendering needs of the files of a run.
-_FIELDS = {
+# Fields that rendering needs, by file of a run.
+_FIELDS: dict[str, dict[str, type]] = {
     manifest.NAME: {"scene": str, "load_options": dict, "data_sha256": str},
     "checkpoints/run.json": {"config": dict, "resolution": list, "seed": int},
 }
@@ -37,20 +38,21 @@ class RunError(Exception):
     """A run that cannot be rendered. The message is one sentence that says what to do."""
 
     def __init__(self, message: str) -> None:
-        """Escape what a terminal would obey in what files say."""
+        """Escape control characters, which may come from files."""
         super().__init__(printable(message))
 
 
-class StoredRun(NamedTuple):
-    """What a run's folder says about it.
+@dataclasses.dataclass(frozen=True)
+class StoredRun:
+    """Content of a run's folder.
 
     Attributes:
       folder: the run's folder.
       manifest: its `manifest.json`.
       identity: its `checkpoints/run.json`.
-      trained: how it was trained.
-      preset: the same, with the settings that the user changes now.
-      stages: those that have a state.
+      trained: preset of its training.
+      preset: the same preset with the settings that the user changes.
+      stages: stages that have a state.
     """
 
     folder: pathlib.Path
@@ -62,12 +64,12 @@ class StoredRun(NamedTuple):
 
 
 def read_run(folder: pathlib.Path) -> StoredRun:
-    """Read how a run was trained, and which states it left.
+    """Read the preset of a run, and list the stages that have a state.
 
-    Prints the settings that its version lacked, with the values that reproduce its renders.
+    Prints the settings that the run's version lacked, with the values that reproduce its renders.
 
     Raises:
-      RunError: the folder holds no run, or none that this version can render.
+      RunError: the folder holds no run that this version can render.
     """
     if not folder.is_dir():
         raise RunError(f"--run={folder} is not a folder: name that of a run of experiments.run")
@@ -105,19 +107,19 @@ def read_run(folder: pathlib.Path) -> StoredRun:
 
 
 def change_settings(run: StoredRun, given: Sequence[str]) -> StoredRun:
-    """The run with other settings, for what is trained from its states.
+    """Return the run with other settings, for fine-tuning from its states.
 
     Raises:
-      RunError: a setting is unknown or has no such value.
+      RunError: a setting is unknown or its value is invalid.
     """
     try:
-        return run._replace(preset=with_settings(run.preset, given))
+        return dataclasses.replace(run, preset=with_settings(run.preset, given))
     except ValueError as error:
         raise RunError(str(error)) from None
 
 
 def choose_stage(run: StoredRun, stage: str | None) -> str:
-    """The stage that the user names; by default the closeup, or the last that trained."""
+    """Return the stage that the user names; by default the closeup, or the last trained stage."""
     if stage is None:
         return next(name for name in (*_BY_DEFAULT, *run.stages) if name in run.stages)
     if stage not in run.stages:
@@ -129,11 +131,11 @@ def choose_stage(run: StoredRun, stage: str | None) -> str:
 
 
 def load_run_scene(run: StoredRun, moved_to: str | None = None) -> Scene:
-    """The scene that a run was trained on, from where it was or `moved_to`.
+    """Load the scene that a run was trained on, from its old place or from `moved_to`.
 
     Raises:
-      RunError: the capture is another one now.
-      SceneError: it cannot be loaded.
+      RunError: the capture does not fit the run.
+      SceneError: the capture cannot be loaded.
     """
     about = run.manifest
     name = about["scene"] if moved_to is None else moved_to
@@ -160,12 +162,11 @@ def load_run_scene(run: StoredRun, moved_to: str | None = None) -> Scene:
 
 
 def restore(run: StoredRun, scene: Scene, stage: str) -> tuple[Programs, TrainState]:
-    """The programs of a run, with the room that its images needed, and a stage's newest state.
+    """Return the programs of a run, with room for its images, and the newest state of a stage.
 
     Raises:
-      RunError: there is no such state, it does not fit into memory, or a changed setting does not
-        fit it.
-      CheckpointError: the state has another form.
+      RunError: the state is missing or too large for memory, or a changed setting does not fit it.
+      CheckpointError: the state does not fit the preset.
     """
     programs = Programs(run.preset, scene)
     try:
@@ -179,35 +180,35 @@ def restore(run: StoredRun, scene: Scene, stage: str) -> tuple[Programs, TrainSt
         )
     like = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     checkpoints = Checkpoints(run.folder / "checkpoints", run.identity)
-    found = checkpoints.load(stage, like)
-    if found is None:
+    loaded = checkpoints.load(stage, like)
+    if loaded is None:
         raise RunError(f"--stage={stage}: {run.folder} has no state of it")
-    step, state, progress = found
+    step, state, progress = loaded
     programs.make_room(progress["growth"])
     print(f"{run.folder}: {scene.name}, {stage} after {step} steps")
     return programs, state
 
 
 def read_fields(path: pathlib.Path, kinds: Mapping[str, type]) -> dict[str, Any]:
-    """Read the object in a JSON file that has these fields, of these types.
+    """Read a JSON object that has these fields, of these types.
 
     Raises:
       RunError: the file cannot be read, or a field is missing or of another type.
     """
     try:
-        found = read_object(path)
+        fields = read_object(path)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise RunError(
             f"{path} cannot be read ({reason}): restore it from a copy of the run"
         ) from None
-    _check_fields(path, found, kinds)
-    return found
+    _check_fields(path, fields, kinds)
+    return fields
 
 
-def _check_fields(path, found, kinds):
+def _check_fields(path: pathlib.Path, fields: Mapping[str, Any], kinds: Mapping[str, type]) -> None:
     for name, kind in kinds.items():
-        value = found.get(name)
+        value = fields.get(name)
         fits = isinstance(value, kind) and not isinstance(value, bool)
         if not fits or (kind is int and not 0 <= value < 2**63):
             raise RunError(
@@ -215,7 +216,7 @@ def _check_fields(path, found, kinds):
             )
 
 
-def _read_json(folder, name):
+def _read_json(folder: pathlib.Path, name: str) -> dict[str, Any]:
     if not (folder / name).exists():
         raise RunError(f"--run={folder} has no {name}: name the folder of a run of experiments.run")
     return read_fields(folder / name, {})

@@ -1,4 +1,4 @@
-"""A camera that moves from a photograph towards what a held-out close-up shows."""
+"""Render a camera that moves from a photograph towards the surface that a close-up shows."""
 
 from collections.abc import Callable, Sequence
 
@@ -18,8 +18,8 @@ from jaxcloseup.labels.target_views import best_source
 
 
 FRAMES = 24
-MAGNIFICATION = (1.5, 8.0)  # smallest and largest: an orbiting close-up may not be nearer at all
-_ENOUGH = 10  # photographs, of which more make no better support
+MAGNIFICATION = (1.5, 8.0)  # smallest and largest: the close-up may be no nearer
+_ENOUGH = 10  # photographs; more make no better support
 
 
 def approach(
@@ -29,7 +29,7 @@ def approach(
     *,
     far: float,
 ) -> list[np.ndarray]:
-    """Render a dolly from the photograph that shows most of the best-supported close-up.
+    """Render a dolly from the photograph that overlaps the best-supported close-up most.
 
     The camera does not turn, so it ends as near as the close-up to the point in its middle.
 
@@ -40,9 +40,9 @@ def approach(
       far: largest depth.
 
     Returns:
-      Frames, uint8 `[H, W, 3]`; none where the model shows nothing in the middle of the close-up.
+      Frames, uint8 `[H, W, 3]`; none if the middle of the rendered close-up is empty.
     """
-    target = max(targets, key=lambda one: float(jnp.mean(jnp.minimum(one.seen, _ENOUGH))))
+    target = max(targets, key=lambda target: float(jnp.mean(jnp.minimum(target.seen, _ENOUGH))))
     camera = target.camera
     depth = label_depth(render(camera), near=0, far=far)
     view = int(jax.jit(best_source)(camera, sources.views, sources.depths, depth=depth))
@@ -57,13 +57,14 @@ def approach(
     nearer = float(distance / depth[row, column])
     shots = dolly(
         start,
-        tuple(pixel.tolist()),
+        (float(pixel[0]), float(pixel[1])),
         float(distance),
         magnification=float(np.clip(nearer, *MAGNIFICATION)),
         frames=FRAMES,
     )
 
-    def frame(one):
-        return to_uint8(np.asarray(render(one).rgb)[:height, :width])
+    def frame(camera: Camera) -> np.ndarray:
+        return to_uint8(np.asarray(render(camera).rgb)[:height, :width])
 
-    return list(progress.each(frame, [one for _, one in named_cameras(shots)], "frames"))
+    cameras = [camera for _, camera in named_cameras(shots)]
+    return list(progress.each(frame, cameras, "frames"))

@@ -2,6 +2,7 @@
 
 import math
 import pathlib
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -108,7 +109,8 @@ def to_capture(shots: Shots, transform: np.ndarray, scale: float, scene: Scene) 
     return shots._replace(cameras=shots.cameras.replace(camtoworld=camtoworld))
 
 
-def _pose(label, entry):
+def _pose(label: str, entry: dict[str, Any]) -> np.ndarray:
+    """Return the camera-to-world pose `[3, 4]` of an entry, in the OpenCV frame."""
     if "camera_to_world" not in entry:
         raise CameraError(f"{label}: camera_to_world is missing: give 16 numbers, by rows")
     try:
@@ -135,7 +137,7 @@ def _pose(label, entry):
     return np.column_stack([rotation @ OPENGL, matrix[:3, 3]])
 
 
-def _number(label, fields, key):
+def _number(label: str, fields: dict[str, Any], key: str) -> float:
     value = fields.get(key)
     if value is None:
         raise CameraError(f"{label}: {key} is missing: add it")
@@ -144,7 +146,7 @@ def _number(label, fields, key):
     return float(value)
 
 
-def _size(path, fields, key):
+def _size(path: pathlib.Path, fields: dict[str, Any], key: str) -> int:
     value = _number(str(path), fields, key)
     if not 1 <= value <= _LARGEST or value != int(value):
         raise CameraError(f"{path}: {key} must be a whole number of pixels, not {value:g}")

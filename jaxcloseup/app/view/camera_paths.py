@@ -28,7 +28,7 @@ class CameraError(Exception):
     """The requested cameras are invalid. The message is one sentence that says what to do."""
 
     def __init__(self, message: str) -> None:
-        """Escape what a terminal would obey in what files say."""
+        """Escape control characters, which may come from files."""
         super().__init__(printable(message))
 
 
@@ -39,8 +39,7 @@ class Shots(NamedTuple):
       cameras: `[Q]` stacked cameras.
       names: file name of each camera's images, without ending.
       fps: frames per second that the camera path asks for, or None.
-      sizes: width and height of each photograph whose view this is, without its padding; None where
-        no image is padded.
+      sizes: width and height of each photograph without its padding; None if no image is padded.
     """
 
     cameras: Camera
@@ -78,19 +77,19 @@ def orbit(scene: Scene, frames: int, *, up: Sequence[float] | None = None) -> Sh
     positions, rotations = (np.asarray(a, np.float64) for a in (cameras.position, cameras.rotation))
     forward = rotations[..., 2]
     center = focus_point(positions, forward, near=scene.near, far=scene.far)
-    up = up_direction(scene) if up is None else _unit(np.asarray(up, np.float64))
+    axis = up_direction(scene) if up is None else _unit(np.asarray(up, np.float64))
     offset = positions - center
-    height = np.median(offset @ up)
-    flat = offset - (offset @ up)[:, None] * up
+    height = np.median(offset @ axis)
+    flat = offset - (offset @ axis)[:, None] * axis
     radius = np.median(np.linalg.norm(flat, axis=1))
-    # Two axes perpendicular to `up`; the first frame is as near as possible to the first view.
-    start = flat[0] if np.linalg.norm(flat[0]) > 1e-6 else np.cross(up, forward[0])
+    # Two axes perpendicular to `axis`; the first frame is as near as possible to the first view.
+    start = flat[0] if np.linalg.norm(flat[0]) > 1e-6 else np.cross(axis, forward[0])
     east = _unit(start)
-    north = np.cross(up, east)
+    north = np.cross(axis, east)
     poses = []
     for angle in np.arange(frames) * (2 * np.pi / frames):
-        position = radius * (np.cos(angle) * east + np.sin(angle) * north) + height * up
-        poses.append(look_at(center + position, center, up))
+        position = radius * (np.cos(angle) * east + np.sin(angle) * north) + height * axis
+        poses.append(look_at(center + position, center, axis))
     first = scene.camera("train", 0)
     intrinsics = np.tile(np.asarray(first.intrinsics), (frames, 1))
     return numbered_shots(poses, intrinsics, first.height, first.width)
@@ -190,9 +189,9 @@ def resized(camera: Camera, width: int | None, height: int | None) -> Camera:
     Raises:
       CameraError: such an image does not fit into memory.
     """
-    if width is None and height is None:
-        return camera
     if width is None:
+        if height is None:
+            return camera
         width = max(1, round(height * camera.width / camera.height))
     if height is None:
         height = max(1, round(width * camera.height / camera.width))
@@ -204,15 +203,15 @@ def resized(camera: Camera, width: int | None, height: int | None) -> Camera:
 
 
 def check_memory(width: int, height: int, given_by: str) -> None:
-    """Raise before rendering images that would not fit into memory.
+    """Refuse images that would not fit into memory, before rendering them.
 
     Args:
       width: of the images, in pixels.
       height: of the images.
-      given_by: what sets their size, for the message.
+      given_by: name of the flags or fields that set the size, for the message.
 
     Raises:
-      CameraError: they would not.
+      CameraError: they need more memory than the computer has.
     """
     needed = _BYTES_PER_PIXEL * width * height
     if needed > (held := installed_memory()):
@@ -261,5 +260,5 @@ def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndar
     return np.column_stack([right, np.cross(forward, right), forward, position])
 
 
-def _unit(vector):
+def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / max(np.linalg.norm(vector), 1e-12)

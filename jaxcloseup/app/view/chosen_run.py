@@ -1,4 +1,4 @@
-"""The stored run that the flags name."""
+"""Read the stored run that the flags name."""
 
 import pathlib
 import sys

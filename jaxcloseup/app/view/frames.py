@@ -1,4 +1,4 @@
-"""Frames of a camera path: color, depth, normals and support as images."""
+"""Render the frames of a camera path: color, depth, normals and support as images."""
 
 import pathlib
 from collections.abc import Sequence
@@ -50,7 +50,7 @@ def render_shots(
       state: the state to render.
       shots: the cameras.
       sources: the training photographs with their depths, or None to leave out support.
-      detail: of the state, or None to render the state alone.
+      detail: detail of the state, or None to render the state alone.
     """
     scene = programs.scene
     cameras = named_cameras(shots)
@@ -61,16 +61,20 @@ def render_shots(
     images: dict[str, Image] = {}
     empty = 0
 
-    def draw(one):
-        (name, camera), size = one
+    def draw(
+        frame: tuple[tuple[str, Camera], tuple[int, int]],
+    ) -> tuple[str, dict[str, Image], bool]:
+        (name, camera), size = frame
         seen = programs.render(state, camera)
-        given = {"sources": sources, "detail": detail, "limits": limits, "size": size}
-        images = draw_pictures(programs, seen, camera, **given)
-        return name, images, np.asarray(seen.alpha)[: size[1], : size[0]]
+        images = draw_pictures(
+            programs, seen, camera, sources=sources, detail=detail, limits=limits, size=size
+        )
+        solid = np.asarray(seen.alpha)[: size[1], : size[0]] >= SOLID
+        return name, images, not solid.any()
 
     frames = list(zip(cameras, sizes, strict=True))
-    for name, images, alpha in progress.each(draw, frames, "rendering frames"):
-        empty += not bool(np.any(alpha >= SOLID))
+    for name, images, shows_nothing in progress.each(draw, frames, "rendering frames"):
+        empty += shows_nothing
         for kind, image in images.items():
             write_png(output_dir / kind / f"{name}.png", image)
     if empty:
@@ -92,16 +96,16 @@ def render_pictures(
 ) -> dict[str, Image]:
     """Render one camera's images by kind: `rgb`, `depth`, `normals`, `support`, `trust`, `error`.
 
-    `normals` is missing for fields that render none, and `support` without `sources`. Without
-    `detail` there is neither `trust`, how much of the photographs' detail was added, from black to
-    white, nor `error`, the error that is expected.
+    `normals` needs a field that renders them, `support` needs `sources`, and two need `detail`:
+    `trust`, the share of the photographs' detail that was added, from black to white, and `error`,
+    the expected error.
 
     Args:
       programs: the run's compiled programs.
       state: the state to render.
       camera: camera of the images.
       sources: the training photographs with their depths, or None to leave out support.
-      detail: of the state, or None to render the state alone.
+      detail: detail of the state, or None to render the state alone.
     """
     seen = programs.render(state, camera)
     return draw_pictures(programs, seen, camera, sources=sources, detail=detail)
@@ -117,21 +121,21 @@ def draw_pictures(
     limits: tuple[float, float] | None = None,
     size: tuple[int, int] | None = None,
 ) -> dict[str, Image]:
-    """The images of `render_pictures` from a rendering.
+    """Return the images of `render_pictures` from a rendering.
 
     Args:
       programs: the run's compiled programs.
-      seen: what they rendered with `camera`.
+      seen: their rendering of `camera`.
       camera: camera of the images.
-      sources: as `render_pictures` takes it.
-      detail: likewise.
+      sources: as in `render_pictures`.
+      detail: as in `render_pictures`.
       limits: nearest and farthest depth of the color scale; default: `depth_range` of the image.
       size: width and height of the images, without the camera's padding at the right and the
         bottom; default: the camera's.
     """
     width, height = size or (camera.width, camera.height)
 
-    def crop(image):
+    def crop(image: jax.typing.ArrayLike) -> np.ndarray:
         return np.asarray(image)[:height, :width]
 
     scene = programs.scene
@@ -139,7 +143,7 @@ def draw_pictures(
     near, far = limits or depth_range([depth], scene)
     solid = crop(seen.alpha) >= SOLID
     depth_colors = colorize_depth(crop(seen.depth), near=near, far=far, valid=solid)
-    images = {"rgb": crop(seen.rgb), "depth": depth_colors}
+    images: dict[str, Image] = {"rgb": crop(seen.rgb), "depth": depth_colors}
     if seen.normal is not None:
         images["normals"] = colorize_normals(np.where(solid[..., None], crop(seen.normal), 0))
     if sources is not None:

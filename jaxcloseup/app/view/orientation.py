@@ -1,4 +1,4 @@
-"""Which direction is up in a scene's world."""
+"""Find the up direction of a scene's world."""
 
 import numpy as np
 
@@ -10,15 +10,15 @@ _SNAP = np.cos(np.radians(3))
 
 
 def up_direction(scene: Scene) -> np.ndarray:
-    """Up `[3]` of unit length: what the capture says, else what its training cameras do.
+    """Return up `[3]`, of unit length: as the capture says, else from its training cameras.
 
-    People tilt a camera up and down but seldom roll it, so its x-axis is level. Up is therefore the
-    direction u that minimizes mean((x . u)^2) + e |u - m|^2 over the x-axes x of all cameras, with
-    their mean up m, whose small weight e decides where all cameras look the same way. Within 3
-    degrees of an axis of the world it is that axis: whoever aligned the capture meant it so.
+    People seldom roll a camera, so its x-axis is level. Up is therefore the direction u that
+    minimizes mean((x . u)^2) + e |u - m|^2 over the x-axes x of all cameras, with their mean up m.
+    The small weight e makes m decide where all cameras look the same way. A direction within 3
+    degrees of an axis of the world becomes that axis, because such a capture was aligned to it.
 
     Args:
-      scene: its `metadata["up"]` is what the capture says, or None.
+      scene: its `metadata["up"]` is the up direction that the capture gives, or None.
     """
     if (given := scene.metadata.get("up")) is not None:
         return np.asarray(given, np.float64)

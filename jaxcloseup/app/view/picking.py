@@ -1,4 +1,4 @@
-"""A close-up camera for a point that a visitor clicked on. Works on arrays, without a window."""
+"""Choose a close-up camera for a point that a visitor clicks on."""
 
 import jax
 import jax.numpy as jnp
@@ -53,7 +53,7 @@ def rank_views(
       `[V]` scores; 0 where a photograph does not show the point.
     """
 
-    def one(camera, depth, weight):
+    def score(camera: Camera, depth: jax.Array, weight: jax.Array) -> jax.Array:
         _, z, weight = sample_where_visible(camera, depth, weight, point, tolerance)
         ray = point - camera.position
         length = safe_norm(ray) * safe_norm(direction)
@@ -61,7 +61,7 @@ def rank_views(
         fineness = safe_divide(jnp.sqrt(camera.intrinsics[0] * camera.intrinsics[1]), z)
         return jnp.where(weight > 0, fineness * jnp.maximum(cosine, 1e-3), 0)
 
-    return jax.vmap(one)(views.cameras, depths, views.weight)
+    return jax.vmap(score)(views.cameras, depths, views.weight)
 
 
 def closeup_camera(source: Camera, point: np.ndarray, magnification: float) -> Camera:
@@ -77,7 +77,9 @@ def closeup_camera(source: Camera, point: np.ndarray, magnification: float) -> C
     """
     point = np.asarray(point, np.float64)
     rotation, position = (np.asarray(a, np.float64) for a in (source.rotation, source.position))
-    pose = look_at(closeup_position(point, position, magnification), point, -rotation[:, 1])
+    # In NumPy, so in float64.
+    nearer = closeup_position(point, position, magnification)  # type: ignore[arg-type]
+    pose = look_at(np.asarray(nearer), point, -rotation[:, 1])
     return source.replace(camtoworld=jnp.asarray(pose, jnp.float32))
 
 

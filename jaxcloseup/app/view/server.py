@@ -1,4 +1,4 @@
-"""Viser's server at exactly the requested address, for pages of that address alone."""
+"""Serve Viser's page at exactly the requested address, and only to pages of that address."""
 
 import contextlib
 import http
@@ -69,15 +69,15 @@ def check_address(host: str, port: int) -> None:
 
 @contextlib.contextmanager
 def _guarded(host: str) -> Iterator[None]:
-    """Servers that start in this context answer requests alone that mean them, see `is_foreign`.
+    """Make servers that start in this context refuse foreign requests, see `is_foreign`.
 
-    Any page that a visitor opens could otherwise read the scene through the visitor's browser.
-    Viser has no setting for it, and its server has started when its constructor returns.
+    Otherwise, any page that a visitor opens could read the scene through the visitor's browser.
+    Viser has no setting for it, and its server runs before its constructor returns.
     """
     serve = websockets_server.serve
 
     def guarded_serve(*args: Any, process_request: Callable[..., Any], **options: Any) -> Any:
-        def process(connection, request):
+        def process(connection: Any, request: Any) -> Any:
             hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
             if is_foreign(host, hosts, origins):
                 text = "This page is served at another address.\n"
@@ -91,9 +91,9 @@ def _guarded(host: str) -> Iterator[None]:
 
 
 def is_foreign(served: str, hosts: Sequence[str], origins: Sequence[str]) -> bool:
-    """Whether a request was not meant for this server, or comes from a page of another one.
+    """Return whether a request addresses another server, or comes from a page of another one.
 
-    Ports may differ from the served one, because a tunnel's may.
+    The port may differ from the served one, because a request may come through a tunnel.
 
     Args:
       served: the address of `--host`.
@@ -106,16 +106,17 @@ def is_foreign(served: str, hosts: Sequence[str], origins: Sequence[str]) -> boo
 
 
 def _name(address: str) -> str:
+    """Return the host of an address, or nothing if it is invalid."""
     with contextlib.suppress(ValueError):
         return urllib.parse.urlsplit(address).hostname or ""
     return ""
 
 
 def _means(served: str, name: str) -> bool:
-    """Whether a name in a request is the served address."""
+    """Return whether the host in a request is the served address."""
     ours, theirs = _ip(served), _ip(name)
     if ours is not None and ours.is_unspecified:
-        # A name could be anyone's, made to lead here; a number cannot.
+        # Anyone can make a name resolve to this computer, but not a number.
         return theirs is not None or name in ("localhost", socket.gethostname().lower())
     if served == "localhost" or (ours is not None and ours.is_loopback):
         return name == "localhost" or (theirs is not None and theirs.is_loopback)

@@ -1,4 +1,4 @@
-"""The surface of a trained state: depth maps of its training views, fused, as a colored mesh."""
+"""Extract a colored mesh from a trained state by fusing depth maps of its training views."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -21,21 +21,21 @@ from jaxcloseup.training.steps import TrainState
 
 
 TRUNCATION = 4  # voxels at which distances are cut
-_STEEPEST = 3  # voxels by which neighbors may differ; the distance to one surface changes by one
-_FINER = 4  # times as wide as training photographs are depth maps, at most
-_MOST_PIXELS = 2**26  # of all depth maps, unless the photographs themselves have more
-_OUTSIDE = 0.005  # share of the points that may lie beyond each side of the default region
-BYTES_PER_VOXEL = 24  # while distances are fused, rearranged and marched through
+_STEEPEST = 3  # largest difference of neighbors, in voxels; near one surface it is at most 1
+_FINER = 4  # largest width of a depth map over that of its photograph
+_MOST_PIXELS = 2**26  # of all depth maps, unless the photographs have more
+_OUTSIDE = 0.005  # share of points beyond each side of the default region
+BYTES_PER_VOXEL = 24  # memory of fusing distances and of marching cubes
 
 _fuse_grid = jax.jit(fuse_grid, static_argnames="shape")
 _fuse, _depth_maps, _count_seen = jax.jit(fuse), jax.jit(depth_maps), jax.jit(count_seen)
 
 
 class Maps(NamedTuple):
-    """What training views see.
+    """Rendered training views.
 
     Attributes:
-      views: with the colors that they see, uint8, and weights, which are 0 where nothing is known.
+      views: the rendered colors, uint8, and weights, which are 0 where the surface is unknown.
       depths: `[V, H, W]` z-depth, 0 where undefined.
     """
 
@@ -44,11 +44,11 @@ class Maps(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """Where distances are fused.
+    """Grid for fused distances.
 
     Attributes:
-      corner: `[3]` its first point in the world.
-      voxel: distance between neighbors in world units.
+      corner: `[3]` first point, in the world.
+      voxel: distance between neighbors, in world units.
       shape: number of points along each axis.
     """
 
@@ -58,12 +58,12 @@ class Grid(NamedTuple):
 
 
 def rendered_view(programs: Programs, state: TrainState) -> Callable[[Camera], tuple]:
-    """`camera -> (rgb, depth)` of a state; the median depth where its field has one."""
+    """Return `camera -> (rgb, depth)` of a state; the depth is the median if its field has one."""
     scene, choose = programs.scene, programs.method.with_expected_depth
     if choose is not None:
         state = state.replace(buffers=choose(state.buffers, False))
 
-    def see(camera):
+    def see(camera: Camera) -> tuple[jax.Array, jax.Array]:
         rendering = programs.render(state, camera)
         return rendering.rgb, label_depth(rendering, near=scene.near, far=scene.far)
 
@@ -71,9 +71,10 @@ def rendered_view(programs: Programs, state: TrainState) -> Callable[[Camera], t
 
 
 def exact_view(scene: Scene) -> Callable[[Camera], tuple]:
-    """`camera -> (rgb, depth)` of the exact surface of a built-in scene."""
+    """Return `camera -> (rgb, depth)` of the exact surface of a built-in scene."""
 
-    def see(camera):
+    def see(camera: Camera) -> tuple[jax.Array, jax.Array]:
+        assert scene.surface is not None
         surface = scene.surface(camera)
         return surface.rgb, surface.depth
 
@@ -83,13 +84,13 @@ def exact_view(scene: Scene) -> Callable[[Camera], tuple]:
 def see_training_views(
     scene: Scene, see: Callable[[Camera], tuple], *, finer: int, support: int
 ) -> Maps:
-    """See all training views, and keep the pixels whose surface enough of them see.
+    """Render all training views, and keep the pixels whose surface enough of them show.
 
     Args:
       scene: the scene.
       see: `camera -> (rgb, depth)`.
-      finer: how many times as wide as the training photographs.
-      support: the number of training views that must see a pixel's surface, itself included.
+      finer: width of the rendered views over that of the photographs.
+      support: number of training views that must show a pixel's surface, its own included.
     """
     cameras, weight = larger_views(scene, finer)
     numbers = range(len(scene.train))
@@ -108,7 +109,7 @@ def see_training_views(
 
 
 def larger_views(scene: Scene, finer: int) -> tuple[Camera, jax.Array]:
-    """Stacked cameras and weights `[V, H, W]` of the training views with finer pixels."""
+    """Return stacked cameras and weights `[V, H, W]` of the training views with finer pixels."""
     cameras = scene.train.cameras
     cameras = cameras.replace(
         intrinsics=cameras.intrinsics * finer,
@@ -119,7 +120,7 @@ def larger_views(scene: Scene, finer: int) -> tuple[Camera, jax.Array]:
 
 
 def finer_by(scene: Scene, *, renders_pixels: bool) -> int:
-    """How many times as wide as training photographs depth maps may be: single rays are slow."""
+    """Return the width of depth maps over that of photographs; rendering single rays is slow."""
     finer = 1 if renders_pixels else _FINER
     while finer > 1 and scene.train.weight.size * finer**2 > _MOST_PIXELS:
         finer //= 2
@@ -127,30 +128,32 @@ def finer_by(scene: Scene, *, renders_pixels: bool) -> int:
 
 
 def seen_points(cameras: Camera, depths: jax.Array, weight: jax.Array) -> np.ndarray:
-    """World points `[P, 3]` of the pixels of depth maps `[V, H, W]` that weigh something."""
-    pixels, found = pixel_grid(cameras.height, cameras.width), []
+    """Return world points `[P, 3]` of the pixels of depth maps `[V, H, W]` with a weight."""
+    pixels, seen = pixel_grid(cameras.height, cameras.width), []
     for index, depth in enumerate(depths):
         points = pixels_to_points(camera_at(cameras, index), pixels, depth)
-        found.append(np.asarray(points)[np.asarray((weight[index] > 0) & (depth > 0))])
-    return np.concatenate(found)
+        seen.append(np.asarray(points)[np.asarray((weight[index] > 0) & (depth > 0))])
+    return np.concatenate(seen)
 
 
 def exact_points(scene: Scene, finer: int) -> np.ndarray:
-    """Points `[P, 3]` of the exact surface of a built-in scene that training views see."""
+    """Return points `[P, 3]` of the exact surface of a built-in scene that training views show."""
     cameras, weight = larger_views(scene, finer)
-    # Without colors, of which a pixel has several, it takes a tenth of the time.
-    see = jax.jit(lambda camera: scene.surface(camera).depth)
+    surface = scene.surface
+    assert surface is not None
+    # Depth alone takes a tenth of the time of colors, which need several samples in a pixel.
+    see = jax.jit(lambda camera: surface(camera).depth)
     depths = jnp.stack([see(camera_at(cameras, i)) for i in range(len(scene.train))])
     return seen_points(cameras, depths, weight)
 
 
 def box_around(points: np.ndarray) -> np.ndarray:
-    """The smallest and largest coordinates `[2, 3]` of points, but for a few far ones."""
+    """Return the smallest and largest coordinates `[2, 3]` of points, except a few far ones."""
     return np.quantile(points, [_OUTSIDE, 1 - _OUTSIDE], axis=0)
 
 
 def make_grid(box: np.ndarray, voxel: float) -> Grid:
-    """A grid that holds a box `[2, 3]` and what lies within reach of it."""
+    """Return a grid that holds a box `[2, 3]` with a margin of the truncation distance."""
     margin = TRUNCATION * voxel
     low, high = np.asarray(box[0]) - margin, np.asarray(box[1]) + margin
     x, y, z = (int(count) for count in np.ceil((high - low) / voxel) + 1)
@@ -158,7 +161,7 @@ def make_grid(box: np.ndarray, voxel: float) -> Grid:
 
 
 def fuse_mesh(maps: Maps, grid: Grid) -> Mesh:
-    """Fuse depth maps into the distances on a grid, and find their surface with its colors."""
+    """Fuse depth maps into distances on a grid, and return their surface with its colors."""
     fused = _depth_maps(maps.views.cameras, maps.depths, maps.views.weight)
     reach = jnp.float32(TRUNCATION * grid.voxel)
     corner, voxel = jnp.asarray(grid.corner), jnp.float32(grid.voxel)

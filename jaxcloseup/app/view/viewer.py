@@ -1,4 +1,4 @@
-"""The run that the visitors of `experiments.view` share, and what they ask of it. Needs Viser."""
+"""Render and fine-tune one run for all visitors of the viewer. Needs Viser."""
 
 import functools
 import pathlib
@@ -41,7 +41,7 @@ class ViewError(Exception):
 
 
 class Viewer:
-    """The run that all visitors share, and the queue of what they ask for.
+    """A run that all visitors share, and the queue of their jobs.
 
     Viser calls back in its own threads. Each callback puts its work into a queue that holds one
     job, and the main thread runs the job. So only one job runs at a time, and the page never waits.
@@ -98,7 +98,7 @@ class Viewer:
         """
         what, job, say = self._jobs.get(timeout=timeout)
 
-        def tell(sentence):
+        def tell(sentence: str) -> None:
             say(sentence)
             print(sentence, flush=True)
 
@@ -108,16 +108,16 @@ class Viewer:
             tell(f"{job()} ({time.perf_counter() - start:.1f} s)")
         except (ViewError, TrainingError) as error:
             tell(str(error))
-        except Exception as error:  # a bug must not end the page for its visitors
+        except Exception as error:  # a bug must not close the page for its visitors
             traceback.print_exc()
             tell(f"{what} failed ({type(error).__name__}): see the terminal for details.")
 
     def later(self, what: str, job: Callable[[], str], say: Callable[[str], None]) -> None:
-        """Let the main thread do something.
+        """Queue a job for the main thread, or say that the viewer is busy.
 
         Args:
-          what: what that is, in words.
-          job: does it, and returns a sentence.
+          what: description of the job.
+          job: does the work, and returns a sentence.
           say: shows a sentence to the visitor who asked.
         """
         try:
@@ -125,7 +125,7 @@ class Viewer:
         except queue.Full:
             say(_BUSY)
 
-    def _thumbnail(self, index):
+    def _thumbnail(self, index: int) -> np.ndarray:
         camera = self.scene.camera("train", index)
         photograph = to_uint8(self.scene.train.rgb[index, : camera.height, : camera.width])
         height = max(1, round(_THUMBNAIL * photograph.shape[0] / photograph.shape[1]))
@@ -134,13 +134,14 @@ class Viewer:
     def find_surface(
         self, origin: np.ndarray, direction: np.ndarray
     ) -> tuple[int, np.ndarray, str]:
-        """The first surface along a ray.
+        """Find the first surface along a ray.
 
         Returns:
-          The photograph that shows it best, the point `[3]`, and how many photographs show it.
+          The index of the photograph that shows it best, the point `[3]`, and a phrase that says
+          how many photographs show it.
 
         Raises:
-          ViewError: there is none, or no photograph shows it.
+          ViewError: there is no surface, or no photograph shows it.
         """
         views = self.scene.train
         focal = float(np.median(np.asarray(views.cameras.intrinsics)[:, 1]))
@@ -165,9 +166,13 @@ class Viewer:
         detail: bool,
         say_steps: Callable[[int, int], None],
     ) -> tuple[dict[str, Image], str]:
-        """Pictures of a camera by kind, and what was done, in words.
+        """Return pictures of a camera by kind, and a description of the work.
 
-        `say_steps` is told how many steps of fine-tuning are done, and how many there are.
+        Args:
+          camera: the camera.
+          tuned: whether to fine-tune a copy of the state for this camera first.
+          detail: whether to add the photographs' detail.
+          say_steps: takes the number of finished steps of fine-tuning, and of all.
         """
         start, state = self.labels, self.state
         cameras = jax.tree.map(lambda leaf: leaf[None], camera)
@@ -176,7 +181,7 @@ class Viewer:
             find = self._find if same else detail_finder(self.programs, start.state)
             state = fine_tune(self.programs, start, cameras, find, tell=say_steps)
         added = self._find()[0] if detail else None
-        if detail and tuned and state is not start.state:
+        if added is not None and tuned and state is not start.state:
             added = tuned_detail(self.programs, state, cameras, added)
         images = render_pictures(self.programs, state, camera, sources=start.sources, detail=added)
         if tuned and state is start.state:
@@ -186,7 +191,7 @@ class Viewer:
         return images, "Fine-tuned and rendered" if tuned else "Rendered"
 
     def drawn(self, position: np.ndarray | None = None) -> Gaussians | None:
-        """The Gaussians that stand for the state, colored as seen from a position `[3]`."""
+        """Return the Gaussians that represent the state, colored as seen from a position `[3]`."""
         gaussians = self.programs.method.gaussians
         if gaussians is None:
             return None
@@ -194,7 +199,7 @@ class Viewer:
 
     @functools.cached_property
     def counts(self) -> np.ndarray:
-        """How many photographs saw each Gaussian, or each point where there are none."""
+        """Number of photographs that saw each Gaussian, or each point of a scene without any."""
         drawn = self.drawn()
         points = self.scene.points if drawn is None else drawn.means
         sources = self.labels.sources
@@ -202,6 +207,6 @@ class Viewer:
 
     @functools.cached_property
     def labels(self) -> LabelStart:
-        """What fine-tuning and support start from; made once."""
+        """Start of fine-tuning, with the depths that support needs; made once."""
         expected = self.programs.preset.labels.expected_depth
         return start_labels(self.programs, self.state, self._seed, expected_depth=expected)
