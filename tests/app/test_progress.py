@@ -1,4 +1,4 @@
-"""What a run says while it computes: by a clock that the test moves, and by lines as they come."""
+"""What a run shows while it computes: by a clock that the test moves, and line by line."""
 
 import io
 import re
@@ -18,12 +18,12 @@ PLAN = {"a": 10.0, "b": 20.0, "c": 30.0, "d": 40.0}
 
 
 class Clock:
-    def __init__(self):
-        self.now = self.compiled = 0.0
+    """Seconds of work, which the test moves; compiling takes none of them."""
 
-    def wait(self, seconds, compiling=0.0):
-        self.now += seconds + compiling
-        self.compiled += compiling
+    now = 0.0
+
+    def wait(self, seconds):
+        self.now += seconds
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def clock():
 
 @pytest.fixture
 def estimate(clock):
-    return Estimate(PLAN, clock=lambda: clock.now, compiled=lambda: clock.compiled)
+    return Estimate(PLAN, lambda: clock.now)
 
 
 def test_a_run_that_takes_three_times_as_long_as_planned(estimate, clock):
@@ -50,23 +50,22 @@ def test_a_run_that_takes_three_times_as_long_as_planned(estimate, clock):
     assert estimate.left() == pytest.approx(3 * (30 + 40))
 
 
-def test_compiling_is_not_part_of_the_rate(estimate, clock):
+def test_steps_tell_the_time_left(estimate, clock):
     estimate.begin("a")
     estimate.count(0, 100)
-    clock.wait(2, compiling=60)
+    clock.wait(2)
     estimate.count(20, 100)
     assert estimate.rate == pytest.approx(10)
     clock.wait(4)
     estimate.count(40, 100)
-    assert estimate.rate == pytest.approx(5)  # the first count says less than one without compiling
+    assert estimate.rate == pytest.approx(5)
     # 12 s are left of this part, whose 100 steps take 20 s instead of 10.
     assert estimate.left() == pytest.approx(12 + 2 * (20 + 30 + 40))
     clock.wait(1)
     assert estimate.left() == pytest.approx(11 + 2 * (20 + 30 + 40))
-    clock.wait(100, compiling=20)
+    clock.wait(100)
     estimate.end()
     estimate.begin("b")
-    clock.wait(0, compiling=50)
     assert estimate.left() == pytest.approx(2 * (20 + 30 + 40))
 
 
@@ -81,22 +80,20 @@ def test_a_resumed_part_is_measured_by_the_steps_that_it_takes(estimate, clock):
     assert estimate.left() == pytest.approx(2 * (20 + 30 + 40))
 
 
-def test_what_does_not_come_is_not_waited_for(estimate, clock):
+def test_parts_that_are_left_out_are_not_waited_for(estimate, clock):
     estimate.begin("a")
     clock.wait(10)
     estimate.end()
-    estimate.skip("c", "a", "nothing")
-    assert estimate.left() == pytest.approx(20 + 40)
     estimate.begin("unplanned")
     clock.wait(5)
     assert estimate.place is None
     estimate.end()
     estimate.begin("d")
-    assert estimate.place == (3, 3) and estimate.left() == pytest.approx(1.5 * 40)
+    assert estimate.place == (4, 4) and estimate.left() == pytest.approx(1.5 * 40)
 
 
 def test_without_a_plan_the_time_of_the_part_is_left(clock):
-    estimate = Estimate({}, clock=lambda: clock.now)
+    estimate = Estimate({}, lambda: clock.now)
     estimate.begin("a")
     estimate.count(0, 100)
     clock.wait(10)
@@ -146,12 +143,16 @@ def test_a_terminal_shows_one_line_below_what_is_printed(monkeypatch):
     terminal = Terminal()
     monkeypatch.setattr(sys, "stdout", terminal)
     monkeypatch.setenv("TERM", "xterm")
-    with progress.showing(), progress.showing(PLAN), progress.part("a"):
+    inner = progress.showing(PLAN), progress.part("a"), progress.saying("compiling")
+    with pytest.raises(KeyboardInterrupt), progress.showing(), inner[0], inner[1], inner[2]:
         print("a sentence")
         time.sleep(0.8)
+        raise KeyboardInterrupt
     said = terminal.getvalue()
-    assert "a sentence\n" in said and "[1/4] a" in said
+    assert "a sentence\n" in said and re.search(r"\[1/4\] a .*compiling", said)
+    assert said.count("\x1b[1A") == 1  # one line is removed at the end
     assert said.rindex("\x1b[?25h") > said.rindex("[1/4] a")  # the cursor is back
+    assert progress.count("a", 1, 2) == "a 1/2"
 
 
 def test_parts_have_words():

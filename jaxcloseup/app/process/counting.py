@@ -32,7 +32,7 @@ def progress(what: str, unit: str) -> Iterator[Report]:
             of = "" if total is None else f" of {total}"
             line = f"{what}: {done}{of}, {rate:.1f} {unit}/s"
             minutes, seconds = divmod(round((total - done) / rate) if total and rate else 0, 60)
-            shown[0] = line + (f", {minutes}:{seconds:02d} left" if minutes or seconds else "")
+            shown(line + (f", {minutes}:{seconds:02d} left" if minutes or seconds else ""))
 
         yield report
     if first is not None:
