@@ -15,8 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcloseup.app.report.pictures import label_pictures
-from jaxcloseup.app.score.audit import audit_labels, resolved_by_photographs
-from jaxcloseup.app.score.scores import exact_depths
+from jaxcloseup.app.score.audit import audit_labels
+from jaxcloseup.app.score.footprints import resolved_by_photographs
+from jaxcloseup.app.score.targets import exact_depths
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.drawn_scenes.drawn import DRAWN_SCENES
 from jaxcloseup.labels.config import LabelConfig, pseudo_settings

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from experiments.benchmarks.timing import interleaved_medians
-from jaxcloseup.app.score.scores import exact_depths
+from jaxcloseup.app.score.targets import exact_depths
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.fields.splats import RasterizeConfig, render_surfels, surfels_from_points
 from jaxcloseup.fields.splats.layout import pack

@@ -7,12 +7,8 @@ import plane
 import pytest
 from tiny_runs import TINY
 
-from jaxcloseup.app.score.audit import (
-    audit_labels,
-    error_curve,
-    left_out_curve,
-    resolved_by_photographs,
-)
+from jaxcloseup.app.score.audit import audit_labels, error_curve, left_out_curve
+from jaxcloseup.app.score.footprints import resolved_by_photographs
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_rays
 from jaxcloseup.labels.config import pseudo_settings

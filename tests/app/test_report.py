@@ -14,7 +14,7 @@ from jaxcloseup.app.report.page import Picture
 from jaxcloseup.app.report.pictures import comparisons, enlarge
 from jaxcloseup.app.report.run_page import write_report
 from jaxcloseup.app.report.showcase import Exhibit, best_middle_worst, cut_out, find_place
-from jaxcloseup.app.score.scores import Target
+from jaxcloseup.app.score.targets import Target
 from jaxcloseup.artifacts.images import side_by_side
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.photos.pyramids import Pyramid

@@ -25,8 +25,9 @@ from jaxcloseup.app.run.gate import AGREEMENT, gated, verdict, weigh_labels
 from jaxcloseup.app.run.loop import TrainingError, run_stage
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.setup import initial_points, initial_state
-from jaxcloseup.app.score.audit import blur_to_footprint
-from jaxcloseup.app.score.scores import NO_PERCEPTUAL, Target, score, summarize
+from jaxcloseup.app.score.footprints import blur_to_footprint
+from jaxcloseup.app.score.scores import NO_PERCEPTUAL, score, summarize
+from jaxcloseup.app.score.targets import Target
 from jaxcloseup.app.store.stored_run import choose_stage, load_run_scene, read_run, restore
 from jaxcloseup.app.view.approach import FRAMES
 from jaxcloseup.artifacts.checkpoints import Checkpoints

@@ -11,7 +11,8 @@ from tiny_capture import frame, write_image, write_json
 from jaxcloseup.app.jobs.evaluate import evaluate_folders
 from jaxcloseup.app.report.pictures import comparisons
 from jaxcloseup.app.score.renders import write_renders, write_truth
-from jaxcloseup.app.score.scores import NO_PERCEPTUAL, evaluate, targets_by_split
+from jaxcloseup.app.score.scores import NO_PERCEPTUAL, evaluate
+from jaxcloseup.app.score.targets import targets_by_split
 from jaxcloseup.app.view import frames
 from jaxcloseup.app.view.camera_paths import orbit, view_shots
 from jaxcloseup.captures.load import load_scene

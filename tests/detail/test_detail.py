@@ -17,7 +17,7 @@ from jaxcloseup.app.run.fine_tuning import fine_tune, tuned_detail
 from jaxcloseup.app.run.kept_detail import detail_finder, detail_path, detailed, find_detail
 from jaxcloseup.app.run.residuals import enlarge
 from jaxcloseup.app.run.setup import label_closeups, label_targets, start_labels
-from jaxcloseup.app.score.scores import targets_by_split
+from jaxcloseup.app.score.targets import targets_by_split
 from jaxcloseup.app.store.stored_run import load_run_scene, read_run, restore
 from jaxcloseup.captures.load import DRAWN_SCENES, SceneError, load_scene
 from jaxcloseup.detail import weights as detail_weights

@@ -12,7 +12,7 @@ import pytest
 
 from experiments.benchmarks import teach
 from jaxcloseup.app.score.expected_errors import compare_errors, error_tenths
-from jaxcloseup.app.score.scores import Target
+from jaxcloseup.app.score.targets import Target
 from jaxcloseup.detail import weights as detail_weights
 from jaxcloseup.detail.add import Detailed
 from jaxcloseup.detail.features import FEATURES

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxcloseup.app.report.page import Picture
 from jaxcloseup.app.score.metrics_text import FINER, SPLIT_TITLES
-from jaxcloseup.app.score.scores import Target
+from jaxcloseup.app.score.targets import Target
 from jaxcloseup.artifacts.images import colorize_depth, colorize_error, side_by_side, write_png
 from jaxcloseup.captures.load import Scene
 from jaxcloseup.geometry.cameras import Camera, pixel_grid

@@ -15,7 +15,7 @@ from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.setup import Training, timed
 from jaxcloseup.app.run.stages import Outcome
 from jaxcloseup.app.score.metrics_text import FINER
-from jaxcloseup.app.score.scores import Target
+from jaxcloseup.app.score.targets import Target
 from jaxcloseup.artifacts.images import encode_webp_animation
 from jaxcloseup.io.files import write_file, write_json
 from jaxcloseup.labels.rules import label_depth

@@ -7,7 +7,7 @@ import cv2
 import jax
 import numpy as np
 
-from jaxcloseup.app.score.scores import Target
+from jaxcloseup.app.score.targets import Target
 from jaxcloseup.artifacts.images import to_uint8
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points, points_to_pixels
 from jaxcloseup.labels.make import LabelSources

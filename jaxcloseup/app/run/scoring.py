@@ -13,13 +13,8 @@ from jaxcloseup.app.run.setup import LabelStart, Training, timed
 from jaxcloseup.app.score.ladder import describe_ladder, ladder_targets
 from jaxcloseup.app.score.metrics_text import describe_split
 from jaxcloseup.app.score.renders import write_renders
-from jaxcloseup.app.score.scores import (
-    Perceptual,
-    Target,
-    evaluate,
-    exact_depths,
-    targets_by_split,
-)
+from jaxcloseup.app.score.scores import Perceptual, evaluate
+from jaxcloseup.app.score.targets import Target, exact_depths, targets_by_split
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.training.steps import TrainState

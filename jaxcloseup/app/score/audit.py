@@ -6,22 +6,20 @@ photographs are left out one by one, labeled from the others, and compared with 
 """
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
-import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxcloseup.app import progress
-from jaxcloseup.captures.load import Scene
+from jaxcloseup.app.score.footprints import blur_to_footprint, seen_by
 from jaxcloseup.fields.contract import Rendering
-from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points, points_to_pixels
-from jaxcloseup.geometry.masks import depth_consistent, in_bounds
-from jaxcloseup.geometry.warp import backward_warp
+from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.labels.make import (
     LabelSources,
+    PseudoLabel,
     PseudoSettings,
     label_pixels,
     label_sources,
@@ -29,61 +27,11 @@ from jaxcloseup.labels.make import (
 )
 from jaxcloseup.labels.rules import label_depth
 from jaxcloseup.labels.target_views import best_source
+from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.views import camera_at, to_float
 
 
 CURVE_POINTS = 20
-_SIGMAS = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
-
-
-def blur_to_footprint(image: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-    """Blur an image as if it were photographed with pixels `footprint` times as large.
-
-    A photograph averages over its pixel (variance 1/12), and bilinear sampling over the neighbors
-    (1/6), so the standard deviation is half a source pixel. The variance that the image's own
-    pixels already have is subtracted.
-
-    Args:
-      image: `[H, W, 3]` image to blur.
-      footprint: `[H, W]` side of a source pixel, in pixels of the image.
-
-    Returns:
-      `[H, W, 3]` blurred image.
-    """
-    sigma = np.sqrt(np.maximum(footprint**2 / 4 - 1 / 12, 0))
-    levels = [image] + [cv2.GaussianBlur(image, (0, 0), s) for s in _SIGMAS[1:]]
-    position = np.interp(sigma, _SIGMAS, np.arange(len(_SIGMAS)))
-    low = np.minimum(position.astype(int), len(_SIGMAS) - 2)
-    rows, columns = np.indices(sigma.shape)
-    stack, share = np.stack(levels), (position - low)[..., None]
-    return (1 - share) * stack[low, rows, columns] + share * stack[low + 1, rows, columns]
-
-
-def resolved_by_photographs(
-    scene: Scene, camera: Camera, exact_depths: jax.Array
-) -> tuple[np.ndarray, np.ndarray]:
-    """Blur a camera's true image to the detail of the training photographs.
-
-    At each pixel the photograph with the smallest footprint sets the blur. Labels from exact depth
-    and all photographs cannot be better than this image.
-
-    Args:
-      scene: a scene with `surface`.
-      camera: camera of the image.
-      exact_depths: `[V, H, W]` exact depths of the training views.
-
-    Returns:
-      `[H, W, 3]` the blurred true image, and `[H, W]` whether any photograph sees the surface.
-    """
-    truth = scene.surface(camera)
-    pixels = pixel_grid(camera.height, camera.width)
-    finest = np.full(pixels.shape[:2], np.inf)
-    for index, depth in enumerate(exact_depths):
-        source = camera_at(scene.train.cameras, index)
-        visible, footprint = _seen_by(camera, pixels, truth.depth, source, depth)
-        finest = np.where(visible, np.minimum(finest, footprint), finest)
-    seen = np.isfinite(finest)
-    return blur_to_footprint(np.asarray(truth.rgb), np.where(seen, finest, 1)), seen
 
 
 def audit_labels(
@@ -104,7 +52,7 @@ def audit_labels(
       scene: a scene with `surface`.
       sources: the photographs with the depths that labels are made from.
       settings: settings of poses and labels.
-      render_depth: `camera -> [H, W]`, the depth of a virtual camera that labels are made from.
+      render_depth: `camera -> [H, W]`, the depth that labels of a virtual camera are made from.
       count: number of virtual cameras.
 
     Returns:
@@ -115,47 +63,76 @@ def audit_labels(
       share of all pixels.
     """
     sample = jax.jit(sample_virtual_camera)
-    of_curve: list[tuple[np.ndarray, ...]] = []
-    pixels_total = 0
-    error = kept = kept_visible = visible_total = 0.0
-    for one in progress.track(jax.random.split(key, count), "close-ups"):
-        camera, index = sample(one, sources, settings)
-        pixels = pixel_grid(camera.height, camera.width)
-        known = camera, pixels, render_depth(camera), index, sources
-        label = label_pixels(*known, settings)
-        weight = np.asarray(label.weight)
-        any_color_weight = np.asarray(label_pixels(*known, _any_color(settings)).weight)
-        truth = scene.surface(camera)
-        visible, footprint = _seen_by(
-            camera, pixels, truth.depth, camera_at(scene.train.cameras, index), exact_depths[index]
-        )
-        visible = np.asarray(visible, np.float32)
-        blurred = blur_to_footprint(np.asarray(truth.rgb), np.asarray(footprint))
-        difference = np.abs(label.rgb - blurred).mean(axis=-1)
-        error += float((weight * difference).sum())
-        kept += float(weight.sum())
-        kept_visible += float((weight * visible).sum())
-        visible_total += float(visible.sum())
-        inside = any_color_weight > 0
-        score = np.abs(label.backward - label.forward).max(axis=-1)
-        columns = score, difference, 1 - visible
-        of_curve.append(tuple(column[inside] for column in columns))
-        pixels_total += inside.size
+    error = kept = kept_visible = visible = 0.0
+    closeups = []
+    for camera_key in progress.track(list(jax.random.split(key, count)), "close-ups"):
+        camera, index = sample(camera_key, sources, settings)
+        depth = render_depth(camera)
+        one = _audit_closeup(camera, depth, index, exact_depths[index], scene, sources, settings)
+        error += float((one.weight * one.error).sum())
+        kept += float(one.weight.sum())
+        kept_visible += float((one.weight * one.visible).sum())
+        visible += float(one.visible.sum())
+        closeups.append(one)
     shares = {
-        "error": (error, kept),
-        "kept": (kept_visible, visible_total),
-        "leaked": (kept - kept_visible, kept),
+        "error": (error, kept, "no label was kept"),
+        "kept": (kept_visible, visible, "the source sees nothing"),
+        "leaked": (kept - kept_visible, kept, "no label was kept"),
     }
     result: dict[str, Any] = {}
-    for name, (part, whole) in shares.items():
-        result[name] = part / whole if whole else None
-        if not whole:
-            result[f"{name}_reason"] = (
-                "no label was kept" if name != "kept" else "the source sees nothing"
-            )
-    score, scored_error, leaked = map(np.concatenate, zip(*of_curve, strict=True))
-    result["curve"] = error_curve(score, scored_error, pixels_total, {"leaked": leaked})
+    for name, (part, whole, reason) in shares.items():
+        result |= {name: part / whole} if whole else {name: None, f"{name}_reason": reason}
+    result["curve"] = error_curve(
+        np.concatenate([one.disagreement[one.reached] for one in closeups]),
+        np.concatenate([one.error[one.reached] for one in closeups]),
+        sum(one.reached.size for one in closeups),
+        {"leaked": np.concatenate([(1 - one.visible)[one.reached] for one in closeups])},
+    )
     return result
+
+
+class _Audited(NamedTuple):
+    """Labels of a virtual close-up against its blurred true image, all `[H, W]`.
+
+    Attributes:
+      weight: weight of each label.
+      error: mean absolute difference from the true color.
+      visible: 1 where the source sees the surface, else 0.
+      disagreement: largest difference of both warps in a channel.
+      reached: whether both warps reach a pixel, whatever their colors.
+    """
+
+    weight: np.ndarray
+    error: np.ndarray
+    visible: np.ndarray
+    disagreement: np.ndarray
+    reached: np.ndarray
+
+
+def _audit_closeup(
+    camera: Camera,
+    depth: jax.Array,
+    index: jax.Array,
+    exact_depth: jax.Array,
+    scene: Scene,
+    sources: LabelSources,
+    settings: PseudoSettings,
+) -> _Audited:
+    """Label a close-up from the training view `index`, and compare it with the exact scene."""
+    assert scene.surface is not None
+    pixels = pixel_grid(camera.height, camera.width)
+    label = label_pixels(camera, pixels, depth, index, sources, settings)
+    any_color = label_pixels(camera, pixels, depth, index, sources, _any_color(settings))
+    truth, source = scene.surface(camera), camera_at(scene.train.cameras, index)
+    visible, footprint = seen_by(camera, pixels, truth.depth, source, exact_depth)
+    blurred = blur_to_footprint(np.asarray(truth.rgb), np.asarray(footprint))
+    return _Audited(
+        weight=np.asarray(label.weight),
+        error=np.abs(label.rgb - blurred).mean(axis=-1),
+        visible=np.asarray(visible, np.float32),
+        disagreement=np.abs(label.backward - label.forward).max(axis=-1),
+        reached=np.asarray(any_color.weight) > 0,
+    )
 
 
 def error_curve(
@@ -187,19 +164,18 @@ def error_curve(
     counts = np.maximum(1, np.round(shares * len(score)).astype(int))
     by_score = np.argsort(score, kind="stable")
 
-    def means(values):
+    def means(values: np.ndarray) -> list[float]:
         return (np.cumsum(values, dtype=np.float64)[counts - 1] / counts).tolist()
 
-    curve = {
+    errors, oracle = means(error[by_score]), means(np.sort(error))
+    gap, largest = np.subtract(errors, oracle), errors[-1]
+    return {
         "coverage": (counts / total).tolist(),
-        "error": means(error[by_score]),
-        "oracle": means(np.sort(error)),
+        "error": errors,
+        "oracle": oracle,
+        **{name: means(values[by_score]) for name, values in (more or {}).items()},
+        "ause": float(np.trapezoid(gap, shares) / largest) if largest else 0.0,
     }
-    for name, values in (more or {}).items():
-        curve[name] = means(values[by_score])
-    gap = np.subtract(curve["error"], curve["oracle"])
-    largest = curve["error"][-1]
-    return curve | {"ause": float(np.trapezoid(gap, shares) / largest) if largest else 0.0}
 
 
 def _any_color(settings: PseudoSettings) -> PseudoSettings:
@@ -230,17 +206,24 @@ def audit_left_out(
       any, and `coverage`, the share of labeled pixels.
     """
     sums = np.zeros((len(candidates), 4))
-    for label_by, model, truth, weight in _left_out(sources, render, count):
+    for left_out in _left_out(sources, render, count):
         for row, settings in enumerate(candidates):
-            sums[row] += _compare(label_by(settings), model, truth, weight)
-    rows = []
-    for label, model, kept, total in sums:
-        of_label, of_model = (
-            float(-10 * np.log10(error / kept)) if kept and error else None
-            for error in (label, model)
-        )
-        rows.append({"label_psnr": of_label, "model_psnr": of_model, "coverage": kept / total})
-    return rows
+            label = left_out.label_by(settings)
+            sums[row] += _compare(label, left_out.model, left_out.truth, left_out.weight)
+    return [
+        {
+            "label_psnr": _psnr(label, kept),
+            "model_psnr": _psnr(model, kept),
+            "coverage": kept / total,
+        }
+        for label, model, kept, total in sums
+    ]
+
+
+def _psnr(squared_errors: float, weight: float) -> float | None:
+    if not weight or not squared_errors:
+        return None
+    return float(-10 * np.log10(squared_errors / weight))
 
 
 def left_out_curve(
@@ -256,28 +239,39 @@ def left_out_curve(
     that keeps that many labels trains on worse colors than the model has. Arguments are those of
     `audit_left_out`.
     """
-    found: list[tuple[np.ndarray, ...]] = []
-    total = 0
-    for label_by, model, truth, weight in _left_out(sources, render, count):
-        label = label_by(_any_color(settings))
-        inside = np.asarray(label.weight * weight) > 0
-        columns = (
-            np.abs(label.backward - label.forward).max(axis=-1),
-            np.abs(label.rgb - truth).mean(axis=-1),
-            np.abs(jnp.clip(model, 0, 1) - truth).mean(axis=-1),
-        )
-        found.append(tuple(column[inside] for column in columns))
-        total += int(np.sum(np.asarray(weight) > 0))
-    score, error, model = map(np.concatenate, zip(*found, strict=True))
+    scores, errors, model_errors, total = [], [], [], 0
+    for left_out in _left_out(sources, render, count):
+        label, truth = left_out.label_by(_any_color(settings)), left_out.truth
+        reached = np.asarray(label.weight * left_out.weight) > 0
+        scores.append(np.abs(label.backward - label.forward).max(axis=-1)[reached])
+        errors.append(np.abs(label.rgb - truth).mean(axis=-1)[reached])
+        clipped = jnp.clip(left_out.model, 0, 1)
+        model_errors.append(np.abs(clipped - truth).mean(axis=-1)[reached])
+        total += int(np.sum(np.asarray(left_out.weight) > 0))
+    score, error, model = map(np.concatenate, (scores, errors, model_errors))
     return error_curve(score, error, total, {"model": model})
 
 
-def _left_out(sources, render, count):
-    """Left-out photographs, spread evenly.
+class _LeftOut(NamedTuple):
+    """A training photograph that labels are made for without it.
 
-    For each, a function of settings that labels it from the others; the model's colors; the
-    photograph; the weight of its pixels.
+    Attributes:
+      label_by: labels it with the settings given.
+      model: `[H, W, 3]` colors of the model.
+      truth: `[H, W, 3]` the photograph.
+      weight: `[H, W]` weight of its pixels.
     """
+
+    label_by: Callable[[PseudoSettings], PseudoLabel]
+    model: jax.Array
+    truth: jax.Array
+    weight: jax.Array
+
+
+def _left_out(
+    sources: LabelSources, render: Callable[[Camera], Rendering], count: int
+) -> Iterator[_LeftOut]:
+    """Leave out photographs, spread evenly."""
     views, depths = sources.views, sources.depths
     for index in np.unique(np.linspace(0, len(views) - 1, count).round().astype(int)):
         camera = camera_at(views.cameras, index)
@@ -288,26 +282,17 @@ def _left_out(sources, render, count):
         pixels = pixel_grid(camera.height, camera.width)
         without = jax.jit(label_sources)(others, depths)
         label_by = functools.partial(label_pixels, camera, pixels, depth, source, without)
-        yield label_by, seen.rgb, to_float(views.rgb[index]), views.weight[index]
+        yield _LeftOut(label_by, seen.rgb, to_float(views.rgb[index]), views.weight[index])
 
 
 @jax.jit
-def _compare(label, rgb, truth, weight):
+def _compare(
+    label: PseudoLabel, model: jax.Array, truth: jax.Array, weight: jax.Array
+) -> jax.Array:
     """Return `[4]` sums: squared errors of labels and of the model, kept weight, all weight."""
     kept = label.weight * weight
 
-    def error(image):
+    def error(image: jax.Array) -> jax.Array:
         return jnp.sum(kept * jnp.mean((jnp.clip(image, 0, 1) - truth) ** 2, axis=-1))
 
-    return jnp.stack([error(label.rgb), error(rgb), jnp.sum(kept), jnp.sum(weight)])
-
-
-@jax.jit
-def _seen_by(camera, pixels, depth, source, source_depth):
-    """Return whether the source sees each surface, and its pixel's side in pixels of `camera`."""
-    landed, landed_depth = points_to_pixels(source, pixels_to_points(camera, pixels, depth))
-    observed = backward_warp(source_depth[..., None], landed, order=0)[..., 0]
-    inside = in_bounds(landed, source.height, source.width)
-    visible = (depth > 0) & inside & depth_consistent(observed, landed_depth, 0.02)
-    magnification = landed_depth / jnp.where(depth > 0, depth, 1)
-    return visible, magnification * camera.intrinsics[0] / source.intrinsics[0]
+    return jnp.stack([error(label.rgb), error(model), jnp.sum(kept), jnp.sum(weight)])

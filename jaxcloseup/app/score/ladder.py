@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 
 from jaxcloseup.app import progress
-from jaxcloseup.app.score.scores import Target
-from jaxcloseup.captures.load import Scene
+from jaxcloseup.app.score.targets import Target
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points
 from jaxcloseup.geometry.poses import closeup_position, sample_anchor
+from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.support import count_seen
 from jaxcloseup.photos.views import camera_at
 
@@ -38,18 +38,18 @@ def ladder_targets(scene: Scene, exact_depths: jax.Array) -> dict[str, list[Targ
     """
     if scene.surface is None or scene.test_far is None:
         return {}
-    surface, count = scene.surface, jax.jit(count_seen)
+    surface, count, cameras = scene.surface, jax.jit(count_seen), scene.test_far.cameras
 
-    def rungs(i):
-        name, far = scene.names["test_far"][i], camera_at(scene.test_far.cameras, i)
+    def rungs(i: int) -> list[Target]:
+        name, far = scene.names["test_far"][i], camera_at(cameras, i)
         pixels = pixel_grid(far.height, far.width)
-        own = surface(far)
-        seen = count(far, pixels, own.depth, scene.train, exact_depths)
-        anchor = _anchor(jax.random.key(i), far, own.depth, seen)
+        far_surface = surface(far)
+        seen = count(far, pixels, far_surface.depth, scene.train, exact_depths)
+        anchor = _anchor(jax.random.key(i), far, far_surface.depth, seen)
         targets = []
         for m in MAGNIFICATIONS:
             camera = _nearer(far, anchor, m) if m > 1 else _wider(far, m)
-            seen_surface = own if m == 1 else surface(camera)
+            seen_surface = far_surface if m == 1 else surface(camera)
             seen = count(camera, pixels, seen_surface.depth, scene.train, exact_depths)
             weight = jnp.ones(seen.shape, jnp.float32)
             rgb = seen_surface.rgb.astype(jnp.float32)
@@ -63,7 +63,7 @@ def ladder_targets(scene: Scene, exact_depths: jax.Array) -> dict[str, list[Targ
 
 @jax.jit
 def _anchor(key: jax.Array, camera: Camera, depth: jax.Array, seen: jax.Array) -> jax.Array:
-    """Draw a point in the middle half of the view, from those that several photographs see."""
+    """Draw a point in the middle half of the view that several photographs see."""
     height, width = depth.shape
     middle = jnp.zeros((height, width), jnp.float32)
     middle = middle.at[height // 4 : -(height // 4), width // 4 : -(width // 4)].set(1)

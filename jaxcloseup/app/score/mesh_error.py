@@ -1,4 +1,4 @@
-"""How far a mesh is from the exact surface that the training photographs of a scene see."""
+"""Measure how far a mesh is from the exact surface that a scene's training photographs see."""
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -11,20 +11,20 @@ _POINTS = 1_000_000  # on each of the two surfaces
 
 
 def mesh_error(mesh: Mesh, exact: np.ndarray) -> dict[str, float]:
-    """Distances between a mesh and points of the exact surface, both drawn with a fixed seed.
+    """Return distances between a mesh and points of the exact surface, drawn with a fixed seed.
 
-    Points of the mesh are drawn uniformly over its area. Each of them is `mesh_to_surface` away
-    from the next exact point, and each exact point `surface_to_mesh` from the next point of the
-    mesh, in the mean. Points have gaps, so a perfect mesh has distances of about half a gap.
+    Points of the mesh are drawn uniformly over its area. Points have gaps, so a perfect mesh has
+    distances of about half a gap.
 
     Args:
       mesh: at least one triangle.
       exact: `[P, 3]` points of the exact surface.
 
     Returns:
-      In world units `extent`, the longest side of the box around `exact`, `mesh_to_surface`,
-      `surface_to_mesh`, and their mean `chamfer`; and the shares `mesh_close` and `surface_close`
-      of points within `CLOSE` times the extent of the other surface.
+      In world units `extent`, the longest side of the box around `exact`; `mesh_to_surface` and
+      `surface_to_mesh`, the mean distances from points of one to the nearest of the other; and
+      their mean `chamfer`. `mesh_close` and `surface_close` are the shares of points within `CLOSE`
+      times the extent of the other surface.
     """
     rng = np.random.default_rng(0)
     drawn = sample_mesh(rng, mesh, _POINTS)
@@ -42,11 +42,11 @@ def mesh_error(mesh: Mesh, exact: np.ndarray) -> dict[str, float]:
 
 
 def sample_mesh(rng: np.random.Generator, mesh: Mesh, count: int) -> np.ndarray:
-    """Points `[count, 3]`, uniform over the area of a mesh."""
+    """Draw points `[count, 3]`, uniform over the area of a mesh."""
     first, second, third = np.moveaxis(mesh.vertices[mesh.faces].astype(np.float64), 1, 0)
     area = np.linalg.norm(np.cross(second - first, third - first), axis=-1)
     face = rng.choice(len(area), count, p=area / area.sum())
-    # Reflected at the diagonal, a point of a parallelogram lies in its triangle.
+    # Reflecting a point of the parallelogram at its diagonal moves it into the triangle.
     u, v = rng.random((2, count, 1))
     u, v = np.where(u + v > 1, (1 - u, 1 - v), (u, v))
     return first[face] + u * (second - first)[face] + v * (third - first)[face]

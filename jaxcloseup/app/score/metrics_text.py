@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 
-FINER = "_finer"  # of the name of a split that is scored at a finer size
+FINER = "_finer"  # end of the name of a split that is scored at a finer size
 SPLIT_TITLES = {
     "test": "Close-ups",
     "test_far": "Ordinary views",

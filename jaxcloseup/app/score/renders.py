@@ -3,7 +3,7 @@
 import pathlib
 from collections.abc import Mapping, Sequence
 
-from jaxcloseup.app.score.scores import Target
+from jaxcloseup.app.score.targets import Target
 from jaxcloseup.artifacts.images import colorize_depth, write_png
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.photos.scene import Scene

@@ -1,6 +1,5 @@
-"""Scores of held-out views: on the full frame, and where training photographs saw the surface."""
+"""Score held-out views: on the full frame, and where training photographs saw the surface."""
 
-import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -9,15 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcloseup.app import progress
-from jaxcloseup.app.score.metrics_text import FINER
-from jaxcloseup.app.score.surface_error import (
-    Landmarks,
-    find_landmarks,
-    point_depth_error,
-    surface_error,
-)
+from jaxcloseup.app.score.surface_error import point_depth_error, surface_error
+from jaxcloseup.app.score.targets import Target
 from jaxcloseup.fields.contract import Rendering
-from jaxcloseup.geometry.cameras import Camera, pixel_grid
+from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.metrics.image_metrics import SSIM_TAPS, cc_psnr, psnr, quantize, ssim
 from jaxcloseup.metrics.perceptual import (
     BACKBONES,
@@ -27,12 +21,9 @@ from jaxcloseup.metrics.perceptual import (
     load_lpips,
     lpips,
 )
-from jaxcloseup.photos.scene import Scene, SceneError, Surface
-from jaxcloseup.photos.support import count_seen
-from jaxcloseup.photos.views import Views, camera_at, to_float
-from jaxcloseup.photos.windows import in_quarters
 
 
+Metrics = dict[str, jax.Array | float]
 SEEN_BY = (1, 3)  # least numbers of photographs, for metrics of the seen pixels alone
 
 
@@ -66,119 +57,6 @@ def find_perceptual(folder: str | None = None) -> Perceptual:
 NO_PERCEPTUAL = Perceptual({}, dict.fromkeys(BACKBONES, "LPIPS was not requested"))
 
 
-class Target(NamedTuple):
-    """A held-out view of `[H, W]` pixels, the photograph's own size.
-
-    Attributes:
-      name: name of its photograph.
-      camera: its camera; padded at the right and the bottom, as all views of its split are, so that
-        they share what is compiled.
-      rgb: `[H, W, 3]` the photograph, float in [0, 1].
-      weight: `[H, W]` weights.
-      seen: `[H, W]` number of training photographs that saw the surface at each pixel.
-      surface: the exact surface, or None where it is unknown.
-      landmarks: visible points of the capture, or None where the exact surface is known.
-    """
-
-    name: str
-    camera: Camera
-    rgb: jax.Array
-    weight: jax.Array
-    seen: jax.Array
-    surface: Surface | None = None
-    landmarks: Landmarks | None = None
-
-
-def exact_depths(scene: Scene, cameras: Camera) -> jax.Array:
-    """Return the exact z-depths `[V, H, W]` of stacked cameras on a built-in scene."""
-    geometry, count = _geometry(scene.surface), cameras.intrinsics.shape[0]
-
-    def depth(i):
-        return geometry(camera_at(cameras, i)).depth
-
-    return jnp.stack(list(progress.each(depth, range(count), "exact depths")))
-
-
-@functools.lru_cache(maxsize=4)
-def _geometry(surface):
-    """The surface without colors: they take longest to compile."""
-    return jax.jit(lambda camera: surface(camera)._replace(rgb=None))
-
-
-def make_targets(
-    scene: Scene,
-    split: str,
-    train_depths: jax.Array,
-    render: Callable[[Camera], Rendering],
-    finer: tuple[Views, Sequence[tuple[int, int]]] | None = None,
-) -> list[Target]:
-    """Return the held-out views of a split, with the number of photographs that saw each pixel.
-
-    That number needs a depth. It is exact on built-in scenes. On captures it is rendered from the
-    baseline, so that all stages are scored on the same pixels.
-
-    Args:
-      scene: the scene.
-      split: name of the split.
-      train_depths: `[V, H, W]` depths of the training views.
-      render: `camera -> Rendering` of the baseline.
-      finer: the split's photographs of another size, as `Scene.photographs_at` returns them; by
-        default those of the scene.
-    """
-    views, sizes = finer or (getattr(scene, split), scene.sizes(split))
-    surface = _geometry(scene.surface) if scene.surface else None
-    if surface and finer:
-        # Quarters of finer views are mostly as large as the others: one program serves both.
-        surface = functools.partial(in_quarters, surface)
-    count = jax.jit(count_seen)
-    rgb_of, weight_of = jax.device_get((views.rgb, views.weight))
-
-    def make(i):
-        camera, (width, height) = camera_at(views.cameras, i), sizes[i]
-        own = camera.replace(width=width, height=height)
-        exact = surface(camera) if surface else None
-        landmarks = None if exact else find_landmarks(own, scene.points)
-        depth = exact.depth if exact else render(camera).depth
-        pixels = pixel_grid(camera.height, camera.width)
-        seen = count(camera, pixels, depth, scene.train, train_depths)[:height, :width]
-        rgb = jnp.asarray(to_float(rgb_of[i, :height, :width]))
-        weight = jnp.asarray(weight_of[i, :height, :width])
-        return Target(scene.names[split][i], camera, rgb, weight, seen, exact, landmarks)
-
-    return list(progress.each(make, range(len(sizes)), f"truth of {split}"))
-
-
-def targets_by_split(
-    scene: Scene,
-    train_depths: jax.Array,
-    exact: jax.Array | None,
-    render: Callable[[Camera], Rendering],
-    *,
-    finer: int | None = None,
-) -> dict[str, list[Target]]:
-    """Return `make_targets` for every split except the training views.
-
-    Args:
-      scene: the scene.
-      train_depths: `[V, H, W]` rendered depths of the training views.
-      exact: `[V, H, W]` exact depths to use instead, or None on captures.
-      render: `camera -> Rendering` of the baseline.
-      finer: divisor of the photographs' size, if the views count at that size too, as splits of
-        their own, named with `FINER`.
-    """
-    seen_from = train_depths if exact is None else exact
-    splits = [split for split in scene.names if split != "train"]
-    targets = {split: make_targets(scene, split, seen_from, render) for split in splits}
-    for split in splits if finer is not None and scene.photographs_at else ():
-        try:
-            photographs = scene.photographs_at(finer, split)
-        except SceneError as error:  # such as full-size photographs that were not kept
-            print(f"views are scored at the size of training alone: {error}")
-            break
-        targets[split + FINER] = make_targets(scene, split, seen_from, render, photographs)
-    return targets
-
-
 def score(
     rendering: Rendering, target: Target, perceptual: Perceptual = NO_PERCEPTUAL
 ) -> dict[str, float | str | None]:
@@ -194,13 +72,13 @@ def score(
     """
     rows, columns = _frame(np.asarray(target.weight))
 
-    def crop(array):
+    def crop(array: Any) -> Any:
         return array[rows, columns]
 
     image, truth, weight = map(crop, (rendering.rgb, target.rgb, target.weight))
     image, truth = _as_8_bits(image, truth)
     seen = crop(target.seen)
-    values = {}
+    values: Metrics = {}
     for least in SEEN_BY:
         counted = np.where(seen >= least, weight, 0)
         for key, value in _masked_metrics(image, truth, counted).items():
@@ -210,7 +88,7 @@ def score(
     if target.surface is not None:
         values |= surface_error(target.camera, rendering, target.surface)
     if target.landmarks is not None:
-        values |= point_depth_error(rendering.depth, target.landmarks)
+        values |= point_depth_error(np.asarray(rendering.depth), target.landmarks)
     return score_image(image, truth, weight, perceptual, values)
 
 
@@ -219,9 +97,9 @@ def score_image(
     truth: jax.Array,
     weight: jax.Array,
     perceptual: Perceptual = NO_PERCEPTUAL,
-    more: Mapping[str, jax.Array | float] | None = None,
+    more: Metrics | None = None,
 ) -> dict[str, float | str | None]:
-    """Return the metrics of one image, on 8-bit colors.
+    """Return the metrics of an image, on 8-bit colors.
 
     Args:
       image: `[H, W, 3]` rendered image.
@@ -231,38 +109,43 @@ def score_image(
       more: other metrics of the image, to add to the result.
 
     Returns:
-      Each metric by name. A metric that cannot be computed is None, and `<metric>_reason` says why.
-      The PSNR of equal images is infinite, and so None too.
+      Each metric by name. A metric that cannot be computed is None, and `<metric>_reason` says why;
+      so is the infinite PSNR of equal images.
     """
     image, truth = _as_8_bits(image, truth)
     values = dict(_full_metrics(image, truth, weight)) | dict(more or {})
-    finite_image, smallest = np.isfinite(image).all(), min(truth.shape[:2])
+    finite, side = bool(np.isfinite(image).all()), min(truth.shape[:2])
     result: dict[str, float | str | None] = {}
     for key, value in values.items():
-        result[key] = float(value) if np.isfinite(value) else None
-        if result[key] is not None:
-            continue
-        if not finite_image:
-            reason = "the rendering is not finite"
-        elif np.isposinf(value):
-            reason = "equals the truth"
-        elif "ssim" in key and smallest < SSIM_TAPS:
-            reason = f"SSIM needs at least {SSIM_TAPS} pixels a side"
-        else:
-            reason = "no pixel of this view counts"
-        result[f"{key}_reason"] = reason
+        known = bool(np.isfinite(value))
+        result[key] = float(value) if known else None
+        if not known:
+            result[f"{key}_reason"] = _why_unknown(key, float(value), side, finite=finite)
     for backbone in BACKBONES:
-        key = f"lpips_{backbone}"
-        result[key], reason = None, perceptual.reasons.get(backbone)
-        if reason is None and not finite_image:
-            reason = "the rendering is not finite"
-        elif reason is None and smallest < SMALLEST[backbone]:
+        key, reason = f"lpips_{backbone}", perceptual.reasons.get(backbone)
+        if reason is None and not finite:
+            reason = _NOT_FINITE
+        elif reason is None and side < SMALLEST[backbone]:
             reason = f"LPIPS needs at least {SMALLEST[backbone]} pixels a side"
-        elif reason is None:
+        if reason is None:
             result[key] = float(_lpips(perceptual.networks[backbone], image, truth, weight))
-        if reason is not None:
-            result[f"{key}_reason"] = reason
+        else:
+            result |= {key: None, f"{key}_reason": reason}
     return result
+
+
+_NOT_FINITE = "the rendering is not finite"
+
+
+def _why_unknown(key: str, value: float, side: int, *, finite: bool) -> str:
+    """Say why a metric is not finite, for an image whose shorter side has `side` pixels."""
+    if not finite:
+        return _NOT_FINITE
+    if np.isposinf(value):
+        return "equals the truth"
+    if "ssim" in key and side < SSIM_TAPS:
+        return f"SSIM needs at least {SSIM_TAPS} pixels a side"
+    return "no pixel of this view counts"
 
 
 def summarize(views: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
@@ -288,7 +171,7 @@ def evaluate(
     Renderings have their photograph's own size, and no `aux`.
     """
 
-    def seen(target):
+    def seen(target: Target) -> Rendering:
         return without_padding(jax.device_get(render(target.camera)), *target.weight.shape)
 
     names = [target.name for target in targets]
@@ -298,25 +181,25 @@ def evaluate(
 
 
 def without_padding(rendering: Rendering, height: int, width: int) -> Rendering:
-    """The upper left `height` x `width` pixels of a rendering: padding is at the other sides."""
+    """Return the upper left `height` x `width` pixels of a rendering; the rest is padding."""
     images = {name: getattr(rendering, name) for name in ("rgb", "depth", "alpha", "normal")}
     cut = {name: image[:height, :width] for name, image in images.items() if image is not None}
     return rendering._replace(**cut, aux=())
 
 
-def _as_8_bits(image, truth):
+def _as_8_bits(image: jax.Array, truth: jax.Array) -> tuple[jax.Array, jax.Array]:
     # Outside the compiled functions, whose fused products make equal images differ by rounding.
     return quantize(image), quantize(truth)
 
 
 @jax.jit
-def _full_metrics(image, truth, weight):
+def _full_metrics(image: jax.Array, truth: jax.Array, weight: jax.Array) -> Metrics:
     metrics = {"psnr": psnr, "cc_psnr": cc_psnr, "ssim": _ssim}
     return {name: metric(image, truth, weight=weight) for name, metric in metrics.items()}
 
 
 @jax.jit
-def _masked_metrics(image, truth, weight):
+def _masked_metrics(image: jax.Array, truth: jax.Array, weight: jax.Array) -> Metrics:
     return {
         "psnr": psnr(image, truth, weight=weight),
         "ssim": _ssim(image, truth, weight=weight),
@@ -324,11 +207,13 @@ def _masked_metrics(image, truth, weight):
 
 
 @jax.jit
-def _lpips(network, image, truth, weight):
+def _lpips(
+    network: LpipsWeights, image: jax.Array, truth: jax.Array, weight: jax.Array
+) -> jax.Array:
     return lpips(network, jnp.where(weight[..., None] > 0, image, truth), truth)
 
 
-def _ssim(image, truth, *, weight):
+def _ssim(image: jax.Array, truth: jax.Array, *, weight: jax.Array) -> jax.Array | float:
     return ssim(image, truth, weight=weight) if min(truth.shape[:2]) >= SSIM_TAPS else jnp.nan
 
 

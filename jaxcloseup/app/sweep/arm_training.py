@@ -28,7 +28,8 @@ from jaxcloseup.app.run.setup import (
     start_labels,
 )
 from jaxcloseup.app.score.metrics_text import SPLIT_TITLES
-from jaxcloseup.app.score.scores import NO_PERCEPTUAL, Perceptual, Target, evaluate
+from jaxcloseup.app.score.scores import NO_PERCEPTUAL, Perceptual, evaluate
+from jaxcloseup.app.score.targets import Target
 from jaxcloseup.app.sweep.arms import Arm, describe, make_arm, why_not
 from jaxcloseup.app.sweep.ceilings import labels_with_better_depth, true_close_ups
 from jaxcloseup.artifacts.checkpoints import Checkpoints

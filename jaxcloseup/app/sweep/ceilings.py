@@ -5,7 +5,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from jaxcloseup.app.score.audit import resolved_by_photographs
+from jaxcloseup.app.score.footprints import resolved_by_photographs
 from jaxcloseup.captures.load import Scene
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.labels.make import (

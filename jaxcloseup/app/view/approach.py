@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcloseup.app import progress
-from jaxcloseup.app.score.scores import Target
+from jaxcloseup.app.score.targets import Target
 from jaxcloseup.app.view.camera_paths import dolly, named_cameras
 from jaxcloseup.artifacts.images import to_uint8
 from jaxcloseup.fields.contract import Rendering
