@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 
 def in_bounds(pixels: jax.Array, height: int, width: int) -> jax.Array:
-    """Whether continuous pixels `[..., 2]` lie on an image of `height` x `width` pixels: `[...]`.
+    """Return whether continuous pixels `[..., 2]` lie on an image: `[...]` bool.
 
     The image covers [0, width) x [0, height); NaN is outside.
     """
@@ -18,7 +18,7 @@ def in_bounds(pixels: jax.Array, height: int, width: int) -> jax.Array:
 def depth_consistent(
     observed: jax.Array, expected: jax.Array, tolerance: jax.Array | float
 ) -> jax.Array:
-    """Whether a depth map confirms a depth: |observed - expected| <= tolerance * expected.
+    """Return whether a depth map confirms a depth: |observed - expected| <= tolerance * expected.
 
     Args:
       observed: `[...]` z-depth read from a depth map; 0 is undefined.
@@ -33,9 +33,9 @@ def depth_consistent(
 
 
 def rgb_consistent(a: jax.Array, b: jax.Array, tolerance: jax.Array | float) -> jax.Array:
-    """Whether two colors `[..., 3]` differ by less than `tolerance` in every channel: `[...]`.
+    """Return whether colors `[..., 3]` differ by less than a tolerance in every channel: `[...]`.
 
-    This is the paper's mask M, |I' - I*| < epsilon.
+    This is the paper's mask M = |I' - I*| < epsilon.
     """
     chex.assert_equal_shape([a, b])
     return jnp.all(jnp.abs(a - b) < tolerance, axis=-1)

@@ -1,7 +1,11 @@
 """Virtual close-up cameras, drawn between a training camera and the surface that it sees.
 
 Symbols as in the paper: anchor X_a, training position t_n, magnification lambda, Euler angles e,
-angular range epsilon.
+angular range epsilon:
+
+    X_a = o + D_n(a) d_a                       a is a random pixel of view n, D_n its depth map
+    t'  = ((lambda - 1) X_a + t_n) / lambda    lambda ~ U(2, 8)
+    e'  = e(R_n) + delta                       delta_i ~ U(-epsilon, epsilon), R = Rz Ry Rx
 """
 
 import chex
@@ -15,13 +19,13 @@ from jaxcloseup.geometry.rotations import euler_to_matrix, matrix_to_euler
 
 
 class PoseSettings(struct.PyTreeNode):
-    """How virtual cameras are drawn; every leaf is traced.
+    """Ranges that virtual cameras are drawn from; every leaf is traced.
 
     Attributes:
       magnification: `[2]` range (lo, hi) of lambda, how many times nearer the camera comes.
       max_angle: `[]` epsilon, largest change of each Euler angle, radians.
-      anchor_tolerance: `[]` an anchor's depth D has |D - mean D| < tolerance * mean D; inf accepts
-        every pixel.
+      anchor_tolerance: `[]` anchors have a depth D with |D - mean D| < tolerance * mean D; inf
+        accepts every pixel.
       look_at: `[]` 1 turns the camera about the anchor, which stays at its pixel; 0 turns the
         camera about itself, as published.
     """
@@ -35,7 +39,7 @@ class PoseSettings(struct.PyTreeNode):
 def closeup_position(
     anchor: jax.Array, position: jax.Array, magnification: jax.Array | float
 ) -> jax.Array:
-    """Camera position `[3]` at 1/lambda of the distance to the anchor.
+    """Return the camera position `[3]` at 1/lambda of the distance to the anchor.
 
     t' = ((lambda - 1) X_a + t_n) / lambda, so |t' - X_a| = |t_n - X_a| / lambda.
     """
@@ -65,7 +69,7 @@ def sample_anchor(key: jax.Array, depth: jax.Array, weight: jax.Array) -> jax.Ar
 
 
 def four_anchors(height: int, width: int) -> jax.Array:
-    """Anchor weights `[height, width]` of the paper's ablation without diverse poses.
+    """Return the anchor weights `[height, width]` of the ablation without diverse poses.
 
     The weight is 1 at the center of each quadrant and 0 elsewhere. Pass it as the `weight` of
     `sample_closeup_camera`, with magnification (4, 4) and max_angle 0.
@@ -78,10 +82,15 @@ def four_anchors(height: int, width: int) -> jax.Array:
 def perturb_rotation(
     key: jax.Array, rotation: jax.Array, max_angle: jax.Array | float
 ) -> jax.Array:
-    """Turn a camera by a uniform offset of each Euler angle: e' = e + U(-eps, eps), `[3, 3]`.
+    """Turn a camera by a uniform offset of each Euler angle: e' = e + U(-epsilon, epsilon).
 
-    `key` is consumed. The paper prints an interval centered on e; this function follows the
-    released script, whose interval is centered on 0.
+    The paper prints an interval of the offset that is centered on e; its text and the released
+    script mean one that is centered on 0.
+
+    Args:
+      key: random key; consumed.
+      rotation: `[3, 3]` camera-to-world rotation.
+      max_angle: `[]` epsilon, radians.
     """
     chex.assert_shape(rotation, (3, 3))
     offset = jax.random.uniform(key, (3,), rotation.dtype, -1, 1) * max_angle

@@ -10,8 +10,9 @@ import jax.numpy as jnp
 
 
 def euler_to_matrix(angles: jax.Array) -> jax.Array:
-    """Rotation matrices `[..., 3, 3]` from Euler angles `[..., 3]` (x, y, z): R = Rz Ry Rx."""
+    """Return rotation matrices `[..., 3, 3]` of Euler angles `[..., 3]` (x, y, z): R = Rz Ry Rx."""
     chex.assert_axis_dimension(angles, -1, 3)
+    # R = Rz Ry Rx, multiplied out.
     (cx, cy, cz), (sx, sy, sz) = (jnp.moveaxis(f(angles), -1, 0) for f in (jnp.cos, jnp.sin))
     rows = [
         [cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx],
@@ -22,10 +23,11 @@ def euler_to_matrix(angles: jax.Array) -> jax.Array:
 
 
 def matrix_to_euler(rotation: jax.Array) -> jax.Array:
-    """Euler angles `[..., 3]` of rotation matrices `[..., 3, 3]`; inverse of `euler_to_matrix`.
+    """Return Euler angles `[..., 3]` of rotation matrices `[..., 3, 3]`.
 
-    y lies in [-pi/2, pi/2]. At gimbal lock (|y| = pi/2) x and z turn about one axis: x takes the
-    whole turn and z is 0, which reproduces the matrix. Gradients are finite everywhere.
+    This is the inverse of `euler_to_matrix`. y lies in [-pi/2, pi/2]. At gimbal lock (|y| = pi/2)
+    x and z turn about one axis: x takes the whole turn and z is 0, which reproduces the matrix.
+    Gradients are finite everywhere.
     """
     chex.assert_axis_dimension(rotation, -1, 3)
     chex.assert_axis_dimension(rotation, -2, 3)
@@ -43,7 +45,7 @@ def matrix_to_euler(rotation: jax.Array) -> jax.Array:
 
 
 def quaternion_to_matrix(wxyz: jax.Array) -> jax.Array:
-    """Rotation matrices `[..., 3, 3]` of quaternions `[..., 4]`, which need not be unit.
+    """Return rotation matrices `[..., 3, 3]` of quaternions `[..., 4]`, which need not be unit.
 
     The zero quaternion gives the identity, with finite gradients.
     """
@@ -55,8 +57,9 @@ def quaternion_to_matrix(wxyz: jax.Array) -> jax.Array:
 def quaternion_rows(
     w: jax.Array, x: jax.Array, y: jax.Array, z: jax.Array
 ) -> list[list[jax.Array]]:
-    """The rows of `quaternion_to_matrix`, entry by entry `[...]`: on a CPU, loops over many
-    quaternions are several times faster so.
+    """Return the rows of `quaternion_to_matrix` as nine arrays `[...]`.
+
+    On a CPU, loops over many quaternions are several times faster than with stacked matrices.
     """
     squared = w * w + x * x + y * y + z * z
     norm = jnp.sqrt(jnp.where(squared == 0, 1, squared))

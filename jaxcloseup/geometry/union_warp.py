@@ -1,6 +1,6 @@
 """Forward warp of every pixel of many views into chosen pixels of one virtual view.
 
-This is the paper's union of forward warps. A full-size capture has tens of millions of source
+This is the paper's union I* of forward warps. A full-size capture has tens of millions of source
 pixels, and a close-up sees few of them. Sources are therefore kept in square blocks with bounding
 spheres. Blocks that cannot land in the virtual view are culled whole; the others are lifted and
 projected on the fly, a chunk at a time. Most sources of a chunk miss the chosen pixels, so a chunk
@@ -8,12 +8,16 @@ leaves one bit per source, and only sources whose bit is set are projected again
 loops have dynamic lengths, so no capacity can overflow.
 """
 
+from collections.abc import Sequence
+from typing import Any
+
 import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
 
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points
+from jaxcloseup.geometry.flag_loops import for_each_hit, for_each_true
 from jaxcloseup.geometry.numerics import matmul
 from jaxcloseup.geometry.visibility import sphere_in_view
 from jaxcloseup.geometry.warp import NO_SOURCE, ForwardWarp, draw_nearest
@@ -23,7 +27,8 @@ from jaxcloseup.geometry.warp import NO_SOURCE, ForwardWarp, draw_nearest
 BLOCK = 16  # side of a block in pixels
 CHUNK = 2048  # maximum number of blocks projected together
 GROUP = 1024  # minimum number of sources drawn together
-_WORD = 32  # bits per word
+
+Buffer = tuple[jax.Array, jax.Array]  # depths and sources, see `draw_nearest`
 
 
 class SourceBlocks(struct.PyTreeNode):
@@ -63,10 +68,10 @@ def block_sources(
     rows, columns = -(-height // BLOCK), -(-width // BLOCK)
     pad = ((0, rows * BLOCK - height), (0, columns * BLOCK - width))
 
-    def blocks_of_view(camera, depth):
+    def blocks_of_view(camera: Camera, depth: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         points = pixels_to_points(camera, pixel_grid(height, width), depth)
 
-        def cut(array):
+        def cut(array: jax.Array) -> jax.Array:
             array = jnp.pad(array, pad + ((0, 0),) * (array.ndim - 2))
             tail = array.shape[2:]
             array = array.reshape(rows, BLOCK, columns, BLOCK, *tail).swapaxes(1, 2)
@@ -82,7 +87,7 @@ def block_sources(
         radius = jnp.max(jnp.where(there[..., 0], distance, 0), axis=1)
         return depth, center, jnp.where(empty[:, 0], -1, radius)
 
-    depth, center, radius = jax.lax.map(lambda one: blocks_of_view(*one), (cameras, depths))
+    depth, center, radius = jax.lax.map(lambda view: blocks_of_view(*view), (cameras, depths))
     view, row, column = jnp.meshgrid(
         *(jnp.arange(size, dtype=jnp.int32) for size in (num_views, rows, columns)), indexing="ij"
     )
@@ -124,14 +129,22 @@ def union_warp(
 
 
 @jax.custom_batching.custom_vmap
-def _union_warp(sources, cameras, values, camera, pixels, exclude):
+def _union_warp(
+    sources: SourceBlocks,
+    cameras: Camera,
+    values: jax.Array,
+    camera: Camera,
+    pixels: jax.Array,
+    exclude: jax.Array,
+) -> ForwardWarp:
     sources, cameras, camera = jax.lax.stop_gradient((sources, cameras, camera))
     chosen = jnp.floor(pixels.reshape(-1, 2)).astype(jnp.int32)
     chosen = jnp.clip(chosen, 0, jnp.array([[camera.width - 1, camera.height - 1]]))
     chosen = chosen[:, 1] * camera.width + chosen[:, 0]
+    # A slot for each chosen pixel; of repeated pixels, one slot serves all.
     slot_of_pixel = jnp.full(camera.height * camera.width, -1, jnp.int32)
     slot_of_pixel = slot_of_pixel.at[chosen].set(jnp.arange(chosen.size, dtype=jnp.int32))
-    wanted = slot_of_pixel >= 0
+    is_chosen = slot_of_pixel >= 0
 
     center = matmul(sources.center - camera.position[None], camera.rotation)
     visible = sphere_in_view(camera, center, sources.radius)
@@ -141,12 +154,14 @@ def _union_warp(sources, cameras, values, camera, pixels, exclude):
     num_blocks = len(blocks_there)
     group = max(GROUP, chosen.size // 32)
 
-    def draw_chunk(block, live, buffer):
+    def draw_chunk(block: jax.Array, live: jax.Array, buffer: Buffer) -> Buffer:
         depth = sources.depth[block]
         target, _ = _project(sources, block[:, None], every_offset, depth, affine, camera)
-        hit = (target >= 0) & wanted[target] & live[:, None]
+        hit = (target >= 0) & is_chosen[target] & live[:, None]
 
-        def draw_group(row, offset, live, buffer):
+        def draw_group(
+            row: jax.Array, offset: jax.Array, live: jax.Array, buffer: Buffer
+        ) -> Buffer:
             source = block[row] * BLOCK * BLOCK + offset
             depth = sources.depth[block[row], offset]
             target, depth = _project(sources, block[row], offset, depth, affine, camera)
@@ -154,40 +169,42 @@ def _union_warp(sources, cameras, values, camera, pixels, exclude):
             # A slot past the end is not drawn.
             return draw_nearest(buffer, jnp.where(slot >= 0, slot, chosen.size), depth, source)
 
-        return _for_each_hit(hit, group, draw_group, buffer)
+        return for_each_hit(hit, group, draw_group, buffer)
 
     buffer = (
         jnp.full(chosen.size, jnp.inf, sources.depth.dtype),
         jnp.full(chosen.size, NO_SOURCE, jnp.int32),
     )
-    buffer = _for_each_true(blocks_there, min(CHUNK, -(-num_blocks // 8)), draw_chunk, buffer)
+    buffer = for_each_true(blocks_there, min(CHUNK, -(-num_blocks // 8)), draw_chunk, buffer)
     depth, source = (array[slot_of_pixel[chosen]] for array in buffer)
 
     hit = source != NO_SOURCE
     block, offset = jnp.divmod(jnp.where(hit, source, 0), BLOCK * BLOCK)
     x = sources.corner[block, 0] + offset % BLOCK
     y = sources.corner[block, 1] + offset // BLOCK
-    found = jnp.where(hit[:, None], values[sources.view[block], y, x], 0)
+    read = jnp.where(hit[:, None], values[sources.view[block], y, x], 0)
     shape = pixels.shape[:-1]
     return ForwardWarp(
-        values=found.reshape(*shape, -1), depth=depth.reshape(shape), hit=hit.reshape(shape)
+        values=read.reshape(*shape, -1), depth=depth.reshape(shape), hit=hit.reshape(shape)
     )
 
 
 @_union_warp.def_vmap
-def _one_after_the_other(size, batched, *arguments):
+def _one_after_the_other(
+    size: int, batched: Sequence[Any], *arguments: Any
+) -> tuple[ForwardWarp, Any]:
     """Compute a batch of warps one after another, and reuse the result of an equal predecessor.
 
     The work of a warp depends on the data, so a batch computed at once would wait for its largest
     member. Arms of a sweep that draw the same camera follow each other.
     """
 
-    def pick(index):
+    def pick(index: jax.Array | int) -> tuple[Any, ...]:
         return jax.tree.map(
             lambda leaf, has_axis: leaf[index] if has_axis else leaf, arguments, tuple(batched)
         )
 
-    def warp(before, index):
+    def warp(before: ForwardWarp, index: jax.Array) -> tuple[ForwardWarp, ForwardWarp]:
         now, last = pick(index), pick(jnp.maximum(index - 1, 0))
         repeated = index > 0
         for leaf, old, has_axis in zip(*map(jax.tree.leaves, (now, last, batched)), strict=True):
@@ -202,16 +219,20 @@ def _one_after_the_other(size, batched, *arguments):
     return results, jax.tree.map(lambda _: True, results)
 
 
-def _pixel_to_virtual(cameras, camera):
-    """`A [V, 3, 3], b [V, 3]`: pixel (x, y) at depth d projects to A (x, y, 1) d + b."""
+def _pixel_to_virtual(cameras: Camera, camera: Camera) -> tuple[jax.Array, jax.Array]:
+    """Return A `[V, 3, 3]` and b `[V, 3]`: pixel (x, y) at depth d projects to A (x, y, 1) d + b.
 
-    def matrix(fx, fy, cx, cy):
+    Lifting and projecting become one affine map for each view, with A = K' R'^T R_j K_j^-1 and
+    b = K' R'^T (t_j - t').
+    """
+
+    def matrix(fx: jax.Array, fy: jax.Array, cx: jax.Array, cy: jax.Array) -> jax.Array:
         zero, one = jnp.zeros_like(fx), jnp.ones_like(fx)
         return jnp.array([[fx, zero, cx], [zero, fy, cy], [zero, zero, one]])
 
     project = matmul(matrix(*camera.intrinsics), camera.rotation.T)
 
-    def one_view(view):
+    def one_view(view: Camera) -> tuple[jax.Array, jax.Array]:
         fx, fy, cx, cy = view.intrinsics
         lift = matrix(1 / fx, 1 / fy, -cx / fx, -cy / fy)
         return (
@@ -222,15 +243,26 @@ def _pixel_to_virtual(cameras, camera):
     return jax.vmap(one_view)(cameras)
 
 
-def _project(sources, block, offset, depth, affine, camera):
-    """Flat target pixel (-1 for none) and z-depth of sources; `block` and `offset` broadcast."""
+def _project(
+    sources: SourceBlocks,
+    block: jax.Array,
+    offset: jax.Array,
+    depth: jax.Array,
+    affine: tuple[jax.Array, jax.Array],
+    camera: Camera,
+) -> tuple[jax.Array, jax.Array]:
+    """Return flat target pixels (-1 for none) and z-depths of sources.
+
+    `block` and `offset`, the index of a pixel within its block, broadcast. Both loops call this,
+    so that a source lands on the same pixel in both.
+    """
     matrix, shift = (array[sources.view[block]] for array in affine)
     corner = sources.corner[block].astype(depth.dtype) + 0.5
     column, row = (index.astype(depth.dtype) for index in (offset % BLOCK, offset // BLOCK))
 
-    def coordinate(axis):
-        by_x, by_y, one = (matrix[..., axis, k] for k in range(3))
-        start = by_x * corner[..., 0] + by_y * corner[..., 1] + one
+    def coordinate(axis: int) -> jax.Array:
+        by_x, by_y, constant = (matrix[..., axis, k] for k in range(3))
+        start = by_x * corner[..., 0] + by_y * corner[..., 1] + constant
         return depth * (start + by_x * column + by_y * row) + shift[..., axis]
 
     x, y, z = map(coordinate, range(3))
@@ -240,57 +272,3 @@ def _project(sources, block, offset, depth, affine, camera):
     lands = in_front & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
     x, y = (jnp.floor(jnp.where(lands, array, 0)).astype(jnp.int32) for array in (x, y))
     return jnp.where(lands, y * camera.width + x, -1), z
-
-
-def _for_each_hit(hit, count, body, carry):
-    """Fold `body(row[count], column[count], live[count], carry)` over true flags `[N, P]`.
-
-    `jnp.nonzero` would write an index for every flag. Here flags become bits, 32 to a word, and the
-    k-th set bit is found in three steps: its row, its word, then its place by bisection.
-    """
-    bits = jnp.left_shift(jnp.uint32(1), jnp.arange(_WORD, dtype=jnp.uint32))
-    words = jnp.where(hit.reshape(len(hit), -1, _WORD), bits, 0)
-    words = jnp.sum(words, axis=-1, dtype=jnp.uint32)
-    ends_in_row = jnp.cumsum(jax.lax.population_count(words).astype(jnp.int32), axis=-1)
-    ends = jnp.cumsum(ends_in_row[:, -1])
-
-    def step(i, carry):
-        rank = i * count + jnp.arange(count, dtype=jnp.int32)
-        live = rank < ends[-1]
-        row = jnp.minimum(jnp.searchsorted(ends, rank, side="right"), len(hit) - 1)
-        rank = rank - (ends[row] - ends_in_row[row, -1])
-        word = jnp.sum(ends_in_row[row] <= rank[:, None], axis=-1, dtype=jnp.int32)
-        word = jnp.minimum(word, words.shape[1] - 1)
-        rank = rank - jnp.where(word > 0, ends_in_row[row, word - 1], 0)
-        bit = _nth_set_bit(words[row, word], rank)
-        return body(row, word * _WORD + bit, live, carry)
-
-    return jax.lax.fori_loop(0, (ends[-1] + count - 1) // count, step, carry)
-
-
-def _nth_set_bit(word, rank):
-    """Position of the set bit of a uint32 that has `rank` set bits below it."""
-    position = jnp.zeros_like(rank)
-    for half in (16, 8, 4, 2, 1):
-        low = (word >> position.astype(word.dtype)) & jnp.asarray(2**half - 1, word.dtype)
-        below = jax.lax.population_count(low).astype(rank.dtype)
-        above = rank >= below
-        rank, position = (
-            jnp.where(above, rank - below, rank),
-            jnp.where(above, position + half, position),
-        )
-    return position
-
-
-def _for_each_true(flags, count, body, carry):
-    """Fold `body(indices[count], live[count], carry)` over the true flags, in ascending order."""
-    indices = jnp.nonzero(flags, size=flags.size, fill_value=0)[0].astype(jnp.int32)
-    indices = jnp.pad(indices, (0, count))
-    total = jnp.sum(flags, dtype=jnp.int32)
-
-    def step(i, carry):
-        start = i * count
-        live = start + jnp.arange(count, dtype=jnp.int32) < total
-        return body(jax.lax.dynamic_slice(indices, (start,), (count,)), live, carry)
-
-    return jax.lax.fori_loop(0, (total + count - 1) // count, step, carry)

@@ -31,9 +31,21 @@ def test_pixel_grid_holds_centers_as_x_y():
     np.testing.assert_array_equal(grid[-1, -1], [WIDTH - 0.5, HEIGHT - 0.5])
 
 
-@pytest.mark.parametrize("jit", [False, True])
-def test_projection_matches_the_oracle_and_opencv(key, jit):
+def from_matrices(make):
+    """The camera of `make_camera`, from a 4x4 pose in OpenCV's or OpenGL's convention and K."""
     camera = make_camera()
+    pose = np.vstack([camera.camtoworld, [0, 0, 0, 1]])
+    if make == Camera.from_opengl:  # the camera looks along -z, with y up
+        pose = pose @ np.diag([1.0, -1, -1, 1])
+    fx, fy, cx, cy = camera.intrinsics.tolist()
+    return make(pose, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], height=HEIGHT, width=WIDTH)
+
+
+@pytest.mark.parametrize("make", [None, Camera.from_matrix, Camera.from_opengl])
+@pytest.mark.parametrize("jit", [False, True])
+def test_projection_matches_the_oracle_and_opencv(key, jit, make):
+    camera = from_matrices(make) if make else make_camera()
+    assert (camera.height, camera.width) == (HEIGHT, WIDTH)
     offsets = jax.random.uniform(key, (20, 3), minval=-1, maxval=1) + jnp.array([[0, 0, 3.0]])
     points = camera.position[None] + offsets @ camera.rotation.T
     project = jax.jit(points_to_pixels) if jit else points_to_pixels
@@ -100,6 +112,41 @@ def test_values_and_gradients_are_finite_behind_and_in_the_camera(depth):
 
     value, gradients = jax.value_and_grad(total, argnums=(0, 1))(camera, point)
     assert all(jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((value, gradients)))
+
+
+def test_the_angle_of_view_is_that_between_the_edges():
+    pose = make_camera().camtoworld
+    for fov, vertical in ((0.9, False), (1.7, False), (0.6, True)):
+        camera = Camera.from_fov(pose, fov, height=HEIGHT, width=WIDTH, vertical=vertical)
+        x, y = (0, np.tan(fov / 2)) if vertical else (np.tan(fov / 2), 0)
+        edge = camera.position + 3 * camera.rotation @ jnp.array([x, y, 1.0])
+        pixel, _ = points_to_pixels(camera, edge)
+        at = [WIDTH / 2, HEIGHT] if vertical else [WIDTH, HEIGHT / 2]
+        np.testing.assert_allclose(pixel, at, atol=1e-4)
+        assert camera.intrinsics[0] == camera.intrinsics[1]
+
+
+@pytest.mark.parametrize("up", [(0.0, 0.0, 2.0), (0.3, -1.0, 0.2)])
+def test_a_camera_looks_at_its_target_with_up_on_top(up):
+    position, target = np.array([1.0, -2.0, 0.5]), np.array([-0.5, 1.0, 1.5])
+    camera = Camera.look_at(position, target, 0.8, height=HEIGHT, width=WIDTH, up=up)
+    pixels, depth = points_to_pixels(camera, jnp.stack([target, target + 0.1 * np.array(up)]))
+    np.testing.assert_allclose(pixels[0], [WIDTH / 2, HEIGHT / 2], atol=1e-5)
+    np.testing.assert_allclose(depth[0], np.linalg.norm(target - position), rtol=1e-6)
+    np.testing.assert_allclose(pixels[1, 0], WIDTH / 2, atol=1e-4)
+    assert pixels[1, 1] < HEIGHT / 2
+    np.testing.assert_allclose(camera.rotation @ camera.rotation.T, np.eye(3), atol=1e-6)
+    assert jnp.linalg.det(camera.rotation) > 0
+
+
+def test_a_camera_may_look_straight_along_up():
+    def rotation(target):
+        return Camera.look_at((0, 0, 3), target, 0.8, height=HEIGHT, width=WIDTH).rotation
+
+    down = rotation(jnp.zeros(3))
+    np.testing.assert_allclose(down @ down.T, np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(down[:, 2], [0, 0, -1], atol=1e-6)
+    assert jnp.all(jnp.isfinite(jax.jacobian(rotation)(jnp.zeros(3))))
 
 
 def test_a_wrong_shape_is_refused():

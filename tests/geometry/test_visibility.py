@@ -6,8 +6,9 @@ import reference
 
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.geometry.rotations import euler_to_matrix
+from jaxcloseup.geometry.union_warp import block_sources, union_warp
 from jaxcloseup.geometry.visibility import sample_where_visible
-from jaxcloseup.geometry.warp import warp_to
+from jaxcloseup.geometry.warp import warp_forward_to, warp_to
 
 
 SOURCE = Camera(jnp.eye(3, 4), jnp.array([40.0, 40, 20, 15]), height=30, width=40)
@@ -111,6 +112,39 @@ def test_gradients_are_finite_and_reach_image_and_depth(key):
     np.testing.assert_array_equal(gradients[1][~valid], 0)
 
 
+@pytest.mark.parametrize("jit", [False, True])
+def test_warp_forward_to_matches_the_oracle(key, jit):
+    image, source, target, depth = random_problem(key)
+    valid = jax.random.uniform(key, depth.shape) < 0.7
+    forward = jax.jit(warp_forward_to) if jit else warp_forward_to
+    ours = forward(image, source, target, depth, valid=valid)
+    drawn = np.asarray(valid & (depth > 0) & jnp.isfinite(depth))
+    poses = [(camera.camtoworld, camera.intrinsics) for camera in (source, target)]
+    grid = np.asarray(pixel_grid(8, 10))
+    points = reference.unproject(*poses[0], grid[drawn], np.asarray(depth)[drawn])
+    pixels, z = reference.project(*poses[1], points)
+    expected, z_buffer = reference.forward_warp(np.asarray(image)[drawn], pixels, z, (8, 10))
+    assert 5 < np.isfinite(z_buffer).sum() < 75
+    np.testing.assert_array_equal(ours.hit, np.isfinite(z_buffer))
+    np.testing.assert_array_equal(ours.values, expected.astype(np.float32))
+    np.testing.assert_allclose(ours.depth, z_buffer, rtol=1e-5)
+
+
+def test_forward_warps_join_in_one_target(key):
+    """Two sources drawn one after the other equal the union of both."""
+    image, source, target, depth = random_problem(key)
+    sources = jax.tree.map(lambda *leaves: jnp.stack(leaves), source, target)
+    images, depths = jnp.stack([image, image[::-1]]), jnp.stack([depth, depth[::-1]])
+    view = target.replace(camtoworld=target.camtoworld.at[2, 3].add(-0.5))
+    first = warp_forward_to(images[0], source, view, depths[0])
+    both = warp_forward_to(images[1], target, view, depths[1], into=first)
+    grid = pixel_grid(view.height, view.width)
+    union = union_warp(block_sources(sources, depths), sources, images, view, grid)
+    assert (both.hit & ~first.hit).any()
+    np.testing.assert_array_equal(both.values, union.values)
+    np.testing.assert_array_equal(both.hit, union.hit)
+
+
 def test_warp_to_batches_under_vmap(key):
     image, source, target, depth = random_problem(key)
     shifts = jnp.array([0.0, 0.2, -0.3])
@@ -138,9 +172,9 @@ def test_a_view_weighs_only_points_that_its_depth_confirms():
     depth, points, screen = (jnp.asarray(array) for array in see(SOURCE))
     depth, points = depth.astype(jnp.float32), points.astype(jnp.float32)
     weight = jnp.full(depth.shape, 0.7).at[:, :5].set(0)
-    pixels, z, found = sample(SOURCE, depth, weight, points, 0.02)
-    np.testing.assert_allclose(pixels, pixel_grid(SOURCE.height, SOURCE.width), atol=1e-3)
-    np.testing.assert_allclose(z, WALL, rtol=1e-6)
-    np.testing.assert_array_equal(found, jnp.where(screen, 0, weight))
+    seen = sample(SOURCE, depth, weight, points, 0.02)
+    np.testing.assert_allclose(seen.pixels, pixel_grid(SOURCE.height, SOURCE.width), atol=1e-3)
+    np.testing.assert_allclose(seen.depth, WALL, rtol=1e-6)
+    np.testing.assert_array_equal(seen.weight, jnp.where(screen, 0, weight))
     for outside in (points + jnp.array([[[100.0, 0, 0]]]), -points):
-        assert not jnp.any(sample(SOURCE, depth, weight, outside, jnp.inf)[2])
+        assert not jnp.any(sample(SOURCE, depth, weight, outside, jnp.inf).weight)
