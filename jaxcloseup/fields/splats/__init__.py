@@ -20,9 +20,9 @@ __all__, __getattr__, __dir__ = lazy_names(
         "selective_adam": "scale_by_selective_adam",
         "spherical_harmonics": "rgb_to_sh sh_basis sh_to_rgb",
         "splat_field": (
-            "SurfelBuffers SurfelFieldAux camera_extent surfel_field surfel_optimizer "
-            "with_expected_depth"
+            "SurfelBuffers SurfelFieldAux camera_extent surfel_field with_expected_depth"
         ),
+        "splat_optimizer": "surfel_optimizer",
         "surfels": "Surfels random_points surfels_from_points",
     },
 )

@@ -11,6 +11,7 @@ and of view-dependent color, and views in which it is 0 do not count.
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -51,16 +52,18 @@ class ImageGradientState(struct.PyTreeNode):
 def adaptive_control(
     config: AdaptiveConfig, *, extent: float, means_lr: Callable[[jax.Array], jax.Array]
 ) -> DensityControl:
-    """Refinement and resets of opacity when they are due; see `density_control`.
+    """Return refinement and resets of opacity when they are due; see `density_control`.
 
     The wrapped optimizer's state must start with that of `optax.scale_by_adam`.
     """
     del means_lr
 
-    def wrap_optimizer(optimizer):
+    def wrap_optimizer(
+        optimizer: optax.GradientTransformation,
+    ) -> optax.GradientTransformation:
         return optax.chain(record_image_gradients(), optimizer)
 
-    def adapt(key, state):
+    def adapt(key: jax.Array, state: Any) -> Any:
         due = is_due(state.step, every=config.every, start=config.start, stop=config.stop)
         reset_due = is_due(state.step, every=config.reset_every, start=0, stop=config.stop)
         state = jax.lax.cond(
@@ -70,11 +73,16 @@ def adaptive_control(
             reset_due, lambda state: _reset(state, config), lambda state: state, state
         )
 
-    return DensityControl(with_image_offset, wrap_optimizer, apply_image_offset, adapt)
+    return DensityControl(
+        init=with_image_offset,
+        wrap_optimizer=wrap_optimizer,
+        before_render=apply_image_offset,
+        adapt=adapt,
+    )
 
 
 def with_image_offset(surfels: Surfels) -> OffsetSurfels:
-    """The same surfels with an image-plane offset of 0."""
+    """Return the same surfels with an image-plane offset of 0."""
     leaves = {f.name: getattr(surfels, f.name) for f in dataclasses.fields(Surfels)}
     return OffsetSurfels(**leaves, image_offset=jnp.zeros_like(surfels.means[:, :2]))
 
@@ -82,8 +90,10 @@ def with_image_offset(surfels: Surfels) -> OffsetSurfels:
 def apply_image_offset(surfels: OffsetSurfels, camera: Camera) -> OffsetSurfels:
     """Shift surfels parallel to the image plane by their image offset.
 
-    The offset is 0, so the surfels stay in place, but the loss has a gradient with respect to it.
+    The offset is 0, so the surfels stay in place, but the loss has a gradient with respect to it:
+    the view-space gradient of Kerbl et al. (section 5.2), which no array of the renderer holds.
     """
+    # The offset's gradient alone is wanted, not a second path to the means.
     offset = jax.lax.stop_gradient(surfels.means) - camera.position[None]
     depth = matmul(offset, camera.rotation)[:, 2:]
     half_image = jnp.array([[camera.width / 2, camera.height / 2]], depth.dtype)
@@ -94,12 +104,15 @@ def apply_image_offset(surfels: OffsetSurfels, camera: Camera) -> OffsetSurfels:
 def record_image_gradients() -> optax.GradientTransformation:
     """Accumulate the image offset's gradient in the optimizer's state; leave updates unchanged."""
 
-    def init(params):
+    def init(params: OffsetSurfels) -> ImageGradientState:
         zeros = jnp.zeros(params.image_offset.shape[0], params.image_offset.dtype)
         return ImageGradientState(zeros, zeros)
 
-    def update(updates, state, params=None):
+    def update(
+        updates: OffsetSurfels, state: ImageGradientState, params: OffsetSurfels | None = None
+    ) -> tuple[OffsetSurfels, ImageGradientState]:
         del params
+        # The norm of each view's gradient: summed vectors of opposite views would cancel.
         norm = safe_norm(updates.image_offset)
         return updates, ImageGradientState(state.total + norm, state.views + (norm > 0))
 
@@ -134,21 +147,15 @@ def refine(
       Surfels, `alive [N]`, and `[N]` bool, True where a surfel is new and the optimizer must forget
       its row.
     """
-    count = alive.shape[0]
     scale = jnp.max(jnp.exp(surfels.log_scales), axis=-1) / extent
     mean_gradient = gradients.total / jnp.maximum(gradients.views, 1)
     opaque = alive & (jax.nn.sigmoid(surfels.opacity_logits) >= config.min_opacity)
     wanted = opaque & (mean_gradient >= config.gradient)
+    # A huge surfel with a large gradient is split, which makes it smaller.
     keep = opaque & (wanted | ~(remove_huge & (scale > config.huge)))
-    strongest = jnp.argsort(jnp.where(wanted, -mean_gradient, 1), stable=True)
-    room = jnp.argsort(keep, stable=True)
-    number = jnp.minimum(jnp.sum(wanted), jnp.sum(~keep))
-    granted = jnp.arange(count) < number
-    place = jnp.where(granted, room, count)  # `count` is out of bounds, so the update is dropped
-    source = jnp.arange(count).at[place].set(strongest, mode="drop")
-    added = jnp.zeros(count, bool).at[place].set(True, mode="drop")
-    parent = jnp.zeros(count, bool).at[jnp.where(granted, strongest, count)].set(True, mode="drop")
+    source, added, parent = _place_copies(wanted, keep, mean_gradient)
 
+    # Both halves of a split surfel move: the copy in its new row, and the surfel that was there.
     split = (parent | added) & (scale[source] > config.small)
     surfels = jax.tree.map(lambda leaf: leaf[source], surfels)
     shape = surfels.log_scales.shape
@@ -162,14 +169,33 @@ def refine(
     return surfels, keep | added, added | split
 
 
+def _place_copies(
+    wanted: jax.Array, keep: jax.Array, mean_gradient: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return which row each row copies, which rows are copies, and which are copied, `[N]`.
+
+    Rows that are not kept are free. When they run out, the largest gradients come first.
+    """
+    count = wanted.shape[0]
+    strongest = jnp.argsort(jnp.where(wanted, -mean_gradient, 1), stable=True)
+    room = jnp.argsort(keep, stable=True)
+    number = jnp.minimum(jnp.sum(wanted), jnp.sum(~keep))
+    granted = jnp.arange(count) < number
+    place = jnp.where(granted, room, count)  # `count` is out of bounds, so the update is dropped
+    source = jnp.arange(count).at[place].set(strongest, mode="drop")
+    added = jnp.zeros(count, bool).at[place].set(True, mode="drop")
+    parent = jnp.zeros(count, bool).at[jnp.where(granted, strongest, count)].set(True, mode="drop")
+    return source, added, parent
+
+
 def reset_opacities(surfels: OffsetSurfels, config: AdaptiveConfig) -> OffsetSurfels:
-    """Surfels whose opacities are at most `config.reset_opacity`."""
+    """Return surfels whose opacities are at most `config.reset_opacity`."""
     most = jnp.log(config.reset_opacity / (1 - config.reset_opacity))
     return surfels.replace(opacity_logits=jnp.minimum(surfels.opacity_logits, most))
 
 
-def _refine(key, state, config, extent):
-    """A state whose surfels are refined and whose 2-D gradients accumulate anew."""
+def _refine(key: jax.Array, state: Any, config: AdaptiveConfig, extent: float) -> Any:
+    """Return a state whose surfels are refined and whose 2-D gradients accumulate anew."""
     gradients, adam = state.opt_state
     refined = refine(
         key,
@@ -184,8 +210,8 @@ def _refine(key, state, config, extent):
     return replace_surfels(state.replace(opt_state=(zeros, adam)), *refined)
 
 
-def _reset(state, config):
-    """A state whose opacities are reset, with Adam's moments of the opacities."""
+def _reset(state: Any, config: AdaptiveConfig) -> Any:
+    """Return a state whose opacities are reset, with Adam's moments of the opacities."""
     gradients, (moments, *others) = state.opt_state
     mu, nu = (
         moment.replace(opacity_logits=jnp.zeros_like(moment.opacity_logits))

@@ -286,7 +286,7 @@ def forward(
         return _ForwardState(_advance(queue, done), product, walk, sums, ended)
 
     # A tile without splats shows nothing, through all of the transmittance.
-    ended = jnp.zeros((tiles + 1, rows.count, plan.tile**2), table.dtype)
+    ended = jnp.zeros((tiles + 1, rows.total, plan.tile**2), table.dtype)
     ended = ended.at[:, rows.transmittance].set(1)
     sums = Channels.of((zeros,) * (features + MOMENTS))
     state = _ForwardState(_begin(lists.counts, lanes), ones, fresh, sums, ended)
@@ -401,7 +401,7 @@ def _pull_chunk(
     """
     features = splats.rows.shape[-1] - PAYLOAD
     rows = pixel_rows(features)
-    at = [pixels[:, i, None] for i in range(rows.count)]
+    at = [pixels[:, i, None] for i in range(rows.total)]
     sums_bar, remaining = Channels.of(at[rows.sums]), at[rows.transmittance]
     trace = Trace(remaining, at[rows.stop].astype(jnp.int32), at[rows.reference])
     seen = shade(splats.column, grid.x, grid.y, plan.near)

@@ -1,4 +1,4 @@
-"""What a density control is: a record of pure functions, and what all schemes share.
+"""The contract of density controls, a record of pure functions, and helpers of all schemes.
 
 Every scheme works at a fixed capacity, so no array changes shape.
 """
@@ -33,13 +33,13 @@ class DensityControl(NamedTuple):
 
 
 def is_due(step: jax.Array, *, every: int, start: int, stop: int) -> jax.Array:
-    """Whether a step `[]` is a multiple of `every` after `start` and before `stop`."""
+    """Return whether a step `[]` is a multiple of `every` after `start` and before `stop`."""
     due = (step % every == 0) & (step > start)
     return due & (step < stop)
 
 
 def replace_surfels(state: Any, surfels: Surfels, alive: jax.Array, changed: jax.Array) -> Any:
-    """The state with new surfels; the optimizer's records of changed surfels become 0.
+    """Return the state with new surfels; the optimizer's records of changed surfels become 0.
 
     Args:
       state: a `TrainState`.
@@ -48,7 +48,8 @@ def replace_surfels(state: Any, surfels: Surfels, alive: jax.Array, changed: jax
       changed: `[N]` bool.
     """
 
-    def forget(leaf):
+    def forget(leaf: jax.Array) -> jax.Array:
+        # Scalars, such as Adam's count, and other records are not per surfel.
         if leaf.ndim == 0 or leaf.shape[0] != changed.shape[0]:
             return leaf
         return jnp.where(changed.reshape(-1, *(1,) * (leaf.ndim - 1)), 0, leaf)

@@ -1,4 +1,4 @@
-"""The table of density controls: which functions belong to which config."""
+"""The table of density controls: a function for each config."""
 
 from collections.abc import Callable, Hashable
 
@@ -22,7 +22,7 @@ _CONTROLS: dict[type, Callable[..., DensityControl]] = {
 def density_control(
     config: Hashable | None, *, extent: float, means_lr: Callable[[jax.Array], jax.Array]
 ) -> DensityControl:
-    """The density control of a config; None never changes the number of surfels.
+    """Return the density control of a config; None never changes the number of surfels.
 
     Args:
       config: None, a `McmcConfig` or an `AdaptiveConfig`; static.

@@ -14,6 +14,7 @@ from jaxcloseup.fields.splats.filters import widen_ellipse
 from jaxcloseup.fields.splats.layout import Footprints
 from jaxcloseup.fields.splats.projection import Discs
 from jaxcloseup.fields.splats.splat_math import ALPHA_MIN
+from jaxcloseup.fields.splats.vectors import Vector
 from jaxcloseup.geometry.cameras import Camera
 
 
@@ -29,7 +30,7 @@ def project_ellipsoids(
     near: float,
     antialias: bool = False,
 ) -> Footprints:
-    """Ellipses of volumetric Gaussians; invisible ones get opacity 0 and an empty box.
+    """Return ellipses of volumetric Gaussians; invisible ones get opacity 0 and an empty box.
 
     Args:
       ellipsoids: `N` of them in the frame of `camera`, with three scales.
@@ -50,16 +51,10 @@ def project_ellipsoids(
     inverse_depth = 1 / jnp.where(ahead, depth, 1)
     slopes = [ellipsoids.center[i] * inverse_depth for i in range(2)]
     center = [slopes[i] * focal[i] + principal[i] for i in range(2)]
-    axes = [
-        tuple(scale * component for component in axis)
-        for scale, axis in zip(ellipsoids.scales, ellipsoids[1:4], strict=True)
-    ]
-    # The rows of J times the semi-axes.
-    x, y = (
-        tuple(focal[i] * inverse_depth * (axis[i] - slope * axis[2]) for axis in axes)
-        for i, slope in enumerate(bounded_slopes(slopes, camera))
+    (first, below, second), kept = widen_ellipse(
+        *_image_axes(ellipsoids, slopes, inverse_depth, focal, camera),
+        antialias=antialias,
     )
-    (first, below, second), kept = widen_ellipse(x, y, antialias=antialias)
     opacity = opacity * kept
     none = jnp.zeros_like(depth)
     homography = [
@@ -68,19 +63,21 @@ def project_ellipsoids(
         [inverse_depth, none, none],
     ]
 
-    # The box has no derivative.
-    opacity_now, middle, half = lax.stop_gradient((opacity, center, (first, (below, second))))
+    # The box has no derivative. Its half sizes are the roots of the covariance's diagonal.
+    opacity_now, middle, first, below, second = lax.stop_gradient(
+        (opacity, center, first, below, second)
+    )
     cutoff = jnp.sqrt(2 * jnp.log(jnp.maximum(opacity_now / ALPHA_MIN, 1)))
     # The margin keeps pixels that only just reach the cutoff in spite of rounding.
-    half = [1.001 * cutoff * size + 0.01 for size in (half[0], jnp.hypot(*half[1]))]
-    box = [*(at - to for at, to in zip(middle, half, strict=True))]
+    half = [1.001 * cutoff * size + 0.01 for size in (first, jnp.hypot(below, second))]
+    box = [at - to for at, to in zip(middle, half, strict=True)]
     box += [at + to for at, to in zip(middle, half, strict=True)]
     drawn = ahead & (opacity_now >= ALPHA_MIN)
     return Footprints(
         anchor=jnp.stack(center),
         homography=jnp.stack([jnp.stack(row) for row in homography]),
         opacity=jnp.where(drawn, opacity, 0),
-        low_pass=jnp.full_like(depth, 1e9),
+        low_pass=jnp.full_like(depth, 1e9),  # no effect: the ellipse is filtered already
         inverse_depth=jnp.stack([inverse_depth, inverse_depth]),
         payload=payload,
         order=jnp.maximum(lax.stop_gradient(depth), near),
@@ -88,8 +85,34 @@ def project_ellipsoids(
     )
 
 
+def _image_axes(
+    ellipsoids: Discs,
+    slopes: list[jax.Array],
+    inverse_depth: jax.Array,
+    focal: jax.Array,
+    camera: Camera,
+) -> tuple[Vector, Vector]:
+    """Return the displacements in x and y, in pixels, by each of the ellipsoids' semi-axes.
+
+    They are the rows of J (Kerbl et al. 2023, equation 5) times the semi-axes, so that products
+    with themselves and each other are the covariance J S J^T.
+    """
+    frame = ellipsoids.tangent_u, ellipsoids.tangent_v, ellipsoids.normal
+    axes = [
+        tuple(scale * component for component in axis)
+        for scale, axis in zip(ellipsoids.scales, frame, strict=True)
+    ]
+
+    def displacement(i: int, slope: jax.Array) -> Vector:
+        u, v, n = (focal[i] * inverse_depth * (axis[i] - slope * axis[2]) for axis in axes)
+        return u, v, n
+
+    x, y = bounded_slopes(slopes, camera)
+    return displacement(0, x), displacement(1, y)
+
+
 def bounded_slopes(slopes: list[jax.Array], camera: Camera) -> list[jax.Array]:
-    """x / z and y / z at which J is taken: at most those a little outside of the image.
+    """Return x / z and y / z at which J is taken: at most those a little outside of the image.
 
     As published, for a principal point anywhere: beside the camera, J grows without bound.
     """

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxcloseup.fields.splats.surfels import Surfels
-from jaxcloseup.fields.splats.vectors import cross, dot, scaled
+from jaxcloseup.fields.splats.vectors import Vector, cross, dot, scaled
 from jaxcloseup.geometry.cameras import Camera, mean_focal, points_to_pixels
 from jaxcloseup.geometry.masks import in_bounds
 
@@ -25,10 +25,19 @@ SMOOTHING_VARIANCE = 0.2  # squared sampling intervals, of its 3-D filter
 _SEEN_BEYOND = 0.15  # of an image's size, by which a center outside of it still counts as seen
 
 
-def pixel_spread(homography, depth, known):
-    """Cholesky factor (l11, l21, l22) of I + s^2 J J^T of each disc; the identity if not known.
+Rows = tuple[Vector, Vector, Vector]  # of homographies
+Factor = tuple[jax.Array, jax.Array, jax.Array]  # l11, l21, l22 `[N]` of Cholesky factors
+
+
+def pixel_spread(homography: Rows, depth: jax.Array, known: jax.Array) -> Factor:
+    """Return the Cholesky factor of I + s^2 J J^T of each disc; the identity if not known.
 
     J is the derivative of (u, v) by the pixel at the disc's center, and s^2 a pixel's variance.
+
+    Args:
+      homography: about the center.
+      depth: `[N]` of the center.
+      known: `[N]` bool.
     """
     (ux, uy), (vx, vy) = (
         [jnp.where(known, depth * slope, 0) for slope in row[1:]] for row in homography[:2]
@@ -44,27 +53,29 @@ def pixel_spread(homography, depth, known):
     return first, below, second
 
 
-def widen(homography, vectors, spread):
-    """Homography and vectors of discs whose covariance of (u, v) is L L^T."""
+def widen(
+    homography: Rows, vectors: tuple[Vector, Vector], spread: Factor
+) -> tuple[Rows, tuple[Vector, Vector]]:
+    """Return homographies and semi-axes of discs whose covariance of (u, v) is L L^T."""
     first, below, second = spread
     u = scaled(1 / first, homography[0])
-    v = tuple((b - below * a) / second for a, b in zip(u, homography[1], strict=True))
-    one, other = vectors
-    one = tuple(first * a + below * b for a, b in zip(one, other, strict=True))
-    return (u, v, homography[2]), (one, scaled(second, other))
+    # L^-1 (u, v) by substitution, and L^T times the semi-axes.
+    vx, vy, vz = ((b - below * a) / second for a, b in zip(u, homography[1], strict=True))
+    x, y, z = (first * a + below * b for a, b in zip(*vectors, strict=True))
+    return (u, (vx, vy, vz), homography[2]), ((x, y, z), scaled(second, vectors[1]))
 
 
-def widen_ellipse(x, y, *, antialias: bool):
-    """Ellipses in the image, with a filter.
+def widen_ellipse(x: Vector, y: Vector, *, antialias: bool) -> tuple[Factor, jax.Array | float]:
+    """Return ellipses in the image, with a filter.
 
     Args:
       x: the displacement in x, in pixels, by each of an ellipsoid's semi-axes: three of `[N]`.
       y: the displacement in y. Without a filter, x.x, x.y and y.y are the covariance.
-      antialias: convolve with Mip-Splatting's 2-D filter, which keeps the light; without it, dilate
-        as published.
+      antialias: convolve with Mip-Splatting's 2-D filter (Yu et al. 2024, equation 10), which keeps
+        the light; without it, dilate as published for 3-D Gaussian splatting.
 
     Returns:
-      Cholesky factor (l11, l21, l22) of the covariance, and the factor on the opacity.
+      Cholesky factor of the covariance, and the factor on the opacity.
     """
     variance = MIP_VARIANCE if antialias else DILATION
     first = jnp.sqrt(dot(x, x) + variance)
@@ -77,12 +88,13 @@ def widen_ellipse(x, y, *, antialias: bool):
     second = jnp.sqrt(variance + area + per_first * dot(y, y))
     if not antialias:
         return (first, below, second), 1.0
+    # The inner `where` keeps the gradient of a flat ellipse's root finite.
     flat = area == 0
     return (first, below, second), jnp.where(flat, 0, jnp.sqrt(jnp.where(flat, 1, area))) / second
 
 
 def sampling_intervals(means: jax.Array, cameras: Camera, *, near: float) -> jax.Array:
-    """Distance `[N]` between neighboring pixels of the photograph that shows each point finest.
+    """Return the distance `[N]` between pixels of the photograph that shows each point finest.
 
     That is the least z / f (Mip-Splatting, equation 6), whether or not something hides the point.
     A point that no photograph shows gets the largest distance of the others.
@@ -93,7 +105,7 @@ def sampling_intervals(means: jax.Array, cameras: Camera, *, near: float) -> jax
       near: z-depth before which a photograph shows nothing.
     """
 
-    def least(found, camera):
+    def least(found: jax.Array, camera: Camera) -> tuple[jax.Array, None]:
         pixels, depth = points_to_pixels(camera, means)
         margin = jnp.array([[camera.width, camera.height]], pixels.dtype) * _SEEN_BEYOND
         wide = jnp.array([1 + 2 * _SEEN_BEYOND], pixels.dtype)[None]
@@ -108,7 +120,7 @@ def sampling_intervals(means: jax.Array, cameras: Camera, *, near: float) -> jax
 
 
 def smoothed(surfels: Surfels, interval: jax.Array | None) -> Surfels:
-    """Splats convolved in space with a Gaussian of `SMOOTHING_VARIANCE` squared intervals.
+    """Return splats convolved in space with a Gaussian of `SMOOTHING_VARIANCE` squared intervals.
 
     Each keeps its integral, over the plane of a disc or over space: scales grow and the opacity
     falls (Mip-Splatting, equation 9).
@@ -119,6 +131,7 @@ def smoothed(surfels: Surfels, interval: jax.Array | None) -> Surfels:
     """
     if interval is None:
         return surfels
+    # Scales add as variances, in logarithms, whose range no scale leaves.
     variance = lax.stop_gradient(jnp.maximum(SMOOTHING_VARIANCE * interval**2, 1e-30))
     log_scales = 0.5 * jnp.logaddexp(2 * surfels.log_scales, jnp.log(variance)[:, None])
     kept = jnp.exp(jnp.sum(surfels.log_scales - log_scales, axis=-1))

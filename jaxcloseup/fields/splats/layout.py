@@ -112,7 +112,7 @@ class PixelRows(NamedTuple):
       transmittance: row of `Trace.transmittance`.
       stop: row of `Trace.stop`, which a float holds exactly.
       reference: row of `Trace.reference`.
-      count: number of rows.
+      total: number of rows.
     """
 
     sums: slice
@@ -120,13 +120,13 @@ class PixelRows(NamedTuple):
     transmittance: int
     stop: int
     reference: int
-    count: int
+    total: int
 
 
 def pixel_rows(features: int) -> PixelRows:
     """Return the layout of pixels for payloads of `features` values."""
     sums = features + MOMENTS
-    return PixelRows(slice(sums), sums, sums + 1, sums + 2, sums + 3, count=sums + 4)
+    return PixelRows(slice(sums), sums, sums + 1, sums + 2, sums + 3, total=sums + 4)
 
 
 class Trace(struct.PyTreeNode):

@@ -5,6 +5,7 @@ noise moves all surfels a little, faint ones most. No array changes shape.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,13 +24,13 @@ _MAX_OPACITY = 1 - 1e-6
 def mcmc_control(
     config: McmcConfig, *, extent: float, means_lr: Callable[[jax.Array], jax.Array]
 ) -> DensityControl:
-    """Relocation when it is due, and position noise after every step; see `density_control`."""
+    """Return relocation when it is due, and position noise after every step."""
     del extent
 
-    def adapt(key, state):
+    def adapt(key: jax.Array, state: Any) -> Any:
         key_relocate, key_noise = jax.random.split(key)
 
-        def move(state):
+        def move(state: Any) -> Any:
             moved = relocate(key_relocate, state.params, state.buffers.alive, config)
             return replace_surfels(state, *moved)
 
@@ -72,9 +73,10 @@ def relocate(
     newborn = _newborn(alive, config.growth)
     receiver = ((alive & ~donor) | newborn) & jnp.any(donor)
 
+    # Dead surfels join living ones in proportion to opacity, as published.
     source = _draw_donors(key, jnp.where(donor, opacity, 0), donor)
     copies = jnp.zeros(count, jnp.int32).at[source].add(receiver.astype(jnp.int32))
-    copies = jnp.minimum(copies + 1, MAX_COPIES)
+    copies = jnp.minimum(copies + 1, MAX_COPIES)  # with the donor itself
     thinner, smaller = split_opacity(opacity, copies)
     thinner = jnp.clip(thinner, config.min_opacity, _MAX_OPACITY)
     shared = surfels.replace(
@@ -91,8 +93,8 @@ def relocate(
     )
 
 
-def _newborn(alive, growth):
-    """Free rows `[N]` that come to life."""
+def _newborn(alive: jax.Array, growth: float) -> jax.Array:
+    """Return the free rows `[N]` that come to life."""
     number = jnp.sum(alive, dtype=jnp.int32)
     wanted = (number.astype(jnp.float32) * growth).astype(jnp.int32)
     # Grow by at least one when counts are tiny.
@@ -101,8 +103,8 @@ def _newborn(alive, growth):
     return ~alive & (jnp.cumsum(~alive, dtype=jnp.int32) <= added)
 
 
-def _draw_donors(key, weight, donor):
-    """`N` random indices of donors, drawn with probability proportional to `weight[N]`."""
+def _draw_donors(key: jax.Array, weight: jax.Array, donor: jax.Array) -> jax.Array:
+    """Return `N` random indices of donors, drawn with probability proportional to `weight[N]`."""
     count = donor.shape[0]
     cumulative = jnp.cumsum(weight)
     draws = jax.random.uniform(key, (count,)) * cumulative[-1]
@@ -112,19 +114,22 @@ def _draw_donors(key, weight, donor):
 
 
 def split_opacity(opacity: jax.Array, copies: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Opacity and scale factor `[N]` of coincident surfels that replace one.
+    """Return the opacity and scale factor `[N]` of coincident surfels that replace one.
 
-    n coincident discs of peak opacity p absorb sum_{i=1..n} (1 - (1 - p)^i) / i times the light of
-    a disc of peak opacity 1, integrated over their plane.
+    The opacity is that of equation 9 of Kheradmand et al. n coincident discs of peak opacity p
+    absorb sum_{i=1..n} (1 - (1 - p)^i) / i times the light of a disc of peak opacity 1, integrated
+    over their plane; the factor keeps that. The published factor keeps the integral along a line,
+    by an alternating sum of binomials that loses its digits for many copies.
 
     Args:
       opacity: `[N]` opacity of the replaced surfel.
       copies: `[N]` number of coincident surfels, 1 to `MAX_COPIES`.
     """
     copies = copies.astype(opacity.dtype)
+    # 1 - (1 - o)^(1/n), without cancellation where o is small.
     each = -jnp.expm1(jnp.log1p(-jnp.minimum(opacity, _MAX_OPACITY)) / copies)
 
-    def add(i, total):
+    def add(i: jax.Array, total: jax.Array) -> jax.Array:
         i = i.astype(opacity.dtype)
         term = -jnp.expm1(i * jnp.log1p(-each)) / i
         return total + jnp.where(i <= copies, term, 0)
@@ -142,6 +147,9 @@ def add_position_noise(
 ) -> Surfels:
     """Move means by Gaussian noise within their discs or ellipsoids, faint ones most.
 
+    The noise of Kheradmand et al., equation 8, has the shape of the covariance, not of its root, so
+    that it moves needles along themselves alone. A disc's stays in its plane.
+
     Args:
       key: random key; consumed.
       surfels: `N` surfels.
@@ -150,6 +158,7 @@ def add_position_noise(
       config: static.
     """
     opacity = jax.nn.sigmoid(surfels.opacity_logits)
+    # A switch at the opacity below which surfels are dead.
     faint = jax.nn.sigmoid(-100 * (opacity - config.min_opacity))
     amount = jnp.where(alive, faint * learning_rate * config.noise, 0)
     variance = jnp.exp(2 * surfels.log_scales)

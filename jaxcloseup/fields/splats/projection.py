@@ -7,15 +7,19 @@ n = t_u x t_v and radii s_u, s_v at depth z with local coordinates (u, v). The t
 
 are affine in the pixel: they are the rows of `Footprints.homography`, taken about the projected
 center, where they are (0, 0, 1 / mu_z) without rounding.
+
+That is the intersection of 2D Gaussian splatting (Huang et al. 2024, equations 8 to 10) without its
+cross product of two planes at each pixel, which in float32 loses the digits of small discs.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 from jax import lax
 
-from jaxcloseup.fields.splats.filters import LOW_PASS, pixel_spread, widen
+from jaxcloseup.fields.splats.filters import LOW_PASS, Rows, pixel_spread, widen
 from jaxcloseup.fields.splats.layout import Footprints
 from jaxcloseup.fields.splats.splat_math import ALPHA_MIN
 from jaxcloseup.fields.splats.surfels import Surfels
@@ -26,6 +30,9 @@ from jaxcloseup.geometry.rotations import quaternion_rows
 
 EDGE_ON = 1e-4  # |cos| between normal and line of sight below which a disc is not drawn
 MAX_LOG_SCALE = 30.0  # beyond it, products of scales leave the range of float32
+
+
+Point = tuple[jax.Array, jax.Array]  # cos and sin `[N]`
 
 
 class Discs(NamedTuple):
@@ -46,11 +53,26 @@ class Discs(NamedTuple):
     scales: tuple[jax.Array, ...]
 
 
-def surfel_columns(surfels: Surfels) -> Surfels:
-    """The surfels with tuples of columns `[N]` in place of arrays `[N, ...]`, see `Vector`."""
-    split = lambda array: _split(array.reshape(array.shape[0], -1))  # noqa: E731
+class SurfelColumns(struct.PyTreeNode):
+    """`Surfels` with tuples of columns `[N]` in place of arrays, see `Vector`; `sh` has triples."""
+
+    means: Vector
+    log_scales: tuple[jax.Array, ...]
+    quaternions: tuple[jax.Array, jax.Array, jax.Array, jax.Array]
+    opacity_logits: jax.Array
+    sh: tuple[Vector, ...]
+
+
+def surfel_columns(surfels: Surfels) -> SurfelColumns:
+    """Return the columns of surfels."""
+
+    def split(array: jax.Array) -> Any:
+        # The derivative of a split is one concatenation, that of slices a sum of padded arrays.
+        columns = array.reshape(array.shape[0], -1).T
+        return tuple(row[0] for row in lax.split(columns, (1,) * columns.shape[0]))
+
     sh = split(surfels.sh)
-    return Surfels(
+    return SurfelColumns(
         means=split(surfels.means),
         log_scales=split(surfels.log_scales),
         quaternions=split(surfels.quaternions),
@@ -59,13 +81,8 @@ def surfel_columns(surfels: Surfels) -> Surfels:
     )
 
 
-def _split(array):
-    # The derivative of a split is one concatenation, that of slices a sum of padded arrays.
-    return tuple(row[0] for row in lax.split(array.T, (1,) * array.shape[1]))
-
-
-def to_camera(surfels: Surfels, camera: Camera) -> tuple[Discs, Vector]:
-    """Discs in the camera's frame, and their normals, world frame, facing the camera.
+def to_camera(surfels: SurfelColumns, camera: Camera) -> tuple[Discs, Vector]:
+    """Return discs in the camera's frame, and their normals, world frame, facing the camera.
 
     Args:
       surfels: from `surfel_columns`.
@@ -73,23 +90,31 @@ def to_camera(surfels: Surfels, camera: Camera) -> tuple[Discs, Vector]:
     """
     tangent_u, tangent_v, normal = zip(*quaternion_rows(*surfels.quaternions), strict=True)
     offset = offsets(surfels, camera)
+    # By the line of sight to the center: where a pixel sees the disc, its ray agrees.
     away = dot(offset, normal) > 0
 
-    def turn(vector):
-        return tuple(dot(axis, vector) for axis in camera.rotation.T)
+    def turn(vector: Vector) -> Vector:
+        x, y, z = (dot(axis, vector) for axis in camera.rotation.T)
+        return x, y, z
 
-    discs = Discs(
-        *map(turn, (offset, tangent_u, tangent_v, normal)),
-        scales=tuple(
-            jnp.exp(jnp.clip(scale, -MAX_LOG_SCALE, MAX_LOG_SCALE)) for scale in surfels.log_scales
-        ),
+    scales = tuple(
+        jnp.exp(jnp.clip(scale, -MAX_LOG_SCALE, MAX_LOG_SCALE)) for scale in surfels.log_scales
     )
-    return discs, tuple(jnp.where(away, -n, n) for n in normal)
+    discs = Discs(
+        center=turn(offset),
+        tangent_u=turn(tangent_u),
+        tangent_v=turn(tangent_v),
+        normal=turn(normal),
+        scales=scales,
+    )
+    x, y, z = (jnp.where(away, -n, n) for n in normal)
+    return discs, (x, y, z)
 
 
-def offsets(surfels: Surfels, camera: Camera) -> Vector:
-    """From the camera to the centers of surfels from `surfel_columns`, world frame."""
-    return tuple(mean - at for mean, at in zip(surfels.means, camera.position, strict=True))
+def offsets(surfels: SurfelColumns, camera: Camera) -> Vector:
+    """Return vectors from the camera to the centers of surfels from `surfel_columns`."""
+    x, y, z = (mean - at for mean, at in zip(surfels.means, camera.position, strict=True))
+    return x, y, z
 
 
 def project_discs(
@@ -101,7 +126,7 @@ def project_discs(
     near: float,
     antialias: bool = False,
 ) -> Footprints:
-    """Homographies and boxes of discs; invisible discs get opacity 0 and an empty box.
+    """Return homographies and boxes of discs; invisible discs get opacity 0 and an empty box.
 
     With `antialias`, each disc is convolved with the pixel, so that an image of fewer pixels is the
     mean of one of more (the elliptical weighted average of Zwicker et al. 2001, as the 2-D filter
@@ -123,44 +148,12 @@ def project_discs(
     if near <= 0:
         raise ValueError(f"near must be a positive depth, not {near}")
     focal, principal = camera.intrinsics[:2], camera.intrinsics[2:]
-    size = camera.width, camera.height
     mu, depth = discs.center, discs.center[2]
     ahead = depth > near
     inverse_depth = 1 / jnp.where(ahead, depth, 1)
     center = [mu[i] * inverse_depth * focal[i] + principal[i] for i in range(2)]
-
-    # A center far outside the image, or behind the camera, is a poor origin for numbers that are
-    # evaluated inside it. Any other pixel serves if the low-pass about it stays out of sight.
-    # Discs behind the camera are anchored at a corner of pixels, never at a pixel's center.
-    margin = [max(side, 16) for side in size]
-    around = list(zip(center, margin, size, strict=True))
-    within = [(at > -more) & (at < side + more) for at, more, side in around]
-    centered = ahead & within[0] & within[1]
-    elsewhere = [
-        jnp.where(ahead, jnp.clip(at, -more, side + more), side // 2) for at, more, side in around
-    ]
-    anchor = [
-        jnp.where(centered, at, lax.stop_gradient(other))
-        for at, other in zip(center, elsewhere, strict=True)
-    ]
-
-    facing = dot(discs.normal, mu)
-    edge_on = jnp.abs(facing) <= EDGE_ON * jnp.sqrt(lax.stop_gradient(dot(mu, mu)))
-    per_facing = 1 / jnp.where(edge_on, 1, facing)
-    covectors = (
-        scaled(per_facing / discs.scales[0], cross(discs.tangent_v, mu)),
-        scaled(per_facing / discs.scales[1], cross(mu, discs.tangent_u)),
-        scaled(per_facing, discs.normal),
-    )
-    ray = [(anchor[i] - principal[i]) / focal[i] for i in range(2)]
-    homography = [
-        (
-            jnp.where(centered, at_center, x * ray[0] + y * ray[1] + z),
-            x / focal[0],
-            y / focal[1],
-        )
-        for (x, y, z), at_center in zip(covectors, (0, 0, inverse_depth), strict=True)
-    ]
+    anchor, centered = _anchors(center, ahead, camera)
+    homography, edge_on = _homographies(discs, anchor, centered, inverse_depth, focal, principal)
     vectors = scaled(discs.scales[0], discs.tangent_u), scaled(discs.scales[1], discs.tangent_v)
     if antialias:
         spread = pixel_spread(homography, depth, centered & ~edge_on)
@@ -169,12 +162,14 @@ def project_discs(
 
     # Neither the box nor the disc's range of depth has a derivative.
     mu, vectors, opacity_now, center = lax.stop_gradient((mu, vectors, opacity, center))
+    # Where alpha falls to ALPHA_MIN, in standard deviations: a fixed 3 would cut opaque discs off.
     cutoff = jnp.sqrt(2 * jnp.log(jnp.maximum(opacity_now / ALPHA_MIN, 1)))
     reach = cutoff * jnp.hypot(vectors[0][2], vectors[1][2])
     drawn = ~edge_on & (opacity_now >= ALPHA_MIN) & (mu[2] + reach >= near)
     nearest, farthest = (jnp.maximum(limit, near) for limit in (mu[2] - reach, mu[2] + reach))
     box = _disc_box(mu, vectors, cutoff, camera, near)
     if not antialias:
+        # The low-pass draws a circle about the center, which may be larger than the disc.
         half = 1.001 * cutoff / jnp.sqrt(LOW_PASS) + 0.01
         square = center[0] - half, center[1] - half, center[0] + half, center[1] + half
         sides = zip([jnp.minimum] * 2 + [jnp.maximum] * 2, box, square, strict=True)
@@ -186,17 +181,89 @@ def project_discs(
         low_pass=jnp.where(ahead & (not antialias), LOW_PASS, 1e9),
         inverse_depth=jnp.stack([1 / farthest, 1 / nearest]),
         payload=payload,
+        # A disc that reaches through the near plane is sorted as if it lay there.
         order=jnp.maximum(mu[2], near),
         box=jnp.where(drawn[None], jnp.stack(box), -1),
     )
 
 
-def _disc_box(center, vectors, cutoff, camera, near):
-    """Exact bounds x0, y0, x1, y1 `[N]` in pixels of discs of radius `cutoff[N]` cut at z = near.
+def _anchors(
+    center: list[jax.Array], ahead: jax.Array, camera: Camera
+) -> tuple[list[jax.Array], jax.Array]:
+    """Return anchors x, y `[N]` of discs, and where these are the projected centers `[N]`.
 
-    The rim is center + cutoff (cos t vectors[0] + sin t vectors[1]). The visible part is convex, so
-    points of its rim bound its image: those where a coordinate is stationary along the circle, and
-    the ends of the chord at z = near.
+    A center far outside the image, or behind the camera, is a poor origin for numbers that are
+    evaluated inside it. Any other pixel serves if the low-pass about it stays out of sight.
+    """
+    size = camera.width, camera.height
+    margin = [max(side, 16) for side in size]
+    around = list(zip(center, margin, size, strict=True))
+    within = [(at > -more) & (at < side + more) for at, more, side in around]
+    centered = ahead & within[0] & within[1]
+    # Discs behind the camera are anchored at a corner of pixels, never at a pixel's center.
+    elsewhere = [
+        jnp.where(ahead, jnp.clip(at, -more, side + more), side // 2) for at, more, side in around
+    ]
+    anchor = [
+        jnp.where(centered, at, lax.stop_gradient(other))
+        for at, other in zip(center, elsewhere, strict=True)
+    ]
+    return anchor, centered
+
+
+def _homographies(
+    discs: Discs,
+    anchor: list[jax.Array],
+    centered: jax.Array,
+    inverse_depth: jax.Array,
+    focal: jax.Array,
+    principal: jax.Array,
+) -> tuple[Rows, jax.Array]:
+    """Return the rows of homographies about anchors, and where discs are seen from the edge `[N]`.
+
+    Args:
+      discs: `N` discs.
+      anchor: x and y `[N]`.
+      centered: `[N]` bool, True where the anchor is the projected center.
+      inverse_depth: `[N]` of the center.
+      focal: `[2]` focal lengths.
+      principal: `[2]` principal point.
+    """
+    mu, facing = discs.center, dot(discs.normal, discs.center)
+    edge_on = jnp.abs(facing) <= EDGE_ON * jnp.sqrt(lax.stop_gradient(dot(mu, mu)))
+    per_facing = 1 / jnp.where(edge_on, 1, facing)
+    # A row is a covector: its product with the ray r is u / z, v / z or 1 / z.
+    covectors = (
+        scaled(per_facing / discs.scales[0], cross(discs.tangent_v, mu)),
+        scaled(per_facing / discs.scales[1], cross(mu, discs.tangent_u)),
+        scaled(per_facing, discs.normal),
+    )
+    ray = [(anchor[i] - principal[i]) / focal[i] for i in range(2)]
+    at_centers: tuple[jax.Array | int, ...] = (0, 0, inverse_depth)  # exact, unlike the sum
+    u, v, w = (
+        (
+            jnp.where(centered, at_center, x * ray[0] + y * ray[1] + z),
+            x / focal[0],
+            y / focal[1],
+        )
+        for (x, y, z), at_center in zip(covectors, at_centers, strict=True)
+    )
+    return (u, v, w), edge_on
+
+
+def _disc_box(
+    center: Vector,
+    vectors: tuple[Vector, Vector],
+    cutoff: jax.Array,
+    camera: Camera,
+    near: float,
+) -> list[jax.Array]:
+    """Return exact bounds x0, y0, x1, y1 `[N]` in pixels of discs of radius `cutoff[N]`.
+
+    The rim is center + cutoff (cos t vectors[0] + sin t vectors[1]). The part beyond z = near is
+    convex, so points of its rim bound its image: those where a coordinate is stationary along the
+    circle, and the ends of the chord at z = near. Published code bounds the ellipse of the whole
+    disc, which for a disc that crosses the camera's plane bounds what is *not* visible.
     """
     # The margin keeps pixels that only just reach the cutoff in spite of rounding.
     radius = 1.001 * cutoff
@@ -210,12 +277,15 @@ def _disc_box(center, vectors, cutoff, camera, near):
         # The derivative of (a.p) / (depth.p) vanishes, where p = (cos t, sin t, 1).
         cos, sin, constant = cross(a, depth)
         rim, has_rim = _meet_circle(cos, sin, -constant)
-        candidates = [(point, near, has_chord) for point in chord]
+        candidates: list[tuple[Point, jax.Array | float, jax.Array]] = [
+            (point, near, has_chord) for point in chord
+        ]
         for point in rim:
             at_depth = _on_circle(depth, point)
             exists = has_rim & (at_depth >= near)
             candidates.append((point, jnp.where(exists, at_depth, 1), exists))
-        least, most = jnp.inf, -jnp.inf
+        least: jax.Array | float = jnp.inf
+        most: jax.Array | float = -jnp.inf
         for point, at_depth, exists in candidates:
             at = _on_circle(a, point) / at_depth
             at = at * camera.intrinsics[axis] + camera.intrinsics[2 + axis]
@@ -223,16 +293,17 @@ def _disc_box(center, vectors, cutoff, camera, near):
             most = jnp.maximum(most, jnp.where(exists, at, -jnp.inf))
         low.append(least - 0.01)
         high.append(most + 0.01)
-    return *low, *high
+    return [*low, *high]
 
 
-def _on_circle(coordinate, point):
-    """The value `[N]` of a coordinate (a, b, c) of the rim at a point (cos, sin)."""
+def _on_circle(coordinate: Vector, point: Point) -> jax.Array:
+    """Return the value `[N]` of a coordinate (a, b, c) of the rim at a point (cos, sin)."""
     return coordinate[0] * point[0] + coordinate[1] * point[1] + coordinate[2]
 
 
-def _meet_circle(a, b, c):
-    """Both points (cos, sin) `[N]` with a cos + b sin + c = 0, and whether they exist `[N]`."""
+def _meet_circle(a: jax.Array, b: jax.Array, c: jax.Array) -> tuple[tuple[Point, Point], jax.Array]:
+    """Return both points (cos, sin) with a cos + b sin + c = 0, and whether they exist `[N]`."""
+    # Scaled to 1: squares of large coordinates would leave the range of float32.
     largest = jnp.maximum(jnp.maximum(jnp.abs(a), jnp.abs(b)), jnp.maximum(jnp.abs(c), 1e-30))
     a, b, c = a / largest, b / largest, c / largest
     squared = a * a + b * b
@@ -240,7 +311,7 @@ def _meet_circle(a, b, c):
     root = jnp.sqrt(jnp.maximum(discriminant, 0))
     # For a disc without extent the equation vanishes, and any point of its rim serves.
     divisor = jnp.where(squared == 0, 1, squared)
-    points = [
+    first, second = (
         ((-c * a - s * b * root) / divisor, (-c * b + s * a * root) / divisor) for s in (-1, 1)
-    ]
-    return points, discriminant >= 0
+    )
+    return (first, second), discriminant >= 0

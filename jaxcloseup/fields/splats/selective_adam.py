@@ -28,7 +28,7 @@ class SelectiveAdamState(NamedTuple):
 def scale_by_selective_adam(
     b1: float = 0.9, b2: float = 0.999, eps: float = 1e-15
 ) -> optax.GradientTransformation:
-    """Adam (Kingma and Ba 2015) of each surfel in the steps alone that see it.
+    """Return Adam (Kingma and Ba 2015) that updates each surfel only in steps that see it.
 
     A surfel is seen where its color has a gradient. Each counts its own steps, which correct the
     bias of its moments, so that surfels may be added at any time.

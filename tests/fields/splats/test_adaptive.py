@@ -10,7 +10,7 @@ import pytest
 from reference_splats import rotation_of
 from splat_scenes import COUNT, HEIGHT, WIDTH, random_scene, to_camera, to_surfels
 
-from jaxcloseup.fields.splats import RasterizeConfig
+from jaxcloseup.fields.splats import RasterizeConfig, SurfelConfig
 from jaxcloseup.fields.splats.adaptive import (
     AdaptiveConfig,
     ImageGradientState,
@@ -19,7 +19,8 @@ from jaxcloseup.fields.splats.adaptive import (
     reset_opacities,
     with_image_offset,
 )
-from jaxcloseup.fields.splats.splat_field import SurfelConfig, surfel_field, surfel_optimizer
+from jaxcloseup.fields.splats.splat_field import surfel_field
+from jaxcloseup.fields.splats.splat_optimizer import surfel_optimizer
 from jaxcloseup.geometry.cameras import points_to_pixels
 from jaxcloseup.training.config import TrainConfig
 from jaxcloseup.training.steps import init_state, run_steps, train_step

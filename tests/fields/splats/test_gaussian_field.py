@@ -11,7 +11,8 @@ import pytest
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.fields.splats import McmcConfig, RasterizeConfig, sampling_intervals
 from jaxcloseup.fields.splats.config import GaussianConfig
-from jaxcloseup.fields.splats.splat_field import surfel_field, surfel_optimizer
+from jaxcloseup.fields.splats.splat_field import surfel_field
+from jaxcloseup.fields.splats.splat_optimizer import surfel_optimizer
 from jaxcloseup.photos.views import camera_at
 from jaxcloseup.training.config import TrainConfig
 from jaxcloseup.training.steps import init_state, run_steps, train_step

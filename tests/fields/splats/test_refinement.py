@@ -71,11 +71,11 @@ def test_joined_surfels_are_the_living_ones_of_both(found):
     _, _, _, new = found
     old = jax.tree.map(lambda leaf: leaf[:6], new[0]), jnp.arange(6) % 2 == 0
     living = int(new[1].sum())
-    surfels, alive = join_surfels(old, new, 400)
+    surfels, alive = join_surfels(old, new, capacity=400)
     assert len(alive) == 400 and int(alive.sum()) == 3 + living
     np.testing.assert_array_equal(surfels.means[:3], old[0].means[::2])
     np.testing.assert_array_equal(surfels.means[3 : 3 + living], new[0].means[new[1]])
-    fewer, alive = join_surfels(old, new, 10)
+    fewer, alive = join_surfels(old, new, capacity=10)
     assert alive.all()
     np.testing.assert_array_equal(fewer.means, surfels.means[:10])
 

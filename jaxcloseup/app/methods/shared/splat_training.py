@@ -21,12 +21,8 @@ from jaxcloseup.fields.contract import RadianceField, Rendering
 from jaxcloseup.fields.splats.control import replace_surfels
 from jaxcloseup.fields.splats.filters import sampling_intervals, smoothed
 from jaxcloseup.fields.splats.refinement import join_surfels, replace_least, surfels_where_wrong
-from jaxcloseup.fields.splats.splat_field import (
-    SurfelBuffers,
-    camera_extent,
-    surfel_field,
-    surfel_optimizer,
-)
+from jaxcloseup.fields.splats.splat_field import SurfelBuffers, camera_extent, surfel_field
+from jaxcloseup.fields.splats.splat_optimizer import surfel_optimizer
 from jaxcloseup.fields.splats.surfels import Surfels, pad_rows
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.labels.rules import label_depth
@@ -123,7 +119,7 @@ def refine(
     new = _search_each(search, views, "photographs searched")
     # The filter of finer photographs is smaller, so what the coarse one made stays as it is.
     old = smoothed(surfels, buffers.interval), buffers.alive
-    surfels, alive = join_surfels(old, new, config.capacity)
+    surfels, alive = _join(old, new, capacity=config.capacity)
     return surfels, buffers.replace(alive=alive, interval=_intervals(config, surfels, scene))
 
 
@@ -159,7 +155,7 @@ def add_for_targets(
 
     new, found = _search_each(search, count, "views searched for more")
     old = state.params, state.buffers.alive
-    surfels, alive, changed = replace_least(*old, _in_kind(new, state.params), found)
+    surfels, alive, changed = _replace_least(*old, _in_kind(new, state.params), found)
     state = replace_surfels(state, surfels, alive, changed)
     interval = _intervals(config, surfels, scene)
     return state.replace(buffers=state.buffers.replace(interval=interval))
@@ -187,6 +183,8 @@ def _sampler(config: SplatTrainingConfig, count: int) -> Callable[..., Any]:
 
 
 _sample = jax.jit(surfels_where_wrong, static_argnames=("count", "sh_degree", "num_scales"))
+_join = jax.jit(join_surfels, static_argnames="capacity")
+_replace_least = jax.jit(replace_least)
 
 
 @functools.partial(jax.jit, static_argnames="rows")
