@@ -10,8 +10,8 @@ from absl.testing import flagsaver
 
 from jaxcloseup.app.cli import process as program
 from jaxcloseup.captures.load import load_scene
+from jaxcloseup.drawn_scenes import assembly, planning
 from jaxcloseup.drawn_scenes import drawn as loading
-from jaxcloseup.drawn_scenes import modeling, planning
 from jaxcloseup.drawn_scenes.builtin import SCENES
 from jaxcloseup.photos.views import camera_at
 
@@ -23,7 +23,7 @@ FOCAL_IN_EXIF = 31  # in mm of a frame 36 mm x 24 mm
 
 def photograph(name, poses):
     """Photographs `[V, H, W, 3]` of a built-in scene in flat light, which need no baking."""
-    world = modeling.build_world(SCENES[name](), lambda *scene: np.ones((len(scene[3]), 4)))
+    world = assembly.build_world(SCENES[name](), lambda *scene: np.ones((len(scene[3]), 4)))
     cameras = loading._cameras(poses, WIDTH, HEIGHT)
     with jax.numpy_dtype_promotion("standard"):
         rgb = [

@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcloseup.drawn_scenes import shading
+from jaxcloseup.drawn_scenes.assembly import build_world
 from jaxcloseup.drawn_scenes.builtin import SCENES
 from jaxcloseup.drawn_scenes.lighting import bake_light
-from jaxcloseup.drawn_scenes.modeling import build_world
 from jaxcloseup.drawn_scenes.planning import (
     FOCAL,
     HEIGHT,
@@ -28,7 +28,8 @@ from jaxcloseup.drawn_scenes.planning import (
     plan_closeups,
     plan_far,
 )
-from jaxcloseup.drawn_scenes.raycast import cast_rays, map_in_threads
+from jaxcloseup.drawn_scenes.raycast import cast_rays
+from jaxcloseup.drawn_scenes.threads import map_in_threads
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.io.cache import Stored, cache_path, cached, hash_files
 from jaxcloseup.photos.scene import Scene, Surface
@@ -38,10 +39,7 @@ from jaxcloseup.photos.views import Views, camera_at
 DRAWN_SCENES: tuple[str, ...] = tuple(SCENES)
 NUM_TRAIN, NUM_TEST, NUM_FAR = 60, 12, 8
 _SAMPLES = 8  # rays per pixel
-_SOURCES = (
-    *("raycast.py", "shading.py", "lighting.py", "modeling.py", "planning.py", "drawn.py"),
-    *("builtin/*.py", "textures/*.py"),
-)
+_SOURCES = ("*.py", "builtin/*.py", "textures/*.py")  # any change may change the pixels
 
 
 def draw_scene(name: str, *, downscale: int = 1) -> Scene:

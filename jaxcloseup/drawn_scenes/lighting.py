@@ -9,8 +9,9 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jaxcloseup.drawn_scenes.raycast import Hit, Solids, cast_rays, map_in_threads
+from jaxcloseup.drawn_scenes.raycast import Hit, Solids, cast_rays
 from jaxcloseup.drawn_scenes.shading import GAMMA, Faces, World, mean_colors, sample_light
+from jaxcloseup.drawn_scenes.threads import map_in_threads
 
 
 _BLOCK, _SAMPLES = 256, 16

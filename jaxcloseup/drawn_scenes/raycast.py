@@ -10,9 +10,8 @@ A point on a solid has a *face* (an integer, numbered through all solids) and a 
 `cast_ray` casts one ray and is batched with `jax.vmap`; `cast_rays` serves host code.
 """
 
-import concurrent.futures
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import chex
 import jax
@@ -173,13 +172,6 @@ def cast_rays(
     return jax.tree.map(
         lambda *leaf: np.concatenate(leaf)[:count].reshape(shape + leaf[0].shape[1:]), *parts
     )
-
-
-def map_in_threads(fn: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
-    """Map `fn` over items, two at a time, because XLA runs such small loops on one core."""
-    first = fn(items[0])  # alone, so that threads do not compile the same code twice
-    with concurrent.futures.ThreadPoolExecutor(2) as pool:
-        return [first, *pool.map(fn, items[1:])]
 
 
 @jax.jit

@@ -9,8 +9,8 @@ import pytest
 import reference
 
 from jaxcloseup.captures.load import load_scene
+from jaxcloseup.drawn_scenes import assembly, planning
 from jaxcloseup.drawn_scenes import drawn as loading
-from jaxcloseup.drawn_scenes import modeling, planning
 from jaxcloseup.drawn_scenes.builtin import SCENES
 from jaxcloseup.drawn_scenes.raycast import cast_rays
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points, points_to_pixels
@@ -46,9 +46,9 @@ def truth(scene):
 @pytest.mark.parametrize("name", loading.DRAWN_SCENES)
 def test_cameras(name, monkeypatch):
     """Cameras stand in free space; close-ups are near, rotated and seen by training views."""
-    monkeypatch.setattr(modeling, "draw_texture", lambda name: np.zeros((1024, 1024, 3)))
+    monkeypatch.setattr(assembly, "draw_texture", lambda name: np.zeros((1024, 1024, 3)))
     model = SCENES[name]()
-    world = modeling.build_world(model, lambda *scene: np.ones((8, 4)))
+    world = assembly.build_world(model, lambda *scene: np.ones((8, 4)))
     rng = np.random.default_rng(7)
     train = planning.plan_far(world.solids, model.rig, rng, 24)
     close = planning.plan_closeups(world.solids, model.rig, train, rng, 5)

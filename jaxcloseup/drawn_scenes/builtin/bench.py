@@ -111,9 +111,9 @@ def _bench() -> list[Solid]:
         solids.append(box(center, (1.62, 0.068, 0.03), OAK, texel=0.025))
     lean = turn(x=-17)
     for along in 0.10 + 0.098 * np.arange(5):
-        center = np.array([0.0, 0.195 + 0.308 * along, 0.40 + 0.95 * along])
-        solids.append(box(center, (1.62, 0.028, 0.075), OAK, rotation=lean, texel=0.025))
-    plaque = center + lean @ [0, -0.016, 0]
+        slat = np.array([0.0, 0.195 + 0.308 * along, 0.40 + 0.95 * along])
+        solids.append(box(slat, (1.62, 0.028, 0.075), OAK, rotation=lean, texel=0.025))
+    plaque = slat + lean @ [0, -0.016, 0]
     solids.append(box(plaque, (0.15, 0.004, 0.066), BRASS, rotation=lean, faces={2: PLAQUE}))
     return solids
 

@@ -1,5 +1,7 @@
 """Finishes and small objects that several scenes share."""
 
+from typing import Any
+
 import numpy as np
 
 from jaxcloseup.drawn_scenes.modeling import (
@@ -37,17 +39,17 @@ COVERS = ((0.25, 0.32, 0.5), (0.6, 0.22, 0.18), (0.3, 0.42, 0.3))
 PAGES = (0.95, 0.92, 0.84)
 
 
-def tinted(finish: Finish, *tint: float) -> Finish:
+def tinted(finish: Finish, red: float, green: float, blue: float) -> Finish:
     """The same finish with another tint."""
-    return finish._replace(tint=tint)
+    return finish._replace(tint=(red, green, blue))
 
 
-def peel(*tint: float) -> Finish:
+def peel(red: float, green: float, blue: float) -> Finish:
     """The skin of a fruit."""
-    return Finish("peel", 0.12, "paper", 0.08, tint=tint, gloss=0.15)
+    return Finish("peel", 0.12, "paper", 0.08, tint=(red, green, blue), gloss=0.15)
 
 
-def print_of(name: str, part: tuple[int, int, int, int] = (0, 0, 1, 1), **options) -> Finish:
+def print_of(name: str, part: tuple[int, int, int, int] = (0, 0, 1, 1), **options: Any) -> Finish:
     """A printed sheet; `part` = (column, row, columns, rows) selects one cell of its grid."""
     column, row, columns, rows = part
     region = column / columns, row / rows, (column + 1) / columns, (row + 1) / rows
@@ -84,7 +86,7 @@ def framed(
     center: tuple, size: tuple, name: str, *, facing: str = "-y", frame: Finish = WALNUT
 ) -> list[Solid]:
     """A print in a frame of four bars, hung on the wall at `center`."""
-    out = {"-y": (0, -1, 0), "-x": (-1, 0, 0)}[facing] * np.ones(3)
+    out = np.array({"-y": (0.0, -1.0, 0.0), "-x": (-1.0, 0.0, 0.0)}[facing])
     across, up = np.array([abs(out[1]), abs(out[0]), 0]), np.array([0, 0, 1])
     width, height = size
     middle, bar, bulk = center + 0.013 * out, 0.025, 0.026 * np.abs(out)

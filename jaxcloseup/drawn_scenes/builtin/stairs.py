@@ -57,8 +57,8 @@ def stairs() -> Model:
         at = (0.46, 2 * RUN + 0.12, 3 * RISE + 0.018 + 0.034 * i)
         solids += book(at, size, i, angle)
     for i, name in enumerate(("dusk", "map", "grey", "day")):
-        size = (0.6, 0.45) if name == "map" else (0.44, 0.55)
-        solids += framed((0.62, -0.45 + 0.75 * i, 1.45 + 0.42 * i), size, name, facing="-x")
+        frame = (0.6, 0.45) if name == "map" else (0.44, 0.55)
+        solids += framed((0.62, -0.45 + 0.75 * i, 1.45 + 0.42 * i), frame, name, facing="-x")
     lamps = [
         Lamp((-1.3, -1.6, 3.0), 0.22, (3.6, 3.3, 2.9)),
         Lamp((-1.6, 1.2, 3.1), 0.4, (1.0, 1.1, 1.25)),

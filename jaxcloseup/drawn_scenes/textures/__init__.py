@@ -1,11 +1,12 @@
-"""Procedural textures by name, drawn with NumPy and OpenCV."""
+"""Draw textures by name with NumPy and OpenCV."""
 
 import zlib
 
 import cv2
 import numpy as np
 
-from jaxcloseup.drawn_scenes.textures.materials import COLORS, DETAILS
+from jaxcloseup.drawn_scenes.textures.details import DETAILS
+from jaxcloseup.drawn_scenes.textures.materials import COLORS
 from jaxcloseup.drawn_scenes.textures.patterns import SIZE
 from jaxcloseup.drawn_scenes.textures.prints import PRINTS
 

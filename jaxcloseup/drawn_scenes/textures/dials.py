@@ -11,6 +11,7 @@ from jaxcloseup.drawn_scenes.textures.lettering import (
     INK,
     WHITE,
     blank,
+    center,
     write,
 )
 
@@ -92,8 +93,8 @@ def clock(rng: np.random.Generator) -> np.ndarray:
                 weight=5,
                 centered=True,
             )
-    write(sheet, "WREN & SONS", (512, 690), 24, INK, weight=2, centered=True)
-    write(sheet, "eight day movement", (512, 728), 12, INK, centered=True)
+    center(sheet, "WREN & SONS", 690, 24, INK, weight=2)
+    center(sheet, "eight day movement", 728, 12, INK)
     for angle, length, width in ((5.3, 240, 20), (0.9, 360, 12)):
         tip = 512 + length * np.array([np.sin(angle), -np.cos(angle)])
         cv2.line(sheet, (512, 512), tip.astype(int).tolist(), INK, width, cv2.LINE_AA)

@@ -1,5 +1,7 @@
 """Draw letters, running text, bars and landscapes on uint8 images with OpenCV."""
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
@@ -30,8 +32,12 @@ DUSK, DAY, GRAY = (
 )  # fmt: skip
 
 
+Color = tuple[int, int, int]
+Box = tuple[float, float, float, float]  # left, top, right, bottom in pixels
+
+
 def write(
-    image: np.ndarray, text: str, at: tuple, height: float, color: tuple = INK, *,
+    image: np.ndarray, text: str, at: Sequence[float], height: float, color: Color = INK, *,
     font: int = SERIF, weight: int = 1, centered: bool = False,
 ) -> None:  # fmt: skip
     """Write `text` with its baseline at `at`, capitals `height` pixels tall, into a uint8 image."""
@@ -40,10 +46,18 @@ def write(
     cv2.putText(image, text, (int(x), int(at[1])), font, scale, color, weight, cv2.LINE_AA)
 
 
+def center(
+    image: np.ndarray, text: str, y: float, height: float, color: Color = INK, *,
+    font: int = SERIF, weight: int = 1,
+) -> None:  # fmt: skip
+    """Write `text` in the middle of a sheet 1024 pixels wide, with its baseline at `y`."""
+    write(image, text, (512, y), height, color, font=font, weight=weight, centered=True)
+
+
 def paragraph(
-    image: np.ndarray, box: tuple, height: float, rng: np.random.Generator, color: tuple = INK
+    image: np.ndarray, box: Box, height: float, rng: np.random.Generator, color: Color = INK
 ) -> None:
-    """Fill `box` = (left, top, right, bottom) with running text."""
+    """Fill a box with running text."""
     left, top, right, bottom = box
     scale = height / cv2.getTextSize("H", SERIF, 1, 1)[0][1]
     words = TEXT.split()
@@ -58,18 +72,21 @@ def paragraph(
         write(image, line, (left, y), height, color)
 
 
-def blank(color: tuple, aspect: float = 1.0) -> np.ndarray:
+def blank(color: Color, aspect: float = 1.0) -> np.ndarray:
     """An empty sheet 1024 pixels wide and `aspect` times as tall."""
     return np.full((round(1024 * aspect), 1024, 3), color, np.uint8)
 
 
-def bar(image: np.ndarray, box: tuple, color: tuple) -> None:
-    """Fill `box` = (left, top, right, bottom) with a color."""
-    cv2.rectangle(image, tuple(map(int, box[:2])), tuple(map(int, box[2:])), color, -1)
+def bar(image: np.ndarray, box: Box, color: Color) -> None:
+    """Fill a box with a color."""
+    left, top, right, bottom = map(int, box)
+    cv2.rectangle(image, (left, top), (right, bottom), color, -1)
 
 
-def landscape(image: np.ndarray, box: tuple, tones: tuple, rng: np.random.Generator) -> None:
-    """Draw hills under a sun into `box`, from the farthest layer to the nearest."""
+def landscape(
+    image: np.ndarray, box: Box, tones: Sequence[Color], rng: np.random.Generator
+) -> None:
+    """Draw hills under a sun into a box, from the farthest layer to the nearest."""
     left, top, right, bottom = map(int, box)
     view = image[top:bottom, left:right]
     height, width = view.shape[:2]

@@ -14,6 +14,7 @@ from jaxcloseup.drawn_scenes.textures.patterns import (
     grid,
     noise,
     ramp,
+    rgb,
     scatter,
     step,
 )
@@ -66,9 +67,7 @@ def _brick(rng: np.random.Generator) -> np.ndarray:
     # Painted relief: the upper edges of bricks are lit and the lower ones shaded.
     height = step(distance, 0.003, 0.0075)[..., 0]
     relief = (np.roll(height, -2, 0) - np.roll(height, 2, 0))[..., None]
-    mortar = (
-        np.float32([0.70, 0.66, 0.60]) * (1 + 0.11 * noise(rng, octave=90, slope=0.6))[..., None]
-    )
+    mortar = rgb(0.70, 0.66, 0.60) * (1 + 0.11 * noise(rng, octave=90, slope=0.6))[..., None]
     blend = step(distance, 0.003, 0.006)
     return (mortar * (1 - blend) + face * blend) * (1 + 0.25 * relief)
 
@@ -76,7 +75,7 @@ def _brick(rng: np.random.Generator) -> np.ndarray:
 def _tiles(rng: np.random.Generator) -> np.ndarray:
     """Glazed 4 x 4 wall tiles; every second one has a painted flower."""
     u, v, column, row = grid(4, 4)
-    base = np.float32([0.88, 0.90, 0.88]) * rng.uniform(0.95, 1.03, (4, 4, 1))[row, column]
+    base = rgb(0.88, 0.90, 0.88) * rng.uniform(0.95, 1.03, (4, 4, 1))[row, column]
     base = base * (1 + 0.012 * noise(rng, octave=10))[..., None]
     x, y = 2 * u - 1, 2 * v - 1
     radius, angle = np.hypot(x, y), np.arctan2(y, x)
@@ -88,23 +87,23 @@ def _tiles(rng: np.random.Generator) -> np.ndarray:
     corner = 1 - step(np.hypot(1 - abs(x), 1 - abs(y)) + ink, 0.24, 0.28)
     rim = 1 - step(np.abs(np.maximum(abs(x), abs(y)) - 0.86) + 0.3 * ink, 0.008, 0.02)
     painted = ((column + row) % 2 == 0)[..., None]
-    blue = np.float32([0.16, 0.30, 0.58])
+    blue = rgb(0.16, 0.30, 0.58)
     base = base + painted * flower * (0.45 + 0.45 * veins) * (blue - base)
-    base = base + painted * core * (np.float32([0.86, 0.62, 0.18]) - base)
+    base = base + painted * core * (rgb(0.86, 0.62, 0.18) - base)
     base = base + painted * corner * 0.8 * (blue - base)
     base = base + painted * rim * 0.7 * (blue - base)
     grout = 1 - step(edge_distance(u, v, 4, 4), 0.0018, 0.0034)
-    return base + grout * (np.float32([0.62, 0.60, 0.56]) - base)
+    return base + grout * (rgb(0.62, 0.60, 0.56) - base)
 
 
 def _floor_tiles(rng: np.random.Generator) -> np.ndarray:
     u, v, column, row = grid(4, 4)
     dark = ((column + row) % 2)[..., None]
     vein = 1 - step(np.abs(noise(rng, octave=5, slope=1.8)), 0.0, 0.10)
-    base = dark * np.float32([0.30, 0.33, 0.36]) + (1 - dark) * np.float32([0.80, 0.77, 0.71])
+    base = dark * rgb(0.30, 0.33, 0.36) + (1 - dark) * rgb(0.80, 0.77, 0.71)
     base = base * (1 + 0.05 * noise(rng, octave=20))[..., None] + 0.10 * vein * (2 * dark - 1)
     grout = 1 - step(edge_distance(u, v, 4, 4), 0.0018, 0.003)
-    return base + grout * (np.float32([0.48, 0.45, 0.42]) - base)
+    return base + grout * (rgb(0.48, 0.45, 0.42) - base)
 
 
 def _granite(rng: np.random.Generator) -> np.ndarray:
@@ -115,13 +114,13 @@ def _granite(rng: np.random.Generator) -> np.ndarray:
         ((0.80, 0.77, 0.74), 120, 1.5),
     ):
         grain = step(noise(rng, octave=octave, slope=2.5), low, low + 0.25)
-        base = base + grain * (np.float32(color) - base)
+        base = base + grain * (rgb(*color) - base)
     return base
 
 
 def _plaster(rng: np.random.Generator) -> np.ndarray:
     value = 1 + 0.022 * noise(rng, octave=120, slope=1) + 0.02 * noise(rng, octave=3)
-    return np.float32([0.84, 0.81, 0.75]) * value[..., None]
+    return rgb(0.84, 0.81, 0.75) * value[..., None]
 
 
 def _white(rng: np.random.Generator) -> np.ndarray:
@@ -130,13 +129,13 @@ def _white(rng: np.random.Generator) -> np.ndarray:
 
 def _steel(rng: np.random.Generator) -> np.ndarray:
     brush = noise(rng, octave=200, stretch=120, slope=1)
-    return np.float32([0.62, 0.63, 0.65]) * (1 + 0.045 * brush)[..., None]
+    return rgb(0.62, 0.63, 0.65) * (1 + 0.045 * brush)[..., None]
 
 
 def _iron(rng: np.random.Generator) -> np.ndarray:
     rust = step(noise(rng, octave=14), 1.0, 1.8)
-    base = np.float32([0.13, 0.15, 0.15]) * (1 + 0.14 * noise(rng, octave=80, slope=1))[..., None]
-    return base + 0.5 * rust * (np.float32([0.40, 0.22, 0.12]) - base)
+    base = rgb(0.13, 0.15, 0.15) * (1 + 0.14 * noise(rng, octave=80, slope=1))[..., None]
+    return base + 0.5 * rust * (rgb(0.40, 0.22, 0.12) - base)
 
 
 def _carpet(rng: np.random.Generator) -> np.ndarray:
@@ -145,9 +144,8 @@ def _carpet(rng: np.random.Generator) -> np.ndarray:
     a, b = abs(2 * x - 1) + 0 * y, abs(2 * y - 1) + 0 * x
     wobble = 0.004 * noise(rng, octave=90)
     edge = np.maximum(a, b) + wobble
-    red, navy, cream, gold = np.float32(
-        [(0.55, 0.14, 0.13), (0.13, 0.16, 0.32), (0.86, 0.79, 0.64), (0.76, 0.55, 0.22)]
-    )
+    red, navy = rgb(0.55, 0.14, 0.13), rgb(0.13, 0.16, 0.32)
+    cream, gold = rgb(0.86, 0.79, 0.64), rgb(0.76, 0.55, 0.22)
     small = np.abs((24 * x) % 2 - 1) + np.abs((24 * y) % 2 - 1) + 3 * wobble
     field = red + (1 - step(np.abs(small - 0.55), 0.10, 0.2)) * (gold - red)
     big = np.abs((4 * x) % 2 - 1) + np.abs((4 * y) % 2 - 1) + wobble
@@ -168,7 +166,7 @@ def _fabric(rng: np.random.Generator) -> np.ndarray:
     stripe = np.isin(column % 8, (1, 2)) * 0.5 + np.isin(row % 8, (1, 2)) * 0.5
     thin = ((column == 5) * 0.35 + (row == 5) * 0.35) * 1.0
     base = ramp(stripe, (0.90, 0.87, 0.80), (0.62, 0.68, 0.74), (0.28, 0.40, 0.55))
-    base = base + thin[..., None] * (np.float32([0.70, 0.25, 0.20]) - base)
+    base = base + thin[..., None] * (rgb(0.70, 0.25, 0.20) - base)
     return base * (1 + 0.03 * noise(rng, octave=40))[..., None]
 
 
@@ -189,10 +187,10 @@ def _wallpaper(rng: np.random.Generator) -> np.ndarray:
     shape = 1 - step(radius - leaf + ink, -0.02, 0.02)
     veins = step(np.abs(np.sin(9 * angle + 6 * radius)), 0.1, 0.35)
     stripe = step(np.sin(2 * np.pi * 20 * x) + 0 * y, -0.15, 0.15)
-    base = np.float32([0.80, 0.76, 0.62]) * (0.985 + 0.03 * stripe)
-    base = base + shape * (0.4 + 0.5 * veins) * (np.float32([0.46, 0.56, 0.44]) - base)
+    base = rgb(0.80, 0.76, 0.62) * (0.985 + 0.03 * stripe)
+    base = base + shape * (0.4 + 0.5 * veins) * (rgb(0.46, 0.56, 0.44) - base)
     dot = 1 - step(np.hypot(p, 0.75 * (q - 0.85)), 0.05, 0.08)
-    return base + dot * (np.float32([0.72, 0.42, 0.30]) - base)
+    return base + dot * (rgb(0.72, 0.42, 0.30) - base)
 
 
 def _leaves(rng: np.random.Generator) -> np.ndarray:
@@ -204,8 +202,8 @@ def _leaves(rng: np.random.Generator) -> np.ndarray:
         width = 0.42 * length * np.sin(np.pi * s**0.8) * rng.uniform(0.7, 1.1)
         side = [at + np.outer(s * length, along) + np.outer(k * width, across) for k in (0.5, -0.5)]
         shape = np.round(16 * np.concatenate([side[0], side[1][::-1]])).astype(np.int32)
-        tone = np.float32([0.22, 0.42, 0.14]) * rng.uniform(0.45, 1.45)
-        tone = tone + np.float32([rng.uniform(0, 0.12), rng.uniform(0, 0.06), 0])
+        tone = rgb(0.22, 0.42, 0.14) * rng.uniform(0.45, 1.45)
+        tone = tone + rgb(rng.uniform(0, 0.12), rng.uniform(0, 0.06), 0)
         cv2.fillPoly(image, [shape], tone.tolist(), cv2.LINE_AA, 4)
         ends = np.round(16 * np.stack([at, at + length * along])).astype(np.int32)
         cv2.line(image, ends[0], ends[1], (tone * 1.4).tolist(), 1, cv2.LINE_AA, 4)
@@ -222,7 +220,7 @@ def _gravel(rng: np.random.Generator) -> np.ndarray:
         shape = np.stack(
             [x * np.cos(turn) - y * np.sin(turn), x * np.sin(turn) + y * np.cos(turn)], 1
         )
-        tone = np.float32([0.56, 0.51, 0.45]) * rng.uniform(0.55, 1.35)
+        tone = rgb(0.56, 0.51, 0.45) * rng.uniform(0.55, 1.35)
         for scale, shift, factor in ((1.12, 1.5, 0.45), (1.0, 0.0, 1.0), (0.55, -1.5, 1.12)):
             polygon = np.round(16 * (at + shift + scale * shape)).astype(np.int32)
             cv2.fillPoly(image, [polygon], (tone * factor).tolist(), cv2.LINE_AA, 4)
@@ -235,7 +233,7 @@ def _grass(rng: np.random.Generator) -> np.ndarray:
     def blade(image: np.ndarray, rng: np.random.Generator, at: np.ndarray) -> None:
         length, lean = rng.uniform(18, 46), rng.uniform(-0.9, 0.9)
         bend = at + length * np.array([[0, 0], [0.3 * lean, -0.6], [lean, -1]])
-        tone = np.float32([0.30, 0.47, 0.17]) * rng.uniform(0.5, 1.4)
+        tone = rgb(0.30, 0.47, 0.17) * rng.uniform(0.5, 1.4)
         points = np.round(16 * bend).astype(np.int32)
         cv2.polylines(
             image, [points], False, tone.tolist(), int(rng.integers(1, 4)), cv2.LINE_AA, 4
@@ -254,7 +252,7 @@ def _bread(rng: np.random.Generator) -> np.ndarray:
     value = 0.5 + 0.22 * noise(rng, octave=6) + 0.08 * noise(rng, octave=70, slope=1)
     crust = ramp(np.clip(value, 0, 1), (0.50, 0.26, 0.10), (0.74, 0.46, 0.20), (0.86, 0.66, 0.38))
     flour = step(noise(rng, octave=25, slope=1), 1.0, 2.0)
-    return crust + 0.6 * flour * (np.float32([0.93, 0.88, 0.80]) - crust)
+    return crust + 0.6 * flour * (rgb(0.93, 0.88, 0.80) - crust)
 
 
 def _peel(rng: np.random.Generator) -> np.ndarray:
@@ -269,53 +267,7 @@ def _sky(rng: np.random.Generator) -> np.ndarray:
     clouds = step(0.6 * noise(rng, octave=5, slope=1.6, stretch=0.6), 0.2, 1.6)
     base = ramp(y[:, 0], (0.40, 0.60, 0.86), (0.62, 0.77, 0.92), (0.88, 0.91, 0.93))[:, None]
     base = np.broadcast_to(base, (SIZE, SIZE, 3))
-    return base + 0.8 * clouds * (np.float32([0.96, 0.96, 0.97]) - base)
-
-
-# Details: gray deviations.
-
-
-def _plain(rng: np.random.Generator) -> np.ndarray:
-    return np.zeros((SIZE, SIZE), np.float32)
-
-
-def _grain(rng: np.random.Generator) -> np.ndarray:
-    fibres = noise(rng, octave=120, stretch=14, slope=1)
-    pores = step(noise(rng, octave=200, stretch=16, slope=2), 1.5, 2.3)[..., 0]
-    return 0.06 * fibres - 0.24 * pores
-
-
-def _grit(rng: np.random.Generator) -> np.ndarray:
-    pits = step(noise(rng, octave=110, slope=2), 1.5, 2.2)[..., 0]
-    return 0.12 * noise(rng, octave=150, slope=0.8) - 0.28 * pits
-
-
-def _pile(rng: np.random.Generator) -> np.ndarray:
-    """Carpet tufts in rows."""
-    u, v, column, row = grid(56, 56, bond=0.5)
-    tone = rng.uniform(-0.10, 0.10, (56, 56))[row, column]
-    tuft = 0.9 * np.exp(-3.2 * ((u - 0.5) ** 2 + (v - 0.45) ** 2) * 2) - 0.6
-    return 0.4 * tuft + tone + 0.09 * noise(rng, octave=260, slope=0.8)
-
-
-def _weave(rng: np.random.Generator) -> np.ndarray:
-    """Threads that cross over and under each other."""
-    u, v, column, row = grid(64, 64)
-    over = (column + row) % 2 == 0
-    along, across = np.where(over, u, v), np.where(over, v, u)
-    thread = np.sin(np.pi * across) ** 0.7 * (0.65 + 0.35 * np.sin(np.pi * along))
-    tone = np.where(over, rng.normal(0, 0.05, 64)[row], rng.normal(0, 0.05, 64)[column])
-    return 0.42 * thread + tone + 0.05 * noise(rng, octave=300, slope=0.8)
-
-
-def _paper(rng: np.random.Generator) -> np.ndarray:
-    return 0.022 * noise(rng, octave=150, slope=0.6)
-
-
-def _scratches(rng: np.random.Generator) -> np.ndarray:
-    brush = noise(rng, octave=240, stretch=150, slope=0.8)
-    cross = np.rot90(noise(rng, octave=120, stretch=100, slope=2))
-    return 0.03 * brush - 0.12 * step(cross, 2.6, 3.2)[..., 0]
+    return base + 0.8 * clouds * (rgb(0.96, 0.96, 0.97) - base)
 
 
 COLORS = {
@@ -324,8 +276,4 @@ COLORS = {
     "white": _white, "steel": _steel, "iron": _iron, "carpet": _carpet, "fabric": _fabric,
     "upholstery": _upholstery, "wallpaper": _wallpaper, "leaves": _leaves, "gravel": _gravel,
     "grass": _grass, "bark": _bark, "bread": _bread, "peel": _peel, "sky": _sky,
-}  # fmt: skip
-DETAILS = {
-    "plain": _plain, "grain": _grain, "grit": _grit, "pile": _pile, "weave": _weave,
-    "paper": _paper, "scratches": _scratches,
 }  # fmt: skip

@@ -40,6 +40,11 @@ def ramp(value: np.ndarray, *colors: tuple[float, float, float]) -> np.ndarray:
     return np.take(table.astype(np.float32), index, axis=0)
 
 
+def rgb(*values: float) -> np.ndarray:
+    """A color `[3]` in float32."""
+    return np.array(values, np.float32)
+
+
 def axes() -> tuple[np.ndarray, np.ndarray]:
     """Texel centers x `[1, S]` and y `[S, 1]` in [0, 1]."""
     line = (np.arange(SIZE, dtype=np.float32) + 0.5) / SIZE

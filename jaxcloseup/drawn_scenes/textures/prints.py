@@ -25,6 +25,7 @@ from jaxcloseup.drawn_scenes.textures.lettering import (
     WHITE,
     bar,
     blank,
+    center,
     landscape,
     paragraph,
     write,
@@ -33,11 +34,11 @@ from jaxcloseup.drawn_scenes.textures.lettering import (
 
 def _newspaper(rng: np.random.Generator) -> np.ndarray:
     page = blank((231, 226, 212), 1.4)
-    write(page, "The Evening Observer", (512, 105), 62, weight=4, font=BOLD, centered=True)
-    write(page, "No. 4,812    CITY EDITION    PRICE TWO PENCE", (512, 145), 14, centered=True)
+    center(page, "The Evening Observer", 105, 62, weight=4, font=BOLD)
+    center(page, "No. 4,812    CITY EDITION    PRICE TWO PENCE", 145, 14)
     bar(page, (40, 158, 984, 161), INK)
-    write(page, "A CLOSER LOOK", (512, 245), 58, weight=5, font=BOLD, centered=True)
-    write(page, "what the far camera never saw", (512, 290), 22, centered=True)
+    center(page, "A CLOSER LOOK", 245, 58, weight=5, font=BOLD)
+    center(page, "what the far camera never saw", 290, 22)
     landscape(page, (275, 320, 748, 640), GRAY, rng)
     write(page, "The valley at noon, seen from the bridge.", (280, 660), 10)
     for column in range(4):
@@ -53,7 +54,7 @@ def _newspaper(rng: np.random.Generator) -> np.ndarray:
 
 def _recipe(rng: np.random.Generator) -> np.ndarray:
     page = blank(CREAM, 1.35)
-    write(page, "Country Bread", (512, 120), 58, RED, font=SCRIPT, weight=4, centered=True)
+    center(page, "Country Bread", 120, 58, RED, font=SCRIPT, weight=4)
     landscape(page, (90, 170, 934, 520), DAY, rng)
     items = ("500 g flour", "350 ml water", "10 g salt", "7 g yeast", "1 tsp honey", "2 tbsp oil")
     write(page, "You need", (90, 590), 26, GREEN, font=BOLD)
@@ -65,7 +66,7 @@ def _recipe(rng: np.random.Generator) -> np.ndarray:
         write(page, str(i + 1), (430, 640 + 135 * i), 26, RED, font=BOLD, weight=2)
         paragraph(page, (470, 615 + 135 * i, 940, 720 + 135 * i), 12, rng)
     paragraph(page, (90, 940, 400, 1290), 9, rng, (110, 100, 90))
-    write(page, "- 47 -", (512, 1350), 14, centered=True)
+    center(page, "- 47 -", 1350, 14)
     return page
 
 
@@ -81,9 +82,9 @@ def _cereal(rng: np.random.Generator) -> np.ndarray:
         ]
         cv2.fillPoly(box, [np.int32(ray)], (234, 172, 60), cv2.LINE_AA)
     bar(box, (60, 90, 964, 400), (150, 30, 34))
-    write(box, "GOLDEN", (512, 230), 105, WHITE, font=BOLD, weight=12, centered=True)
-    write(box, "OAT HOOPS", (512, 365), 88, (250, 214, 90), font=BOLD, weight=10, centered=True)
-    write(box, "crisp whole grain cereal with honey", (512, 455), 24, INK, weight=2, centered=True)
+    center(box, "GOLDEN", 230, 105, WHITE, font=BOLD, weight=12)
+    center(box, "OAT HOOPS", 365, 88, (250, 214, 90), font=BOLD, weight=10)
+    center(box, "crisp whole grain cereal with honey", 455, 24, INK, weight=2)
     cv2.ellipse(box, (512, 860), (380, 110), 0, 0, 360, (40, 70, 140), -1, cv2.LINE_AA)
     cv2.ellipse(box, (512, 860), (380, 260), 0, 0, 180, (46, 84, 160), -1, cv2.LINE_AA)
     cv2.ellipse(box, (512, 850), (345, 90), 0, 0, 360, (246, 242, 230), -1, cv2.LINE_AA)
@@ -220,7 +221,7 @@ def _map(rng: np.random.Generator) -> np.ndarray:
         cv2.circle(sheet, (at[0] - 12, at[1] - 6), 6, RED, -1, cv2.LINE_AA)
         write(sheet, text, at, 15, RED, font=BOLD)
     bar(sheet, (0, 0, 1024, 76), BLUE)
-    write(sheet, "PLAN OF THE OLD TOWN", (512, 54), 34, CREAM, font=BOLD, weight=3, centered=True)
+    center(sheet, "PLAN OF THE OLD TOWN", 54, 34, CREAM, font=BOLD, weight=3)
     return sheet
 
 
@@ -231,18 +232,9 @@ def _chart(rng: np.random.Generator) -> np.ndarray:
     while height > 5:
         y += 1.9 * height if y else 1.35 * height
         letters = rng.choice(list("CDEFHKNOPRSTVZ"), min(12, int(4 * (150 / height) ** 0.55) - 2))
-        write(
-            sheet,
-            "  ".join(letters),
-            (512, y),
-            height,
-            INK,
-            font=BOLD,
-            weight=max(1, int(height / 9)),
-            centered=True,
-        )
+        center(sheet, "  ".join(letters), y, height, INK, font=BOLD, weight=max(1, int(height / 9)))
         height *= 0.72
-    write(sheet, "READ FROM THREE METRES", (512, 1410), 12, RED, centered=True)
+    center(sheet, "READ FROM THREE METRES", 1410, 12, RED)
     return sheet
 
 
@@ -250,8 +242,8 @@ def _picture(tones: tuple, title: str) -> Callable[[np.random.Generator], np.nda
     def draw(rng: np.random.Generator) -> np.ndarray:
         sheet = blank(WHITE, 1.25)
         landscape(sheet, (90, 90, 934, 1060), tones, rng)
-        write(sheet, title, (512, 1150), 34, INK, font=SCRIPT, weight=2, centered=True)
-        write(sheet, "lithograph, 12 / 80", (512, 1200), 13, (110, 106, 100), centered=True)
+        center(sheet, title, 1150, 34, INK, font=SCRIPT, weight=2)
+        center(sheet, "lithograph, 12 / 80", 1200, 13, (110, 106, 100))
         return sheet
 
     return draw
@@ -260,18 +252,11 @@ def _picture(tones: tuple, title: str) -> Callable[[np.random.Generator], np.nda
 def _plaque(rng: np.random.Generator) -> np.ndarray:
     sheet = blank((186, 150, 78), 0.45)
     cv2.rectangle(sheet, (18, 18), (1005, 442), (92, 68, 30), 5, cv2.LINE_AA)
-    write(sheet, "IN MEMORY OF", (512, 98), 26, (60, 42, 18), weight=2, centered=True)
-    write(sheet, "EDITH MARLOW", (512, 190), 58, (60, 42, 18), font=BOLD, weight=4, centered=True)
-    write(sheet, "1921 - 2009", (512, 252), 28, (60, 42, 18), weight=2, centered=True)
-    write(sheet, "who loved this garden and sat here", (512, 330), 22, (60, 42, 18), centered=True)
-    write(
-        sheet,
-        "most afternoons, reading the small print",
-        (512, 382),
-        22,
-        (60, 42, 18),
-        centered=True,
-    )
+    center(sheet, "IN MEMORY OF", 98, 26, (60, 42, 18), weight=2)
+    center(sheet, "EDITH MARLOW", 190, 58, (60, 42, 18), font=BOLD, weight=4)
+    center(sheet, "1921 - 2009", 252, 28, (60, 42, 18), weight=2)
+    center(sheet, "who loved this garden and sat here", 330, 22, (60, 42, 18))
+    center(sheet, "most afternoons, reading the small print", 382, 22, (60, 42, 18))
     for at in ((44, 44), (980, 44), (44, 418), (980, 418)):
         cv2.circle(sheet, at, 11, (120, 92, 42), -1, cv2.LINE_AA)
         cv2.line(
@@ -283,10 +268,8 @@ def _plaque(rng: np.random.Generator) -> np.ndarray:
 def _doormat(rng: np.random.Generator) -> np.ndarray:
     sheet = blank((150, 112, 68), 0.6)
     cv2.rectangle(sheet, (40, 40), (984, 574), (50, 36, 24), 14, cv2.LINE_AA)
-    write(sheet, "WELCOME", (512, 350), 120, (50, 36, 24), font=BOLD, weight=22, centered=True)
-    write(
-        sheet, "mind the step", (512, 470), 44, (50, 36, 24), font=SCRIPT, weight=6, centered=True
-    )
+    center(sheet, "WELCOME", 350, 120, (50, 36, 24), font=BOLD, weight=22)
+    center(sheet, "mind the step", 470, 44, (50, 36, 24), font=SCRIPT, weight=6)
     return sheet
 
 
@@ -294,7 +277,7 @@ def _menu(rng: np.random.Generator) -> np.ndarray:
     sheet = blank(CREAM, 1.4)
     cv2.rectangle(sheet, (40, 40), (984, 1394), GOLD, 6, cv2.LINE_AA)
     cv2.rectangle(sheet, (58, 58), (966, 1376), GOLD, 2, cv2.LINE_AA)
-    write(sheet, "Menu", (512, 210), 90, BLUE, font=SCRIPT, weight=6, centered=True)
+    center(sheet, "Menu", 210, 90, BLUE, font=SCRIPT, weight=6)
     courses = (
         ("TO START", "Leek and potato soup", "Rye bread, salted butter"),
         ("FROM THE OVEN", "Roast chicken with thyme", "Carrots, new potatoes"),
@@ -302,17 +285,10 @@ def _menu(rng: np.random.Generator) -> np.ndarray:
     )
     for i, (course, *dishes) in enumerate(courses):
         y = 360 + 310 * i
-        write(sheet, course, (512, y), 28, RED, font=BOLD, weight=2, centered=True)
+        center(sheet, course, y, 28, RED, font=BOLD, weight=2)
         for k, dish in enumerate(dishes):
-            write(sheet, dish, (512, y + 75 + 70 * k), 28, INK, font=SERIF, weight=2, centered=True)
-        write(
-            sheet,
-            "please ask about nuts, milk, wheat and celery",
-            (512, y + 195),
-            13,
-            (110, 104, 96),
-            centered=True,
-        )
+            center(sheet, dish, y + 75 + 70 * k, 28, INK, font=SERIF, weight=2)
+        center(sheet, "please ask about nuts, milk, wheat and celery", y + 195, 13, (110, 104, 96))
     return sheet
 
 
