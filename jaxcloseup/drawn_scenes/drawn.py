@@ -159,7 +159,7 @@ def _capture(name: str, width: int, height: int) -> dict[str, np.ndarray]:
 
     every = np.concatenate([train, test_far, closeups.poses])
     depths = cast_rays(world.solids, *grid_rays(every, 64, 36)).depth
-    capture = {
+    capture: dict[str, Any] = {
         "train_poses": train,
         "test_far_poses": test_far,
         "test_poses": closeups.poses,

@@ -133,9 +133,11 @@ def _smooth(light: np.ndarray, world: World) -> np.ndarray:
     tiles = np.column_stack([world.faces.tile, np.asarray(world.faces.wraps, np.int32)])
     for start, width, height, wraps in np.unique(tiles, axis=0):
         tile = light[start : start + width * height].reshape(height, width, 4)
-        for axis, mode in ((1, "wrap" if wraps else "edge"), (0, "edge")):
+        for axis in (1, 0):
             padding = [(1, 1) if i == axis else (0, 0) for i in range(3)]
-            padded = np.moveaxis(np.pad(tile, padding, mode=mode), axis, 0)
+            around = axis == 1 and wraps
+            padded = np.pad(tile, padding, mode="wrap" if around else "edge")
+            padded = np.moveaxis(padded, axis, 0)
             tile = np.moveaxis((padded[:-2] + 2 * padded[1:-1] + padded[2:]) / 4, 0, axis)
         light[start : start + width * height] = tile.reshape(-1, 4)
     return light

@@ -180,7 +180,7 @@ def rod(
     across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     across /= np.linalg.norm(across)
     rotation = np.stack([across, np.cross(axis, across), axis], axis=1)
-    length = np.linalg.norm(end - start)
+    length = float(np.linalg.norm(end - start))
     return cylinder(start, length, thickness, thickness, finish, rotation=rotation, texel=texel)
 
 

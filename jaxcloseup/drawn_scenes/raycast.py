@@ -24,8 +24,7 @@ PLANE, BOX, SPHERE, CYLINDER = range(4)
 FACES_OF = (1, 6, 1, 3)  # box: -x +x -y +y -z +z; cylinder: side, bottom, top
 
 
-@struct.dataclass
-class Solids:
+class Solids(struct.PyTreeNode):
     """Solids sorted by kind, followed by padding.
 
     Attributes:
@@ -182,8 +181,9 @@ def _cast(solids: Solids, wanted: jax.Array, origins: jax.Array, directions: jax
     )
 
 
-def _apply(affine: jax.Array, x: jax.Array, y: jax.Array, z: jax.Array, w: float) -> list:
+def _apply(affine: jax.Array, vector: tuple[jax.Array, ...], w: float) -> list[jax.Array]:
     """Apply an affine map, written out, since accelerators round small matrix products coarsely."""
+    x, y, z = vector
     return [row[0] * x + row[1] * y + row[2] * z + row[3] * w for row in affine]
 
 
@@ -191,7 +191,7 @@ def _first_crossing(
     crossings: Callable, to_local: jax.Array, taper: jax.Array, ray: tuple, nearest: float
 ) -> jax.Array:
     """Smallest ray parameter above `nearest` at which the ray crosses one solid, or inf."""
-    o, d = _apply(to_local, *ray[:3], 1.0), _apply(to_local, *ray[3:], 0.0)
+    o, d = _apply(to_local, ray[:3], 1.0), _apply(to_local, ray[3:], 0.0)
     # Start at the ray's closest approach to the center: for a distant thin rail, b^2 - 4ac would
     # otherwise lose all precision.
     start = -_dot(o, d) / _dot(d, d)
@@ -258,7 +258,7 @@ def _describe(
     index = jnp.maximum(index, 0)
     point = origin + jnp.where(is_hit, depth, 0) * direction
     to_local, taper, kind = solids.to_local[index], solids.taper[index], solids.kind[index]
-    x, y, z = _apply(to_local, *point, 1.0)
+    x, y, z = _apply(to_local, tuple(point), 1.0)
     local, square, up = jnp.stack([x, y, z]), jnp.stack([x, y]), jnp.array([0.0, 0.0, 1.0])
 
     axis = jnp.argmax(jnp.abs(local)).astype(jnp.int32)
@@ -284,7 +284,7 @@ def _describe(
     chart = jnp.select([is_plane, is_box, is_cap], [square, box_chart, cap_chart], around)
 
     # Normals transform by the transpose of the map to the unit solid.
-    normal = sum(to_local[i, :3] * normal[i] for i in range(3))
+    normal = jnp.asarray(sum(to_local[i, :3] * normal[i] for i in range(3)))
     normal = normal / jnp.sqrt(jnp.sum(normal * normal))
     normal = jnp.where(jnp.sum(normal * direction) > 0, -normal, normal)
     return Hit(

@@ -28,8 +28,7 @@ _SHININESS = 60.0
 _TILE = 24  # side in pixels of image tiles that share a list of solids
 
 
-@struct.dataclass
-class Faces:
+class Faces(struct.PyTreeNode):
     """The appearance of each face.
 
     Attributes:
@@ -57,8 +56,7 @@ class Faces:
     wraps: jax.Array
 
 
-@struct.dataclass
-class World:
+class World(struct.PyTreeNode):
     """A scene ready for rendering.
 
     Attributes:

@@ -161,10 +161,12 @@ def _flowers(x: float, y: float) -> list[Solid]:
 
 
 def _wine(x: float, y: float) -> list[Solid]:
-    round_label = {"rotation": turn(z=-90), "texel": 0.015}
+    front = turn(z=-90)  # the middle of the label
     return [
         cylinder((x, y, RUNNER), 0.2, 0.076, 0.076, BOTTLE, texel=0.015),
-        cylinder((x, y, RUNNER + 0.05), 0.10, 0.0772, 0.0772, label(2), **round_label),
+        cylinder(
+            (x, y, RUNNER + 0.05), 0.10, 0.0772, 0.0772, label(2), rotation=front, texel=0.015
+        ),
         cylinder((x, y, RUNNER + 0.2), 0.05, 0.076, 0.03, BOTTLE),
         cylinder((x, y, RUNNER + 0.25), 0.07, 0.03, 0.028, tinted(BOTTLE, 0.35, 0.06, 0.10)),
     ]

@@ -3,7 +3,7 @@
 Each function draws a uint8 sheet, 1024 pixels wide, with its own aspect ratio.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -23,6 +23,7 @@ from jaxcloseup.drawn_scenes.textures.lettering import (
     SCRIPT,
     SERIF,
     WHITE,
+    Color,
     bar,
     blank,
     center,
@@ -73,14 +74,10 @@ def _recipe(rng: np.random.Generator) -> np.ndarray:
 def _cereal(rng: np.random.Generator) -> np.ndarray:
     box = blank((222, 150, 36), 1.45)
     for i in range(24):
-        ray = [
-            [512, 640],
-            *[
-                [512 + 1500 * np.cos(a), 640 + 1500 * np.sin(a)]
-                for a in (i * np.pi / 12, (i + 0.5) * np.pi / 12)
-            ],
-        ]
-        cv2.fillPoly(box, [np.int32(ray)], (234, 172, 60), cv2.LINE_AA)
+        angles = i * np.pi / 12, (i + 0.5) * np.pi / 12
+        ends = [(512 + 1500 * np.cos(a), 640 + 1500 * np.sin(a)) for a in angles]
+        ray = np.array([(512, 640), *ends]).astype(np.int32)
+        cv2.fillPoly(box, [ray], (234, 172, 60), cv2.LINE_AA)
     bar(box, (60, 90, 964, 400), (150, 30, 34))
     center(box, "GOLDEN", 230, 105, WHITE, font=BOLD, weight=12)
     center(box, "OAT HOOPS", 365, 88, (250, 214, 90), font=BOLD, weight=10)
@@ -205,21 +202,17 @@ def _map(rng: np.random.Generator) -> np.ndarray:
     cv2.polylines(sheet, [river], False, (120, 166, 196), 56, cv2.LINE_AA)
     names = ("Mill Lane", "High Street", "Station Road", "Abbey Walk", "Castle Hill", "Orchard Way")
     for i, name in enumerate(names):
-        a, b = np.int32([0, 140 + 105 * i]), np.int32([1024, 90 + 118 * i])
+        a, b = np.array([0, 140 + 105 * i]), np.array([1024, 90 + 118 * i])
         for width, color in ((17, (150, 130, 110)), (13, WHITE)):
             cv2.line(sheet, a.tolist(), b.tolist(), color, width, cv2.LINE_AA)
             cv2.line(sheet, (160 * i + 90, 80), (150 * i + 130, 768), color, width, cv2.LINE_AA)
         for k in range(3):
-            at = a + (b - a) * (0.12 + 0.33 * k)
-            write(sheet, name, (at[0], at[1] + 4), 9)
-    for text, at in (
-        ("St Anne", (240, 330)),
-        ("Market", (520, 560)),
-        ("Park", (780, 250)),
-        ("Quay", (420, 450)),
-    ):
-        cv2.circle(sheet, (at[0] - 12, at[1] - 6), 6, RED, -1, cv2.LINE_AA)
-        write(sheet, text, at, 15, RED, font=BOLD)
+            along = a + (b - a) * (0.12 + 0.33 * k)
+            write(sheet, name, (along[0], along[1] + 4), 9)
+    places = (("St Anne", 240, 330), ("Market", 520, 560), ("Park", 780, 250), ("Quay", 420, 450))
+    for place, column, row in places:
+        cv2.circle(sheet, (column - 12, row - 6), 6, RED, -1, cv2.LINE_AA)
+        write(sheet, place, (column, row), 15, RED, font=BOLD)
     bar(sheet, (0, 0, 1024, 76), BLUE)
     center(sheet, "PLAN OF THE OLD TOWN", 54, 34, CREAM, font=BOLD, weight=3)
     return sheet
@@ -238,7 +231,7 @@ def _chart(rng: np.random.Generator) -> np.ndarray:
     return sheet
 
 
-def _picture(tones: tuple, title: str) -> Callable[[np.random.Generator], np.ndarray]:
+def _picture(tones: Sequence[Color], title: str) -> Callable[[np.random.Generator], np.ndarray]:
     def draw(rng: np.random.Generator) -> np.ndarray:
         sheet = blank(WHITE, 1.25)
         landscape(sheet, (90, 90, 934, 1060), tones, rng)
