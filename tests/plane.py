@@ -3,11 +3,13 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_rays
+from jaxcloseup.photos.scene import Scene, Surface
 from jaxcloseup.photos.views import Views
 
 
 HEIGHT, WIDTH, FOCAL = 24, 32, 30.0
+STRIPES = 0.3  # their wavelength on the exact surface
 
 
 def camera_above(x, y, height, *, tilt=0.0):
@@ -48,3 +50,24 @@ def make_views(cameras):
     )
     rgb, depths = (jnp.asarray(np.stack([s[i] for s in shots]), jnp.float32) for i in range(2))
     return Views(stacked, rgb, jnp.ones(depths.shape)), depths
+
+
+def surface(camera):
+    """Return the exact surface of the plane with stripes along y instead of the texture."""
+    origins, directions = pixels_to_rays(camera, pixel_grid(camera.height, camera.width))
+    depth = -origins[..., 2] / directions[..., 2]
+    x = origins[..., 0] + depth * directions[..., 0]
+    wave = 0.5 + 0.4 * jnp.sin(2 * jnp.pi * x / STRIPES)
+    rgb = jnp.stack([wave] * 3, axis=-1)
+    return Surface(rgb, depth, jnp.zeros_like(rgb).at[..., 2].set(1))
+
+
+def make_scene(cameras, far=()):
+    """Return a scene of the plane with its exact surface, and exact depths of its photographs."""
+    train, depths = make_views(cameras)
+    test_far = make_views(far)[0] if far else None
+    names = {"train": [str(i) for i in range(len(cameras))]}
+    names |= {"test_far": [f"far{i}" for i in range(len(far))]} if far else {}
+    none = np.zeros((0, 3))
+    scene = Scene("plane", train, None, test_far, none, none, 0.5, 9.0, names, surface=surface)
+    return scene, depths

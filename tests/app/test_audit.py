@@ -10,51 +10,27 @@ from tiny_runs import TINY
 from jaxcloseup.app.score.audit import audit_labels, error_curve, left_out_curve
 from jaxcloseup.app.score.footprints import resolved_by_photographs
 from jaxcloseup.fields.contract import Rendering
-from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_rays
+from jaxcloseup.geometry.cameras import pixel_grid
 from jaxcloseup.labels.config import pseudo_settings
 from jaxcloseup.labels.make import label_sources
-from jaxcloseup.photos.scene import Scene, Surface
-
-
-WAVELENGTH = 0.3
-
-
-def striped(camera):
-    """Return the exact surface of the plane z = 0 with stripes along y."""
-    origins, directions = pixels_to_rays(camera, pixel_grid(camera.height, camera.width))
-    depth = -origins[..., 2] / directions[..., 2]
-    x = origins[..., 0] + depth * directions[..., 0]
-    wave = 0.5 + 0.4 * jnp.sin(2 * jnp.pi * x / WAVELENGTH)
-    rgb = jnp.stack([wave] * 3, axis=-1)
-    return Surface(rgb, depth, jnp.zeros_like(rgb).at[..., 2].set(1))
-
-
-def scene_of(cameras):
-    views, depths = plane.make_views(cameras)
-    names, none = {"train": [str(i) for i in range(len(cameras))]}, np.zeros((0, 3))
-    return Scene("waves", views, None, None, none, none, 0.5, 9.0, names, surface=striped), depths
 
 
 @pytest.mark.parametrize("heights", [(4.0,), (4.0, 2.0), (2.0, 4.0)])
 def test_stripes_have_the_contrast_of_the_nearest_photograph(heights):
-    scene, depths = scene_of([plane.camera_above(0.0, 0.0, height) for height in heights])
+    scene, depths = plane.make_scene([plane.camera_above(0.0, 0.0, height) for height in heights])
     close = plane.camera_above(0.1, 0.0, 1.0)
     resolved, seen = resolved_by_photographs(scene, close, depths)
     assert seen.all()
     # The blur's standard deviation is half a source pixel, less the close-up's own pixel.
     pixel = min(heights) / plane.FOCAL
     variance = pixel**2 / 4 - (1 / plane.FOCAL) ** 2 / 12
-    expected = np.exp(-2 * np.pi**2 * variance / WAVELENGTH**2)
+    expected = np.exp(-2 * np.pi**2 * variance / plane.STRIPES**2)
     inner = resolved[6:-6, 6:-6] - 0.5
     assert np.abs(inner).max() / 0.4 == pytest.approx(expected, rel=0.1)
 
 
 def test_unseen_pixels_are_not_resolved():
-    views, depths = plane.make_views([plane.camera_above(1.0, 0.0, 1.0)])
-    none = np.zeros((0, 3))
-    scene = Scene(
-        "waves", views, None, None, none, none, 0.5, 9.0, {"train": ["0"]}, surface=striped
-    )
+    scene, depths = plane.make_scene([plane.camera_above(1.0, 0.0, 1.0)])
     close = plane.camera_above(0.0, 0.0, 1.0)
     _, seen = resolved_by_photographs(scene, close, depths)
     # The photograph is 1 unit, or 30 pixels, to the right.
@@ -84,9 +60,9 @@ def test_error_curves_of_a_perfect_and_of_a_random_score():
 
 def test_labels_from_exact_depth_are_sorted_and_never_leak():
     cameras = [plane.camera_above(x, 0.1 * x, 4.0, tilt=0.1 * x) for x in (-1.0, 0.0, 1.0)]
-    scene, depths = scene_of(cameras)
+    scene, depths = plane.make_scene(cameras)
     sources = label_sources(scene.train, depths)
-    options = {"render_depth": lambda camera: striped(camera).depth, "count": 3}
+    options = {"render_depth": lambda camera: plane.surface(camera).depth, "count": 3}
     strict = settings().replace(rgb_tolerance=jnp.float32(0.02))
     masked = audit_labels(jax.random.key(0), depths, scene, sources, strict, **options)
     no_mask = strict.replace(use_mask=jnp.float32(0))

@@ -10,34 +10,16 @@ import pytest
 
 from jaxcloseup.app.report.plots import Curve, gains_over, line_plot, zoom_curves
 from jaxcloseup.app.score.ladder import MAGNIFICATIONS, describe_ladder, ladder_targets
-from jaxcloseup.captures.load import Scene
-from jaxcloseup.geometry.cameras import (
-    pixel_grid,
-    pixels_to_points,
-    pixels_to_rays,
-    points_to_pixels,
-)
-from jaxcloseup.photos.scene import Surface
+from jaxcloseup.geometry.cameras import pixels_to_points, points_to_pixels
 from jaxcloseup.photos.views import camera_at
-
-
-def surface(camera):
-    """Return the exact surface of a gray plane z = 0."""
-    origins, directions = pixels_to_rays(camera, pixel_grid(camera.height, camera.width))
-    depth = -origins[..., 2] / directions[..., 2]
-    rgb = jnp.full((*depth.shape, 3), 0.5)
-    return Surface(rgb, depth, jnp.zeros_like(rgb))
 
 
 @pytest.fixture(scope="module")
 def ladder():
     cameras = [plane.camera_above(x, 0.1 * x, 4.0, tilt=0.1 * x) for x in (-1.0, 0.0, 1.0)]
-    views, _ = plane.make_views(cameras)
-    far, _ = plane.make_views([plane.camera_above(0.3, 0.0, 4.0), plane.camera_above(0, 0.2, 3.5)])
-    names = {"train": list("abc"), "test_far": ["x", "y"]}
-    none = np.zeros((0, 3))
-    scene = Scene("plane", views, None, far, none, none, 1.0, 9.0, names, surface=surface)
-    exact = jnp.stack([surface(camera).depth for camera in cameras])
+    far = [plane.camera_above(0.3, 0.0, 4.0), plane.camera_above(0, 0.2, 3.5)]
+    scene, _ = plane.make_scene(cameras, far)
+    exact = jnp.stack([plane.surface(camera).depth for camera in cameras])
     return scene, ladder_targets(scene, exact)
 
 
@@ -77,7 +59,7 @@ def test_targets_hold_the_exact_surface(ladder):
     for rung in targets.values():
         for target in rung:
             np.testing.assert_allclose(
-                target.surface.depth, surface(target.camera).depth, rtol=1e-5
+                target.surface.depth, plane.surface(target.camera).depth, rtol=1e-5
             )
             assert target.seen.max() == 3
 

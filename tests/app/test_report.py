@@ -12,7 +12,7 @@ from pages import Page
 from jaxcloseup.app.report.headline import conclusion, print_results, run_tables
 from jaxcloseup.app.report.page import Picture
 from jaxcloseup.app.report.pictures import comparisons, enlarge
-from jaxcloseup.app.report.run_page import write_report
+from jaxcloseup.app.report.run_report import write_report
 from jaxcloseup.app.report.showcase import Exhibit, best_middle_worst, cut_out, find_place
 from jaxcloseup.app.score.targets import Target
 from jaxcloseup.artifacts.images import side_by_side

@@ -1,8 +1,7 @@
 """Draw the pictures of a run: its stages beside the true images, and its pseudo-labels."""
 
 import pathlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
 
 import jax
 import numpy as np
@@ -13,7 +12,13 @@ from jaxcloseup.app.score.targets import Target
 from jaxcloseup.artifacts.images import colorize_depth, colorize_error, side_by_side, write_png
 from jaxcloseup.captures.load import Scene
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
-from jaxcloseup.labels.make import LabelSources, PseudoSettings, label_pixels, sample_virtual_camera
+from jaxcloseup.labels.make import (
+    LabelSources,
+    PseudoLabel,
+    PseudoSettings,
+    label_pixels,
+    sample_virtual_camera,
+)
 from jaxcloseup.labels.target_views import best_source
 
 
@@ -30,7 +35,7 @@ def comparisons(
     """Write `<name>.png`: the true image, every stage, and the error of the last stage.
 
     A name that an earlier split has used gets its split as a prefix. A split that no stage rendered
-    has no pictures, for example if every arm of a sweep failed.
+    has no pictures, for example if all arms of a sweep failed.
 
     Args:
       folder: folder to write to.
@@ -101,77 +106,47 @@ def label_pictures(
     Returns:
       The pictures, for the report.
     """
-    shots = [
-        *_virtual_shots(key, scene, sources, settings, render_depth),
-        *_closeup_shots(targets[:SHOWN_LABELS], sources, render_depth),
-    ]
-    pictures = []
-    for shot in shots:
-        pixels = pixel_grid(shot.camera.height, shot.camera.width)
-        label = label_pixels(shot.camera, pixels, shot.depth, shot.source, sources, settings)
-        panels = {
-            "backward warp": label.backward,
-            "forward warp": label.forward,
-            "kept": np.where(label.weight[..., None] > 0, label.rgb, 0),
-            "mask": np.repeat(np.asarray(label.weight)[..., None], 3, axis=-1),
-            "rendered depth": colorize_depth(shot.depth, near=scene.near, far=scene.far),
-        }
-        if shot.truth is not None:
-            panels["truth"] = np.asarray(shot.truth)
-        width, height = shot.size
+    sample, nearest = jax.jit(sample_virtual_camera), jax.jit(best_source)
+    sizes, pictures = scene.sizes("train"), []
+
+    def draw(
+        name: str,
+        camera: Camera,
+        depth: jax.Array,
+        source: jax.Array,
+        truth: jax.Array | None,
+        size: Sequence[int],
+    ) -> None:
+        pixels = pixel_grid(camera.height, camera.width)
+        label = label_pixels(camera, pixels, depth, source, sources, settings)
+        panels = _label_panels(label, depth, truth, scene)
+        width, height = size  # without padding
         image = _row({title: panel[:height, :width] for title, panel in panels.items()})
-        write_png(folder / f"{shot.name}.png", image)
-        photograph = scene.names["train"][int(shot.source)]
-        pictures.append(Picture("Pseudo-labels", f"{shot.name}, from {photograph}", image))
-    return pictures
+        write_png(folder / f"{name}.png", image)
+        photograph = scene.names["train"][int(source)]
+        pictures.append(Picture("Pseudo-labels", f"{name}, from {photograph}", image))
 
-
-class _Shot(NamedTuple):
-    """A camera to label.
-
-    Attributes:
-      name: name of its picture.
-      camera: the camera, perhaps padded.
-      depth: `[H, W]` its z-depth.
-      source: index of the photograph that the backward warp reads.
-      truth: `[H, W, 3]` its true image, or None.
-      size: its width and height without padding.
-    """
-
-    name: str
-    camera: Camera
-    depth: jax.Array
-    source: jax.Array
-    truth: jax.Array | None
-    size: tuple[int, int]
-
-
-def _virtual_shots(
-    key: jax.Array,
-    scene: Scene,
-    sources: LabelSources,
-    settings: PseudoSettings,
-    render_depth: Callable[[Camera], jax.Array],
-) -> Iterator[_Shot]:
-    """Draw virtual cameras, each with the lens and the size of its source."""
-    sample, sizes = jax.jit(sample_virtual_camera), scene.sizes("train")
     for i, camera_key in enumerate(jax.random.split(key, SHOWN_LABELS)):
         camera, source = sample(camera_key, sources, settings)
         truth = scene.surface(camera).rgb if scene.surface else None
-        size = sizes[int(source)]
-        yield _Shot(f"virtual_{i}", camera, render_depth(camera), source, truth, size)
+        # A virtual camera has the lens and the size of its source.
+        draw(f"virtual_{i}", camera, render_depth(camera), source, truth, sizes[int(source)])
+    for target in targets[:SHOWN_LABELS]:
+        camera, depth = target.camera, render_depth(target.camera)
+        source = nearest(camera, sources.views, sources.depths, depth=depth)
+        draw(f"closeup_{target.name}", camera, depth, source, target.rgb, target.weight.shape[::-1])
+    return pictures
 
 
-def _closeup_shots(
-    targets: Sequence[Target],
-    sources: LabelSources,
-    render_depth: Callable[[Camera], jax.Array],
-) -> Iterator[_Shot]:
-    """Choose the source of each held-out close-up."""
-    nearest = jax.jit(best_source)
-    for target in targets:
-        depth = render_depth(target.camera)
-        source = nearest(target.camera, sources.views, sources.depths, depth=depth)
-        height, width = target.weight.shape
-        name = f"closeup_{target.name}"
-        yield _Shot(name, target.camera, depth, source, target.rgb, (width, height))
+def _label_panels(
+    label: PseudoLabel, depth: jax.Array, truth: jax.Array | None, scene: Scene
+) -> dict[str, np.ndarray | jax.Array]:
+    """Return the panels `[H, W, 3]` that show how a label is made, by title."""
+    panels: dict[str, np.ndarray | jax.Array] = {
+        "backward warp": label.backward,
+        "forward warp": label.forward,
+        "kept": np.where(label.weight[..., None] > 0, label.rgb, 0),
+        "mask": np.repeat(np.asarray(label.weight)[..., None], 3, axis=-1),
+        "rendered depth": colorize_depth(depth, near=scene.near, far=scene.far),
+    }
+    return panels if truth is None else panels | {"truth": np.asarray(truth)}

@@ -1,5 +1,7 @@
-"""Write everything that reports a run: results.json, pictures and the page."""
+"""Write everything that reports a run: results.json, pictures and the page, pictures first."""
 
+import base64
+import json
 import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -7,14 +9,22 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxcloseup.app.report.headline import best_stage
+from jaxcloseup.app.report.audits import (
+    detail_table,
+    gate_table,
+    label_plots,
+    labels_table,
+    zoom_plots,
+)
+from jaxcloseup.app.report.headline import all_scores, best_stage, conclusion, run_tables
+from jaxcloseup.app.report.page import Picture, by_section, fill_page
 from jaxcloseup.app.report.pictures import comparisons, label_pictures
-from jaxcloseup.app.report.run_page import write_report
 from jaxcloseup.app.report.showcase import Exhibit, exhibits
+from jaxcloseup.app.run.gate import verdict
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.setup import Training, timed
 from jaxcloseup.app.run.stages import Outcome
-from jaxcloseup.app.score.metrics_text import FINER
+from jaxcloseup.app.score.metrics_text import FINER, SPLIT_TITLES
 from jaxcloseup.app.score.targets import Target
 from jaxcloseup.artifacts.images import encode_webp_animation
 from jaxcloseup.io.files import write_file, write_json
@@ -85,7 +95,7 @@ def report_run(
 
 
 def _showcase(programs: Programs, outcome: Outcome) -> list[Exhibit]:
-    """The close-ups that the page begins with, as the best stage renders them."""
+    """Return the close-ups at the top of the page, as the best stage renders them."""
     targets, stage = outcome.held_out.targets, best_stage(outcome.scores)
     split = next((name for name in (f"test{FINER}", "test") if targets.get(name)), None)
     if split is None:
@@ -103,7 +113,7 @@ def _showcase(programs: Programs, outcome: Outcome) -> list[Exhibit]:
 
 
 def _loaded_photographs(programs: Programs, outcome: Outcome) -> Pyramid:
-    """The finest photographs that the stages have read: a report must not draw or read others."""
+    """Return the finest photographs that stages have read; a report reads and draws no others."""
     windows, finest = programs.preset.windows, programs.preset.downscale
     if outcome.detail is not None:
         finest = 1
@@ -113,8 +123,54 @@ def _loaded_photographs(programs: Programs, outcome: Outcome) -> Pyramid:
 
 
 def _finer_resolution(targets: Mapping[str, Sequence[Target]]) -> list[int] | None:
-    """Width and height of the views that are scored at a finer size, or None."""
+    """Return width and height of the views at the finer size, or None without these."""
     for split, views in targets.items():
         if split.endswith(FINER) and views:
             return [views[0].camera.width, views[0].camera.height]
     return None
+
+
+def write_report(
+    path: pathlib.Path,
+    results: Mapping[str, Any],
+    exhibits: Sequence[Exhibit],
+    pictures: Sequence[Picture],
+    *,
+    dolly: bytes = b"",
+) -> None:
+    """Write the page of a run.
+
+    Args:
+      path: file to write.
+      results: content of `results.json`.
+      exhibits: close-ups at the top of the page.
+      pictures: further pictures, grouped by section.
+      dolly: a WebP of a camera that comes near; empty without one.
+    """
+    labels, gate, detail = results["labels"], results["gate"], results["detail"]
+    sections = by_section(pictures)
+    views = {title: shown for title, shown in sections.items() if title in SPLIT_TITLES.values()}
+    sizes = [results["resolution"], results["finer_resolution"]]
+    (width, height), *finer = [size for size in sizes if size]
+    page = fill_page(
+        "run.html",
+        title=results["scene"],
+        verdict=conclusion(results),
+        results=results,
+        sizes=" and ".join([f"{width} x {height} pixels", *(f"{w} x {h}" for w, h in finer)]),
+        exhibits=exhibits,
+        stage=best_stage(results["stages"]),
+        dolly=dolly and f"data:image/webp;base64,{base64.b64encode(dolly).decode()}",
+        views=views,
+        tables=run_tables(results),
+        zoom_plots=zoom_plots(results["stages"]),
+        all_scores=all_scores(results["stages"]),
+        labels_table=labels_table(labels) if labels else None,
+        label_plots=label_plots(labels, results["left_out"]),
+        gate_table=gate_table(gate) if gate else None,
+        gate_verdict=verdict(gate) if gate else None,
+        labels={title: shown for title, shown in sections.items() if title not in views},
+        detail_table=detail_table(detail) if detail else None,
+        config=json.dumps({key: results[key] for key in ("config", "versions")}, indent=1),
+    )
+    write_file(path, page)

@@ -92,21 +92,13 @@ def audit_labels(
 
 
 class _Audited(NamedTuple):
-    """Labels of a virtual close-up against its blurred true image, all `[H, W]`.
+    """Labels of a virtual close-up against its blurred true image, all `[H, W]`."""
 
-    Attributes:
-      weight: weight of each label.
-      error: mean absolute difference from the true color.
-      visible: 1 where the source sees the surface, else 0.
-      disagreement: largest difference of both warps in a channel.
-      reached: whether both warps reach a pixel, whatever their colors.
-    """
-
-    weight: np.ndarray
-    error: np.ndarray
-    visible: np.ndarray
-    disagreement: np.ndarray
-    reached: np.ndarray
+    weight: np.ndarray  # of each label
+    error: np.ndarray  # mean absolute difference from the true color
+    visible: np.ndarray  # 1 where the source sees the surface, else 0
+    disagreement: np.ndarray  # largest difference of both warps in a channel
+    reached: np.ndarray  # whether both warps reach a pixel, whatever their colors
 
 
 def _audit_closeup(
@@ -253,19 +245,12 @@ def left_out_curve(
 
 
 class _LeftOut(NamedTuple):
-    """A training photograph that labels are made for without it.
-
-    Attributes:
-      label_by: labels it with the settings given.
-      model: `[H, W, 3]` colors of the model.
-      truth: `[H, W, 3]` the photograph.
-      weight: `[H, W]` weight of its pixels.
-    """
+    """A training photograph, and what labels it from the others."""
 
     label_by: Callable[[PseudoSettings], PseudoLabel]
-    model: jax.Array
-    truth: jax.Array
-    weight: jax.Array
+    model: jax.Array  # [H, W, 3] colors of the model
+    truth: jax.Array  # [H, W, 3] the photograph
+    weight: jax.Array  # [H, W] weight of its pixels
 
 
 def _left_out(
