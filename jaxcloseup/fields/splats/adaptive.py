@@ -76,7 +76,7 @@ def adaptive_control(
     return DensityControl(
         init=with_image_offset,
         wrap_optimizer=wrap_optimizer,
-        before_render=apply_image_offset,
+        before_render=apply_image_offset,  # type: ignore[arg-type]  # of what `init` returns
         adapt=adapt,
     )
 

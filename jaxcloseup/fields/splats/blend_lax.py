@@ -433,7 +433,7 @@ def _pull_chunk(
     # Sums over pixels as small matrix products, at full precision: accelerators would round.
     def moments(values: jax.Array) -> Moments:
         sums = jnp.einsum("bkp,pm->bkm", values, grid.basis, precision=_EXACT)
-        return jnp.moveaxis(sums, -1, 0)
+        return jnp.moveaxis(sums, -1, 0)  # a triple in one array
 
     payload_bar = pixels[:, :features]
     payload = jnp.einsum("bkp,bfp->bkf", weight, payload_bar, precision=_EXACT)

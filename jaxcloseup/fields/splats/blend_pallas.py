@@ -56,7 +56,7 @@ def forward(
     values = jax.ShapeDtypeStruct((tiles, pixels), dtype)
     sums, median, *trace = pl.pallas_call(
         functools.partial(_forward_tile, plan, features),
-        grid=tiles,
+        grid=(tiles,),
         out_specs=[pl.BlockSpec((1, features + MOMENTS, pixels), lambda i: (i, 0, 0)), *[each] * 4],
         out_shape=[
             jax.ShapeDtypeStruct((tiles, features + MOMENTS, pixels), dtype),
@@ -90,7 +90,7 @@ def backward(
     whole = [pl.BlockSpec(a.shape, lambda i, n=a.ndim: (0,) * n) for a in (table, *in_turn)]
     pairs_bar = pl.pallas_call(
         functools.partial(_backward_tile, plan, features),
-        grid=tiles,
+        grid=(tiles,),
         in_specs=[
             *whole,
             *[each] * 3,
@@ -296,7 +296,7 @@ def _add_pairs(pairs_bar: jax.Array, lists: TileLists, count: int, *, interpret:
 
     return pl.pallas_call(
         add,
-        grid=count,
+        grid=(count,),
         out_specs=pl.BlockSpec((1, pairs_bar.shape[1]), lambda i: (i, 0)),
         out_shape=jax.ShapeDtypeStruct((count, pairs_bar.shape[1]), pairs_bar.dtype),
         interpret=interpret,

@@ -284,10 +284,10 @@ def _disc_box(
             at_depth = _on_circle(depth, point)
             exists = has_rim & (at_depth >= near)
             candidates.append((point, jnp.where(exists, at_depth, 1), exists))
-        least: jax.Array | float = jnp.inf
-        most: jax.Array | float = -jnp.inf
-        for point, at_depth, exists in candidates:
-            at = _on_circle(a, point) / at_depth
+        least: Any = jnp.inf
+        most: Any = -jnp.inf
+        for point, depth_there, exists in candidates:
+            at = _on_circle(a, point) / depth_there
             at = at * camera.intrinsics[axis] + camera.intrinsics[2 + axis]
             least = jnp.minimum(least, jnp.where(exists, at, jnp.inf))
             most = jnp.maximum(most, jnp.where(exists, at, -jnp.inf))

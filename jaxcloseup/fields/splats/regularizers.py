@@ -1,6 +1,7 @@
-"""Losses per pixel, unreduced, that gather surfels on a surface.
+"""Losses per pixel, unreduced, that gather surfels on a surface (2DGS, section 4.2).
 
-One makes normals agree with depth; the other removes the spread of depth along a ray.
+One makes normals agree with depth (equation 14); the other removes the spread of depth along a ray
+(equation 13).
 """
 
 import chex
@@ -13,7 +14,7 @@ from jaxcloseup.geometry.numerics import safe_norm
 
 
 def depth_to_normal(camera: Camera, depth: jax.Array) -> jax.Array:
-    """Normals `[H, W, 3]` of a depth map by central differences, world frame, facing the camera.
+    """Return normals `[H, W, 3]` of depth by central differences, world frame, facing the camera.
 
     Exact on planes. Normals are 0, with gradient 0, at the border and beside pixels without depth.
 
@@ -26,7 +27,7 @@ def depth_to_normal(camera: Camera, depth: jax.Array) -> jax.Array:
     points = pixels_to_points(camera, pixels, depth)
     down = points[2:, 1:-1] - points[:-2, 1:-1]
     across = points[1:-1, 2:] - points[1:-1, :-2]
-    normal = jnp.cross(down, across)
+    normal = jnp.cross(down, across)  # towards the camera, since y points down
     length = safe_norm(normal, keepdims=True)
     seen = depth > 0
     seen = seen[2:, 1:-1] & seen[:-2, 1:-1] & seen[1:-1, 2:] & seen[1:-1, :-2]
@@ -36,7 +37,7 @@ def depth_to_normal(camera: Camera, depth: jax.Array) -> jax.Array:
 
 
 def normal_inconsistency(normal: jax.Array, depth_normal: jax.Array, alpha: jax.Array) -> jax.Array:
-    """alpha (1 - <normal, depth_normal>) `[H, W]`; 0 where `depth_normal` is undefined.
+    """Return alpha (1 - <normal, depth_normal>) `[H, W]`; 0 where `depth_normal` is undefined.
 
     Args:
       normal: `[H, W, 3]` rendered normals, not normalized.
@@ -50,7 +51,7 @@ def normal_inconsistency(normal: jax.Array, depth_normal: jax.Array, alpha: jax.
 
 
 def scale_free_distortion(distortion: jax.Array, reference_depth: jax.Array | float) -> jax.Array:
-    """Distortion of m = 1 - reference_depth / z, which does not depend on the unit of length.
+    """Return the distortion of m = 1 - reference_depth / z, the same for every unit of length.
 
     Args:
       distortion: rendered distortion of inverse depths.

@@ -12,7 +12,13 @@ from jaxcloseup.fields.splats.config import RasterizeConfig
 from jaxcloseup.fields.splats.culling import map_shown, may_show
 from jaxcloseup.fields.splats.ellipsoids import project_ellipsoids
 from jaxcloseup.fields.splats.layout import pack
-from jaxcloseup.fields.splats.projection import offsets, project_discs, surfel_columns, to_camera
+from jaxcloseup.fields.splats.projection import (
+    SurfelColumns,
+    offsets,
+    project_discs,
+    surfel_columns,
+    to_camera,
+)
 from jaxcloseup.fields.splats.rasterize import blend
 from jaxcloseup.fields.splats.spherical_harmonics import sh_to_channels
 from jaxcloseup.fields.splats.surfels import Surfels
@@ -74,6 +80,7 @@ def render_surfels(
     chex.assert_shape(camera.camtoworld, (3, 4))
     chex.assert_shape(camera.intrinsics, (4,))
 
+    # Only surfels that may show are projected, and only pairs that draw are listed.
     opacity = jnp.where(alive, jax.nn.sigmoid(surfels.opacity_logits), 0)
     shown = may_show(surfels, opacity, camera, near=config.near, antialias=config.antialias)
     project = functools.partial(_project, near=config.near, antialias=config.antialias)
@@ -88,18 +95,19 @@ def render_surfels(
     return Rendering(rgb, image.depth, image.alpha, aux, normal=aux.normal, overflow=aux.overflow)
 
 
-def _project(surfels, camera, *, near, antialias):
-    """Table, boxes and order of surfels, for `blend`."""
-    surfels, opacity = surfels
+def _project(
+    items: tuple[SurfelColumns, jax.Array], camera: Camera, *, near: float, antialias: bool
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return the table, boxes and order of surfels and their opacities, for `blend`."""
+    surfels, opacity = items
     discs, normals = to_camera(surfels, camera)
     x, y, z = offsets(surfels, camera)
+    # At the camera's center any direction serves; the gradient must be finite.
     squared = x * x + y * y + z * z
     distance = jnp.sqrt(jnp.where(squared == 0, 1, squared))
     colors = sh_to_channels(surfels.sh, x / distance, y / distance, z / distance)
-    options = {"near": near, "antialias": antialias}
-    if len(discs.scales) == 3:
-        footprints = project_ellipsoids(discs, opacity, jnp.stack(colors), camera, **options)
-    else:
-        payload = jnp.stack([*colors, *normals])
-        footprints = project_discs(discs, opacity, payload, camera, **options)
+    volumetric = len(discs.scales) == 3
+    project = project_ellipsoids if volumetric else project_discs
+    payload = jnp.stack(colors if volumetric else [*colors, *normals])
+    footprints = project(discs, opacity, payload, camera, near=near, antialias=antialias)
     return pack(footprints), footprints.box.T, footprints.order

@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from jaxcloseup.fields.splats.surfels import Surfels
+
 
 class SelectiveAdamState(NamedTuple):
     """Moments of the gradients of N surfels.
@@ -20,7 +22,7 @@ class SelectiveAdamState(NamedTuple):
       nu: mean of their squares.
     """
 
-    count: jax.Array
+    count: jax.Array  # type: ignore[assignment]  # hides tuple.count, as in states of optax
     mu: optax.Updates
     nu: optax.Updates
 
@@ -34,22 +36,25 @@ def scale_by_selective_adam(
     bias of its moments, so that surfels may be added at any time.
     """
 
-    def init(params):
+    def init(params: Surfels) -> SelectiveAdamState:
         zeros = jax.tree.map(jnp.zeros_like, params)
         return SelectiveAdamState(jnp.zeros(params.means.shape[0], jnp.int32), zeros, zeros)
 
-    def update(gradients, state, params=None):
+    def update(
+        gradients: Surfels, state: SelectiveAdamState, params: Surfels | None = None
+    ) -> tuple[Surfels, SelectiveAdamState]:
         del params
+        # Priors have a gradient for every surfel, colors only for those in sight.
         seen = jnp.any(gradients.sh != 0, axis=(1, 2))
         count = state.count + seen.astype(jnp.int32)
 
-        def rows(values, like):
+        def rows(values: jax.Array, like: jax.Array) -> jax.Array:
             return values.reshape(-1, *(1,) * (like.ndim - 1))
 
-        def moment(old, new, decay):
+        def moment(old: jax.Array, new: jax.Array, decay: float) -> jax.Array:
             return jnp.where(rows(seen, old), decay * old + (1 - decay) * new, old)
 
-        def step(mu, nu):
+        def step(mu: jax.Array, nu: jax.Array) -> jax.Array:
             times = rows(jnp.maximum(count, 1), mu).astype(mu.dtype)
             mean, square = mu / (1 - b1**times), nu / (1 - b2**times)
             return jnp.where(rows(seen, mu), mean / (jnp.sqrt(square) + eps), 0)

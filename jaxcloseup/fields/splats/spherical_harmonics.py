@@ -12,18 +12,19 @@ _CONSTANT = math.sqrt(1 / (4 * math.pi))
 
 
 def sh_basis(directions: jax.Array, degree: int) -> jax.Array:
-    """Orthonormal basis `[..., (degree + 1)^2]` at unit `directions[..., 3]`, `degree` 0 to 3.
+    """Return the orthonormal basis `[..., (degree + 1)^2]` at unit `directions[..., 3]`.
 
-    Functions are ordered by degree, then order, with the signs (-1)^m that splat files use.
+    `degree` is 0 to 3. Functions are ordered by degree, then order, with the signs (-1)^m that splat files use.
 
     Raises:
       ValueError: `degree` is not 0 to 3.
     """
     chex.assert_axis_dimension(directions, -1, 3)
-    return jnp.stack(_basis(*jnp.moveaxis(directions, -1, 0), degree), axis=-1)
+    x, y, z = jnp.moveaxis(directions, -1, 0)
+    return jnp.stack(_basis(x, y, z, degree), axis=-1)
 
 
-def _basis(x, y, z, degree):
+def _basis(x: jax.Array, y: jax.Array, z: jax.Array, degree: int) -> list[jax.Array]:
     if degree not in range(4):
         raise ValueError(f"spherical harmonics must have degree 0 to 3, not {degree}")
     xx, yy, zz = x * x, y * y, z * z
@@ -53,7 +54,7 @@ def _basis(x, y, z, degree):
 
 
 def sh_to_rgb(sh: jax.Array, directions: jax.Array) -> jax.Array:
-    """Colors max(0, 1/2 + sum_k Y_k sh_k) `[..., 3]` along viewing directions.
+    """Return colors max(0, 1/2 + sum_k Y_k sh_k) `[..., 3]` along viewing directions.
 
     Args:
       sh: `[..., (L + 1)^2, 3]` coefficients.
@@ -67,7 +68,7 @@ def sh_to_rgb(sh: jax.Array, directions: jax.Array) -> jax.Array:
 def sh_to_channels(
     sh: Sequence[Sequence[jax.Array]], x: jax.Array, y: jax.Array, z: jax.Array
 ) -> tuple[jax.Array, ...]:
-    """`sh_to_rgb` with `(L + 1)^2` times 3 arrays `[...]` of coefficients, to 3 of colors.
+    """Return `sh_to_rgb` of `(L + 1)^2` times 3 arrays `[...]` of coefficients, as 3 of colors.
 
     `x`, `y` and `z` are the components `[...]` of the directions.
     """
@@ -82,5 +83,5 @@ def sh_to_channels(
 
 
 def rgb_to_sh(rgb: jax.Array) -> jax.Array:
-    """Constant coefficients `[..., 3]` that give the color `rgb[..., 3]` in all directions."""
+    """Return constant coefficients `[..., 3]` of the color `rgb[..., 3]` in all directions."""
     return (rgb - 0.5) / _CONSTANT

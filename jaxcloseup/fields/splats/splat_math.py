@@ -182,7 +182,8 @@ class Pulled(struct.PyTreeNode):
     scaled: jax.Array
 
 
-Moments = Sequence[jax.Array]  # three: sums over pixels of values times 1, x and y
+# Sums over pixels of values times 1, x and y: three arrays, or one of them stacked.
+Moments = Sequence[jax.Array] | jax.Array
 
 
 class PulledSums(struct.PyTreeNode):

@@ -38,6 +38,9 @@ class Surfels(struct.PyTreeNode):
     sh: jax.Array
 
 
+_Best = tuple[jax.Array, jax.Array, jax.Array]  # smallest, second and third smallest
+
+
 def surfels_from_points(
     key: jax.Array,
     points: jax.Array,
@@ -48,7 +51,7 @@ def surfels_from_points(
     opacity: float = 0.1,
     num_scales: int = 2,
 ) -> tuple[Surfels, jax.Array]:
-    """Randomly oriented surfels at points, as large as the gaps between them.
+    """Return randomly oriented surfels at points, as large as the gaps between them.
 
     Args:
       key: random key for the rotations, and for the choice of points where `P` exceeds `capacity`;
@@ -79,6 +82,7 @@ def surfels_from_points(
     surfels = Surfels(
         means=points,
         log_scales=jnp.stack([jnp.log(gaps)] * num_scales, axis=-1),
+        # Normal components are uniform over rotations; uniform ones would not be.
         quaternions=jax.random.normal(key_rotation, (points.shape[0], 4), points.dtype),
         opacity_logits=jnp.full(points.shape[0], math.log(opacity / (1 - opacity)), points.dtype),
         sh=jnp.concatenate([constant, higher], axis=1),
@@ -89,7 +93,7 @@ def surfels_from_points(
 def random_points(
     key: jax.Array, cameras: Camera, *, near: float, far: float, count: int
 ) -> jax.Array:
-    """Random world points `[count, 3]` that many cameras see, for captures without points.
+    """Return random world points `[count, 3]` that many cameras see, for captures without points.
 
     Eight times as many points are drawn, along random pixels of random cameras and uniformly in
     inverse depth. The points that lie in the images of the most cameras are kept.
@@ -106,10 +110,10 @@ def random_points(
     size = jnp.array([[cameras.width, cameras.height]], jnp.float32)
     pixels = size * jax.random.uniform(key_pixel, (8 * count, 2))
     depth = 1 / jax.random.uniform(key_depth, (8 * count,), minval=1 / far, maxval=1 / near)
-    own = jax.tree.map(lambda leaf: leaf[view], cameras)
-    points = jax.vmap(pixels_to_points)(own, pixels, depth)
+    chosen = jax.tree.map(lambda leaf: leaf[view], cameras)
+    points = jax.vmap(pixels_to_points)(chosen, pixels, depth)
 
-    def add(total, camera):
+    def add(total: jax.Array, camera: Camera) -> tuple[jax.Array, None]:
         landed, depth = points_to_pixels(camera, points)
         inside = in_bounds(landed, camera.height, camera.width)
         return total + (inside & (depth > near)).astype(jnp.int32), None
@@ -119,12 +123,12 @@ def random_points(
 
 
 def pad_rows(array: jax.Array, rows: int) -> jax.Array:
-    """The array with rows of zeros appended, `rows` in all."""
+    """Return the array with rows of zeros appended, `rows` in all."""
     return jnp.pad(array, ((0, rows - array.shape[0]), *((0, 0) for _ in array.shape[1:])))
 
 
 def neighbor_distance(points: jax.Array, valid: jax.Array, *, rows: int = 256) -> jax.Array:
-    """Root mean square distance `[P]` from each point to its three nearest valid neighbors.
+    """Return the root mean square distance `[P]` of points to their three nearest valid neighbors.
 
     The search is exact and compares all pairs, which takes a few seconds for 100k points. The
     result is at least sqrt(1e-7), so that duplicates keep a size. A point with fewer than three
@@ -132,7 +136,7 @@ def neighbor_distance(points: jax.Array, valid: jax.Array, *, rows: int = 256) -
 
     Args:
       points: `[P, 3]` points.
-      valid: `[P]` bool; other points are nobody's neighbor.
+      valid: `[P]` bool; other points are no neighbors.
       rows: number of points compared at once; static.
     """
     count = points.shape[0]
@@ -141,24 +145,24 @@ def neighbor_distance(points: jax.Array, valid: jax.Array, *, rows: int = 256) -
     others = jnp.where(jnp.pad(valid, (0, -count % rows))[:, None], padded, jnp.inf)
     blocks = others.reshape(-1, rows, 3)
 
-    def nearest(start):
-        own = lax.dynamic_slice_in_dim(padded, start, rows)
-        own_index = start + jnp.arange(rows)
+    def nearest(start: jax.Array) -> jax.Array:
+        here = lax.dynamic_slice_in_dim(padded, start, rows)
+        here_index = start + jnp.arange(rows)
 
-        def update(best, block):
+        def update(best: _Best, block: tuple[jax.Array, jax.Array]) -> tuple[_Best, None]:
             index, other = block
-            squared = sum((own[:, None, i] - other[None, :, i]) ** 2 for i in range(3))
-            squared = jnp.where(own_index[:, None] == index[None], jnp.inf, squared)
+            squared = sum((here[:, None, i] - other[None, :, i]) ** 2 for i in range(3))
+            squared = jnp.where(here_index[:, None] == index[None], jnp.inf, squared)
             # Keep the three smallest in each of `rows` lanes; the lanes are merged at the end.
-            kept = []
-            for smallest in best:
-                kept.append(jnp.minimum(smallest, squared))
-                squared = jnp.maximum(smallest, squared)
-            return tuple(kept), None
+            first = jnp.minimum(best[0], squared)
+            squared = jnp.maximum(best[0], squared)
+            second = jnp.minimum(best[1], squared)
+            squared = jnp.maximum(best[1], squared)
+            return (first, second, jnp.minimum(best[2], squared)), None
 
-        best = (jnp.full((rows, rows), jnp.inf, points.dtype),) * 3
+        infinite = jnp.full((rows, rows), jnp.inf, points.dtype)
         indices = jnp.arange(padded.shape[0]).reshape(-1, rows)
-        best, _ = lax.scan(update, best, (indices, blocks))
+        best, _ = lax.scan(update, (infinite,) * 3, (indices, blocks))
         return -lax.top_k(-jnp.concatenate(best, axis=-1), 3)[0]
 
     starts = jnp.arange(0, padded.shape[0], rows)

@@ -25,7 +25,7 @@ _WIDER = 1.001
 def reaches(
     table: jax.Array, splat: jax.Array, corner: jax.Array, *, tile: int, near: float
 ) -> jax.Array:
-    """Whether splats are at least `ALPHA_MIN` anywhere in a tile, `[P]` bool; never wrongly no.
+    """Return whether splats are at least `ALPHA_MIN` anywhere in a tile, `[P]`; never wrongly no.
 
     With `Footprints.homography` H, cutoff c and d = (1, q - anchor), a splat is where
     |(H[0].d, H[1].d)| <= c H[2].d: a convex set. Seen from its center, it enters a tile through an
@@ -41,8 +41,11 @@ def reaches(
       tile: side of a tile in pixels; static.
       near: z-depth before which nothing is drawn.
     """
-    column = lambda i: rows[:, i]  # noqa: E731
     rows = table[:, :PAYLOAD][splat]
+
+    def column(i: int) -> jax.Array:
+        return rows[:, i]
+
     opacity = jnp.maximum(column(OPACITY) / ALPHA_MIN, 1)
     cutoff = _WIDER * jnp.sqrt(2 * jnp.log(opacity))
     # Pixel centers of the tile about the anchor, and the one that is nearest to the anchor.
@@ -51,13 +54,20 @@ def reaches(
     x, y = (jnp.clip(0, low[:, i], high[:, i]) for i in (0, 1))
     side = tile - 1 + 2 * _MARGIN
 
-    def meets(x, y, axis):
-        """Whether the splat meets the segment of one side's length from (x, y) along `axis`."""
-        start, along = [], []
-        for i, scale in zip(range(HOMOGRAPHY, OPACITY, 3), (1, 1, cutoff), strict=True):
+    def meets(x: jax.Array, y: jax.Array, axis: int) -> jax.Array:
+        """Return whether the splat meets the side's segment from (x, y) along `axis`."""
+        scales: tuple[jax.Array | int, ...] = (1, 1, cutoff)
+        start: list[jax.Array] = []
+        along: list[jax.Array] = []
+        for i, scale in zip(range(HOMOGRAPHY, OPACITY, 3), scales, strict=True):
             start.append(scale * (column(i) + column(i + 1) * x + column(i + 2) * y))
             along.append(scale * (side * column(i + 1 + axis)))
-        form = lambda a, b: a[0] * b[0] + a[1] * b[1] - a[2] * b[2]  # noqa: E731
+
+        def form(a: list[jax.Array], b: list[jax.Array]) -> jax.Array:
+            return a[0] * b[0] + a[1] * b[1] - a[2] * b[2]
+
+        # The cone u^2 + v^2 - (c w)^2 along the segment is a parabola; its least value is at an
+        # end or its vertex. Where it opens downwards the splat may reach past infinity: keep it.
         curvature = form(along, along)
         convex = curvature > 0
         step = jnp.clip(-form(start, along) / jnp.where(convex, curvature, 1), 0, 1)

@@ -15,6 +15,7 @@ from jax import lax
 
 
 LARGEST = 2**31 - 1
+_Carried = tuple[jax.Array, tuple[jax.Array, jax.Array]]  # a rank, and tiles and ranks
 _LARGE = 2**16  # room for pairs that is worth shortcuts
 _FEW = 2**12  # splats that are worth a shortcut
 
@@ -97,19 +98,19 @@ def tile_lists(
 
 
 def longest_first(counts: jax.Array) -> jax.Array:
-    """Indices `[T]` of tiles by the length of their lists, of equal ones by index."""
+    """Return indices `[T]` of tiles by the length of their lists, of equal ones by index."""
     return jnp.argsort(-counts, stable=True).astype(jnp.int32)
 
 
 def starts_of(ordered: jax.Array, count: int) -> jax.Array:
-    """Where each of the numbers 0 to `count` begins, `[count + 1]`, in ascending int32 `[P]`."""
+    """Return where each number 0 to `count` begins, `[count + 1]`, in ascending int32 `[P]`."""
     # Unrolled, for a GPU starts each step of a loop anew.
     numbers = jnp.arange(count + 1, dtype=jnp.int32)
     return jnp.searchsorted(ordered, numbers, method="scan_unrolled").astype(jnp.int32)
 
 
-def _nearest_first_shown(order, pairs):
-    """Indices `[N]` of splats, the nearest first as far as splats have any pairs `[N]`."""
+def _nearest_first_shown(order: jax.Array, pairs: jax.Array) -> jax.Array:
+    """Return indices `[N]` of splats, the nearest first as far as these have pairs `[N]`."""
     count = order.shape[0]
     few = count // 4
     if few < _FEW:
@@ -118,10 +119,10 @@ def _nearest_first_shown(order, pairs):
     index = jnp.arange(count, dtype=jnp.int32)
     after = jnp.max(jnp.where(pairs > 0, index, -1), initial=-1)
 
-    def first_ones():
+    def sort_few() -> jax.Array:
         return jnp.concatenate([_nearest_first(order[:few]), index[few:]])
 
-    return lax.cond(after < few, first_ones, lambda: _nearest_first(order))
+    return lax.cond(after < few, sort_few, lambda: _nearest_first(order))
 
 
 def _touched_tiles(
@@ -146,16 +147,17 @@ def _touched_tiles(
     begins = ends - pairs
     tiles = across * down
     size, steps = at_once, -(-capacity // at_once)
-    # How many splats' pairs end in front of each pair.
+    # How many splats' pairs end in front of each pair: sums along this are the pairs' ranks.
     ended = jnp.zeros(steps * size, jnp.int32).at[ends].add(1, mode="drop").reshape(steps, size)
 
-    def find(rank, step):
+    def find(rank: jax.Array, step: tuple[jax.Array, jax.Array]) -> _Carried:
         ended, place = step
 
-        def some():
+        def some() -> _Carried:
             ranks = rank + jnp.cumsum(ended)
             places = place + jnp.arange(size, dtype=jnp.int32)
             listed = places < ends[-1]
+            # Which tile of the splat's box, row by row.
             within = places - begins[ranks]
             down_by = within // columns[ranks]
             row = first[ranks, 1] + down_by
@@ -165,33 +167,35 @@ def _touched_tiles(
                 listed &= reaches(splats[ranks], corner)
             return ranks[-1], (jnp.where(listed, row * across + column, tiles), ranks)
 
-        def none():
+        def none() -> _Carried:
             return rank, (jnp.full(size, tiles, jnp.int32), jnp.zeros(size, jnp.int32))
 
         return lax.cond(place < ends[-1], some, none)
 
     starts = size * jnp.arange(steps, dtype=jnp.int32)
-    _, found = lax.scan(find, jnp.int32(0), (ended, starts))
-    return tuple(part.reshape(-1)[:capacity] for part in found)
+    _, (tile_of, ranks) = lax.scan(find, jnp.int32(0), (ended, starts))
+    return tile_of.reshape(-1)[:capacity], ranks.reshape(-1)[:capacity]
 
 
-def _sorted_pairs(tile_of, rank, by_depth, total, tiles):
-    """Where each tile's pairs start, `[T + 1]`, and splats `[capacity]` by tile and rank."""
+def _sorted_pairs(
+    tile_of: jax.Array, rank: jax.Array, by_depth: jax.Array, total: jax.Array, tiles: int
+) -> tuple[jax.Array, jax.Array]:
+    """Return where each tile's pairs start, `[T + 1]`, and splats `[capacity]` by tile and rank."""
     capacity = tile_of.shape[0]
     # Sorting costs what there is room for; windows show few splats in few pairs.
     eighths = (1, 1.5, 2, 3, 4, 6) if capacity >= _LARGE else ()
     rooms = [int(capacity * part / 8) for part in eighths] + [capacity]
 
-    def sort(room):
-        found, ranks = _sort_pairs(tile_of[:room], rank[:room], tiles + 1, len(by_depth))
-        return starts_of(found, tiles), jnp.pad(by_depth[ranks], (0, capacity - room))
+    def sort(room: int) -> tuple[jax.Array, jax.Array]:
+        ordered, ranks = _sort_pairs(tile_of[:room], rank[:room], tiles + 1, len(by_depth))
+        return starts_of(ordered, tiles), jnp.pad(by_depth[ranks], (0, capacity - room))
 
     smallest = jnp.argmax(jnp.stack([total <= room for room in rooms[:-1]] + [jnp.array(True)]))
     return lax.switch(smallest, [functools.partial(sort, room) for room in rooms])
 
 
 def _tile_range(box: jax.Array, size: jax.Array, tile: int) -> tuple[jax.Array, jax.Array]:
-    """First and last tile `[N, 2]` (x, y) with pixel centers in the box; last < first if none."""
+    """Return the first and last tile `[N, 2]` with pixel centers in the box; last < first if none."""
     # Clip before the cast: a box may reach to infinity, which int32 cannot hold.
     edge = (size - 1).astype(box.dtype)[None]
     first = jnp.clip(jnp.ceil(box[:, :2] - 0.5), 0, edge + 1).astype(jnp.int32)
@@ -201,11 +205,10 @@ def _tile_range(box: jax.Array, size: jax.Array, tile: int) -> tuple[jax.Array, 
 
 
 def _nearest_first(order: jax.Array) -> jax.Array:
-    """Indices `[N]` that sort a non-negative `order[N]`, ties by index.
-
-    XLA's CPU backend sorts single integers several times faster than pairs. So float32 is sorted
-    digit by digit, the last digit first; a digit and a position share one integer.
-    """
+    """Return indices `[N]` that sort a non-negative `order[N]`, ties by index."""
+    # XLA's CPU backend sorts single integers several times faster than pairs. So float32 is sorted
+    # digit by digit, the last digit first; a digit and a position share one integer. The bits of
+    # floats that are not negative rise with the floats.
     count = order.shape[0]
     place = jnp.arange(count, dtype=jnp.uint32)
     if order.dtype != jnp.float32:
@@ -219,10 +222,14 @@ def _nearest_first(order: jax.Array) -> jax.Array:
     return by_key.astype(jnp.int32)
 
 
-def _sort_pairs(tile, rank, tiles: int, ranks: int):
-    """Sort pairs by (tile, rank); one packed key sorts several times faster than two."""
+def _sort_pairs(
+    tile: jax.Array, rank: jax.Array, tiles: int, ranks: int
+) -> tuple[jax.Array, jax.Array]:
+    """Sort pairs by (tile, rank)."""
+    # One packed key sorts several times faster than two.
     bits = max(ranks - 1, 1).bit_length()
     if tiles <= 2 ** (32 - bits):
         key = lax.sort((tile.astype(jnp.uint32) << bits) | rank.astype(jnp.uint32))
         return (key >> bits).astype(jnp.int32), (key & (2**bits - 1)).astype(jnp.int32)
-    return tuple(lax.sort((tile, rank), num_keys=2))
+    tile, rank = lax.sort((tile, rank), num_keys=2)
+    return tile, rank
