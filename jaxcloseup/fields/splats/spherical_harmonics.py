@@ -14,7 +14,8 @@ _CONSTANT = math.sqrt(1 / (4 * math.pi))
 def sh_basis(directions: jax.Array, degree: int) -> jax.Array:
     """Return the orthonormal basis `[..., (degree + 1)^2]` at unit `directions[..., 3]`.
 
-    `degree` is 0 to 3. Functions are ordered by degree, then order, with the signs (-1)^m that splat files use.
+    `degree` is 0 to 3. Functions are ordered by degree, then order, with the signs (-1)^m that
+    splat files use.
 
     Raises:
       ValueError: `degree` is not 0 to 3.

@@ -195,7 +195,7 @@ def _sorted_pairs(
 
 
 def _tile_range(box: jax.Array, size: jax.Array, tile: int) -> tuple[jax.Array, jax.Array]:
-    """Return the first and last tile `[N, 2]` with pixel centers in the box; last < first if none."""
+    """Return the first and last tile `[N, 2]` with pixel centers in boxes; last < first if none."""
     # Clip before the cast: a box may reach to infinity, which int32 cannot hold.
     edge = (size - 1).astype(box.dtype)[None]
     first = jnp.clip(jnp.ceil(box[:, :2] - 0.5), 0, edge + 1).astype(jnp.int32)
