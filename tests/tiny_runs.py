@@ -19,7 +19,7 @@ from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.fields.splats import RasterizeConfig
 from jaxcloseup.training.config import TrainConfig
-from jaxcloseup.training.steps import init_state
+from jaxcloseup.training.state import init_state
 
 
 TINY = dataclasses.replace(

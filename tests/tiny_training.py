@@ -9,7 +9,7 @@ from jaxcloseup.fields.contract import RadianceField, Rendering
 from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_rays
 from jaxcloseup.geometry.poses import PoseSettings
 from jaxcloseup.labels.make import PseudoSettings
-from jaxcloseup.training.steps import init_state
+from jaxcloseup.training.state import init_state
 
 
 RATE = 0.25

@@ -25,11 +25,16 @@ from jaxcloseup.app.methods import surfels
 from jaxcloseup.app.methods.method import Preset
 from jaxcloseup.app.methods.nerf import QUICK as NERF_QUICK
 from jaxcloseup.app.run.fine_tuning import fine_tune
-from jaxcloseup.app.run.kept_detail import detail_finder
+from jaxcloseup.app.run.kept_detail import detail_getter
+from jaxcloseup.app.run.keys import run_keys
+from jaxcloseup.app.run.labels import start_labels
+from jaxcloseup.app.run.loop import Training
+from jaxcloseup.app.run.manifest import identity_of
 from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.run.setup import Training, identity_of, initial_state, start_labels
 from jaxcloseup.app.run.stage_names import STAGES
 from jaxcloseup.app.run.stages import run_stages
+from jaxcloseup.app.run.states import initial_state
+from jaxcloseup.app.run.step_data import TrainData
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.fields.splats import RasterizeConfig
@@ -270,12 +275,12 @@ def training(size: Size) -> dict[str, Any]:
     scene = dataclasses.replace(scene, train=jax.device_put(scene.train))
     loaded = time.perf_counter() - begun
     programs = Programs(preset, scene)
-    state, views = initial_state(programs, seed=0), programs.photographs
+    state, views = initial_state(programs, run_keys(0)), programs.photographs
     begun = time.perf_counter()
-    state, _ = programs.run("photographs", state, views, count=1)
+    state, _ = programs.run(state, TrainData(views), count=1)
     compiled = time.perf_counter() - begun
     begun = time.perf_counter()
-    programs.run("photographs", state, views, count=10)
+    programs.run(state, TrainData(views), count=10)
     step = (time.perf_counter() - begun) / 10
     # Surfels multiply, and a step with a label costs more than two without.
     steps = int(size.training_seconds / step / 4)
@@ -292,10 +297,10 @@ def training(size: Size) -> dict[str, Any]:
         )
         whole = Training(programs, checkpoints, save_every=10**9)
         outcome = run_stages(whole, 0, output, to_run=size.stages)
-    start = start_labels(programs, outcome.start.state, 0)
+    start = start_labels(programs, outcome.start.state, run_keys(0))
     wanted = jax.tree.map(lambda leaf: leaf[:1], scene.test.cameras)
     begun = time.perf_counter()
-    tuned = fine_tune(programs, start, wanted, detail_finder(programs, start.state))
+    tuned = fine_tune(programs, start, wanted, detail_getter(programs, start.state))
     jax.block_until_ready(programs.render(tuned, jax.tree.map(lambda leaf: leaf[0], wanted)))
     return {
         "image": [scene.train.cameras.height, scene.train.cameras.width],

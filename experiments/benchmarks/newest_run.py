@@ -7,7 +7,7 @@ from typing import NamedTuple
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.store.stored_run import choose_stage, load_run_scene, read_run, restore
 from jaxcloseup.photos.scene import Scene
-from jaxcloseup.training.steps import TrainState
+from jaxcloseup.training.state import TrainState
 
 
 class NewestRun(NamedTuple):

@@ -5,9 +5,12 @@ import jax
 from experiments.benchmarks.timing import interleaved_medians
 from jaxcloseup.app.methods.method import Preset
 from jaxcloseup.app.methods.registry import METHODS
+from jaxcloseup.app.run.keys import run_keys
+from jaxcloseup.app.run.labels import start_labels
 from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.run.setup import initial_state, start_labels
-from jaxcloseup.app.sweep.arm_training import stack_arms
+from jaxcloseup.app.run.states import initial_state
+from jaxcloseup.app.run.step_data import CloseupData, TrainData
+from jaxcloseup.app.sweep.arm_training import join_arms
 from jaxcloseup.app.sweep.arms import make_arm
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.labels.config import pseudo_settings
@@ -36,18 +39,18 @@ def step_seconds(
     """Seconds of a step alone, and of a step of all arms together, on a scene by its name."""
     scene = load_scene(scene, downscale=preset.downscale)
     programs = Programs(preset, scene)
-    state = initial_state(programs, seed=0)
+    state = initial_state(programs, run_keys(0))
     views = jax.device_put(scene.train)
-    state, _ = programs.run("photographs", state, views, count=warmup)
-    start = start_labels(programs, state, seed=0)
+    state, _ = programs.run(state, TrainData(views), count=warmup)
+    start = start_labels(programs, state, run_keys(0))
     arms = [make_arm(arm, preset) for arm in ARMS + GRID]
     arms = [arm.settings for arm in sorted(arms, key=lambda arm: arm.outlook)]
-    states, *data = stack_arms(arms, [start] * len(arms), len(jax.devices()))
-    alone = start.state, views, start.sources, pseudo_settings(preset.labels)
+    states, together = join_arms(arms, [start] * len(arms), views, devices=len(jax.devices()))
+    alone = CloseupData(views, start.sources, pseudo_settings(preset.labels))
     programs.make_room(4)  # virtual cameras need more than photographs; both calls get the same
     calls = {
-        "alone": lambda: programs.run("random_closeups", *alone, count=STEPS)[0],
-        "arms": lambda: programs.run("arms", states, views, *data, count=STEPS)[0],
+        "alone": lambda: programs.run(start.state, alone, count=STEPS)[0],
+        "arms": lambda: programs.run(states, together, count=STEPS)[0],
     }
     seconds = interleaved_medians(calls, 5)
     return seconds["alone"] / STEPS, seconds["arms"] / STEPS

@@ -1,8 +1,5 @@
 """Arithmetic that stays finite, in values and in gradients, where the plain form does not."""
 
-from collections.abc import Callable
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
@@ -24,15 +21,3 @@ def safe_norm(x: jax.Array, *, axis: int = -1, keepdims: bool = False) -> jax.Ar
 def matmul(a: jax.Array, b: jax.Array) -> jax.Array:
     """Multiply matrices in full precision; accelerators would otherwise round geometry's inputs."""
     return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)
-
-
-def take_turns(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Make `jax.vmap` of a function compute its batch one member after another on a CPU.
-
-    This suits work that is cut to the size of a core's cache, which a whole batch would exceed.
-    Other backends keep the batch together. The function must take arrays, close over no array that
-    may be batched, and not be differentiated in reverse mode.
-    """
-    if jax.default_backend() != "cpu":
-        return function
-    return jax.custom_batching.sequential_vmap(function)

@@ -6,15 +6,12 @@ from jaxcloseup.lazy import lazy_names
 __all__, __getattr__, __dir__ = lazy_names(
     __name__,
     {
+        "arms": "arm_state run_arms stack_arms stack_states",
         "config": "TrainConfig",
-        "steps": (
-            "TrainState init_state train_step pseudo_step closeup_step "
-            "labeled_step run_steps render_depths"
-        ),
         "loss": "judge rendered_loss",
-        "sampling": (
-            "DrawKeys draw_keys sample_batch sample_labels CloseupDraw sample_closeup "
-            "in_a_loop in_threads over_devices"
-        ),
+        "parallel": "in_a_loop in_threads over_devices",
+        "sampling": ("CloseupDraw DrawKeys draw_keys sample_batch sample_closeup sample_labels"),
+        "state": "TrainState init_state",
+        "steps": "closeup_step labeled_step pseudo_step run_steps train_step",
     },
 )

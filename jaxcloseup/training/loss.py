@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxcloseup.fields.contract import RadianceField, Rendering
-from jaxcloseup.geometry.numerics import safe_divide, take_turns
+from jaxcloseup.geometry.numerics import safe_divide
 from jaxcloseup.photos.views import Batch
 
 
@@ -17,7 +17,7 @@ Loss = tuple[jax.Array, dict[str, jax.Array]]
 def judge(
     field: RadianceField, rendering: Rendering, target_rgb: jax.Array, weight: jax.Array
 ) -> Loss:
-    """`field.loss` of a rendering, with the rendering's overflow among the metrics.
+    """Return `field.loss` of a rendering, with the rendering's overflow among the metrics.
 
     Args:
       field: field that rendered.
@@ -42,8 +42,9 @@ def rendered_loss(
     *,
     field: RadianceField,
     chunk: int | None = None,
+    sequential: bool = False,
 ) -> Loss:
-    """Loss of what `field` renders at a batch's pixels, differentiable in `params` alone.
+    """Return the loss of a batch's pixels as `field` renders them; only `params` get gradients.
 
     With `chunk`, differentiation renders that many pixels, takes their gradient and adds it to a
     sum, so nothing is kept for a backward pass and nothing is computed twice. The sum is exact,
@@ -59,76 +60,112 @@ def rendered_loss(
       key: consumed by the rendering; None renders deterministically.
       field: static; renders, and defines the loss.
       chunk: static; pixels to differentiate at once, usually `field.gradient_chunk`; None for all.
+      sequential: static; under `jax.vmap`, compute the chunks of one member after another. A chunk
+        fills the cache of a CPU's core, which a whole batch of members would exceed.
 
     Returns:
       The loss and its metrics, from `judge`.
     """
     if chunk is None or batch.pixels is None or len(batch.pixels) <= chunk:
         return _at_once(field, params, buffers, batch, key)
-    return _chunked(field, chunk, params, buffers, batch, key)
+    return _chunked(field, chunk, sequential, params, buffers, batch, key)
 
 
-def _plain(field, params, buffers, batch, key):
+def _plain(
+    field: RadianceField, params: Any, buffers: Any, batch: Batch, key: jax.Array | None
+) -> Loss:
     rendering = field.render(params, buffers, batch.cameras, batch.pixels, key)
     return judge(field, rendering, batch.rgb, batch.weight)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _at_once(field, params, buffers, batch, key):
+def _at_once(
+    field: RadianceField, params: Any, buffers: Any, batch: Batch, key: jax.Array | None
+) -> Loss:
     return _plain(field, params, buffers, batch, key)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _at_once_forward(field, params, buffers, batch, key):
+def _at_once_forward(
+    field: RadianceField, params: Any, buffers: Any, batch: Batch, key: jax.Array | None
+) -> tuple[Loss, Any]:
     # Outside `jax.jit`, JAX would compile what comes before and after the derivative apart, and
     # trace both in every step.
     of_params = jax.value_and_grad(functools.partial(_plain, field), has_aux=True)
     return of_params(params, buffers, batch, key)
 
 
-def _scale_gradients(*arguments):
-    """The cotangents of a loss whose forward pass has taken the gradients already."""
+def _scale_gradients(*arguments: Any) -> tuple[Any, None, None, None]:
+    """Return the cotangents of a loss whose forward pass has taken the gradients already."""
+    # The static arguments come first; then what the forward pass kept, and the cotangents.
     gradients, (cotangent, _) = arguments[-2:]
     return _times(cotangent, gradients), None, None, None
 
 
 @jax.jit
-def _times(factor, tree):
+def _times(factor: jax.Array, tree: Any) -> Any:
     return jax.tree.map(lambda leaf: factor * leaf, tree)
 
 
 _at_once.defvjp(_at_once_forward, _scale_gradients)
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def _chunked(field, chunk, params, buffers, batch, key):
-    del chunk
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2))
+def _chunked(
+    field: RadianceField,
+    chunk: int,
+    sequential: bool,
+    params: Any,
+    buffers: Any,
+    batch: Batch,
+    key: jax.Array | None,
+) -> Loss:
+    del chunk, sequential
     return _plain(field, params, buffers, batch, key)
 
 
-def _chunked_forward(field, chunk, params, buffers, batch, key):
-    return take_turns(functools.partial(_add_up, field, chunk))(params, buffers, batch, key)
+def _chunked_forward(
+    field: RadianceField,
+    chunk: int,
+    sequential: bool,
+    params: Any,
+    buffers: Any,
+    batch: Batch,
+    key: jax.Array | None,
+) -> tuple[Loss, Any]:
+    add_up = functools.partial(_add_up, field, chunk)
+    if sequential:
+        add_up = jax.custom_batching.sequential_vmap(add_up)
+    return add_up(params, buffers, batch, key)
 
 
-def _add_up(field, chunk, params, buffers, batch, key):
+def _add_up(
+    field: RadianceField,
+    chunk: int,
+    params: Any,
+    buffers: Any,
+    batch: Batch,
+    key: jax.Array | None,
+) -> tuple[Loss, Any]:
+    """Return the loss and its gradients, one chunk of pixels after the other."""
     total = jnp.sum(batch.weight)
 
-    def add_gradient(gradients, piece):
-        piece, key = piece
+    def add_gradient(gradients: Any, piece: tuple[Batch, Any]) -> tuple[Any, Rendering]:
+        pixels, key = piece
 
-        def share_of_loss(params):
-            rendering = field.render(params, buffers, piece.cameras, piece.pixels, key)
-            loss, _ = field.loss(rendering, piece.rgb, piece.weight)
-            return loss * safe_divide(jnp.sum(piece.weight), total), rendering
+        def share_of_loss(params: Any) -> tuple[jax.Array, Rendering]:
+            rendering = field.render(params, buffers, pixels.cameras, pixels.pixels, key)
+            loss, _ = field.loss(rendering, pixels.rgb, pixels.weight)
+            return loss * safe_divide(jnp.sum(pixels.weight), total), rendering
 
         gradient, rendering = jax.grad(share_of_loss, has_aux=True)(params)
         return jax.tree.map(jnp.add, gradients, gradient), rendering
 
-    pieces = _split(batch, chunk)
-    keys = None if key is None else jax.random.split(key, len(pieces.pixels))
+    pieces, count = _split(batch, chunk), batch.rgb.shape[0]
+    keys = None if key is None else jax.random.split(key, pieces.rgb.shape[0])
     zeros = jax.tree.map(jnp.zeros_like, params)
     gradients, renderings = jax.lax.scan(add_gradient, zeros, (pieces, keys))
-    rendering = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: len(batch.pixels)], renderings)
+    rendering = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], renderings)
     return judge(field, rendering, batch.rgb, batch.weight), gradients
 
 
@@ -136,8 +173,11 @@ _chunked.defvjp(_chunked_forward, _scale_gradients)
 
 
 def _split(batch: Batch, chunk: int) -> Batch:
-    """Pieces of `chunk` pixels on a new leading axis; pixels of weight 0 fill up the last one."""
-    count = len(batch.pixels)
+    """Split a batch into pieces of `chunk` pixels on a new leading axis.
+
+    Pixels of weight 0 fill up the last piece.
+    """
+    count = batch.rgb.shape[0]
     fill = -count % chunk
     cameras = batch.cameras
     if cameras.intrinsics.ndim == 1:

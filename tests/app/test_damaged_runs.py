@@ -16,7 +16,8 @@ from jaxcloseup.app.methods.settings import (
     settings_of,
     with_settings,
 )
-from jaxcloseup.app.run import setup
+from jaxcloseup.app.run import states
+from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.logs import TrainLog
 from jaxcloseup.app.run.loop import TrainingError
 from jaxcloseup.app.run.manifest import write_manifest
@@ -119,11 +120,11 @@ def test_the_program_says_so(kept, tmp_path):
     ("method", "setting"), [("surfels", "capacity=100000000"), ("nerf", "width=2147483647")]
 )
 def test_what_does_not_fit_into_memory_is_not_begun(capture_folder, monkeypatch, method, setting):
-    monkeypatch.setattr(setup, "installed_memory", lambda: 2**30)
+    monkeypatch.setattr(states, "installed_memory", lambda: 2**30)
     preset = with_settings(METHODS[method].presets["quick"], [setting])
     programs = Programs(preset, load_scene(str(capture_folder)))
     with pytest.raises(TrainingError, match=r"takes [\d.]+ GiB, but this computer has 1.0: choose"):
-        setup.initial_state(programs, 0)
+        states.initial_state(programs, run_keys(0))
 
 
 @pytest.mark.parametrize("text", ["{}", NESTED, "[1]", '{"scenes": 3}'])

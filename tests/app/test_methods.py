@@ -24,13 +24,9 @@ from jaxcloseup.app.methods import registry
 from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.methods.shared import splat_training
 from jaxcloseup.app.methods.shared.splat_training import extent, make_field
+from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.run.setup import (
-    FEWEST_POINTS,
-    initial_points,
-    initial_state,
-    state_shapes,
-)
+from jaxcloseup.app.run.states import FEWEST_POINTS, initial_points, initial_state, state_shapes
 from jaxcloseup.artifacts.surfel_ply import read_surfels
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.fields.contract import Rendering
@@ -40,7 +36,7 @@ from jaxcloseup.fields.splats.spherical_harmonics import sh_to_rgb
 from jaxcloseup.geometry.cameras import points_to_pixels
 from jaxcloseup.photos.pyramids import scene_pyramid
 from jaxcloseup.photos.views import camera_at
-from jaxcloseup.training.steps import TrainState
+from jaxcloseup.training.state import TrainState
 
 
 ROOT = pathlib.Path(__file__).parents[2]
@@ -187,7 +183,7 @@ def test_few_points_have_random_ones_beside_them(scene):
 def test_the_shapes_of_a_state_are_those_of_the_state(scene):
     points = np.random.default_rng(0).uniform(-1, 1, (FEWEST_POINTS, 3)).astype(np.float32)
     programs = Programs(TINY_SURFELS, dataclasses.replace(scene, points=points, rgb=points))
-    shapes, state = state_shapes(programs), initial_state(programs, seed=0)
+    shapes, state = state_shapes(programs), initial_state(programs, run_keys(0))
     chex.assert_trees_all_equal_shapes_and_dtypes(shapes, state)
 
 

@@ -16,8 +16,8 @@ from jaxcloseup.app.cli import render as program
 from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.methods.settings import plain_config
 from jaxcloseup.app.run import fine_tuning
+from jaxcloseup.app.run.labels import LabelStart
 from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.run.setup import LabelStart
 from jaxcloseup.app.store.stored_config import preset_from_config
 from jaxcloseup.app.store.stored_run import RunError, change_settings, load_run_scene, read_run
 from jaxcloseup.captures.load import load_scene

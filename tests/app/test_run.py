@@ -22,9 +22,11 @@ from jaxcloseup.app.methods.surfels import REDUCED
 from jaxcloseup.app.report.comparison import say_which_is_best, write_comparison
 from jaxcloseup.app.report.finished_runs import read_finished
 from jaxcloseup.app.run.gate import AGREEMENT, gated, verdict, weigh_labels
-from jaxcloseup.app.run.loop import TrainingError, run_stage
+from jaxcloseup.app.run.keys import run_keys
+from jaxcloseup.app.run.loop import Training, TrainingError, train_stage
 from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.run.setup import initial_points, initial_state
+from jaxcloseup.app.run.states import initial_points, initial_state
+from jaxcloseup.app.run.step_data import TrainData
 from jaxcloseup.app.score.footprints import blur_to_footprint
 from jaxcloseup.app.score.scores import NO_PERCEPTUAL, score, summarize
 from jaxcloseup.app.score.targets import Target
@@ -39,7 +41,7 @@ from jaxcloseup.io.files import write_json
 from jaxcloseup.labels.config import pseudo_settings
 from jaxcloseup.labels.make import label_sources
 from jaxcloseup.photos.views import camera_at
-from jaxcloseup.training.steps import init_state
+from jaxcloseup.training.state import init_state
 
 
 @pytest.fixture(scope="session")
@@ -162,9 +164,8 @@ def test_a_nerf_may_learn_from_rays_of_larger_photographs(capture_folder, capsys
         photographs = programs.photographs
         assert "learning from pixels of photographs of 32 x 24 pixels" in capsys.readouterr().out
         assert photographs.pyramid.sizes == ((24, 32), (12, 16))
-        state, metrics = programs.run(
-            "photographs", initial_state(programs, 0), photographs, count=2
-        )
+        state = initial_state(programs, run_keys(0))
+        state, metrics = programs.run(state, TrainData(photographs), count=2)
     assert state.step == 2 and metrics["skipped"] == 0 and np.isfinite(metrics["loss"])
     assert METHODS["nerf"].presets["quick"].windows.finest == 8  # reduced photographs alone
 
@@ -181,7 +182,7 @@ def test_no_step_is_taken_on_a_truncated_image(capture_folder, capsys):
             points = initial_points(jax.random.key(1), scene, count=500)
             bound = {"field": programs.field, "optimizer": programs.optimizer}
             state = init_state(jax.random.key(0), *points, **bound)
-            after, metrics = programs.run("photographs", state, scene.train, count=3)
+            after, metrics = programs.run(state, TrainData(scene.train), count=3)
         assert "overflow" not in metrics
         states.append(after)
     assert "growing to 2 times the preset's" in capsys.readouterr().out
@@ -195,7 +196,7 @@ def test_a_large_image_is_rendered_in_quarters(capture_folder):
     with jax.numpy_dtype_promotion("standard"):
         scene = load_scene(str(capture_folder))
         programs = Programs(TINY, scene)
-        state = initial_state(programs, 0)
+        state = initial_state(programs, run_keys(0))
         camera = camera_at(scene.train.cameras, 1)
         times = 4 + 3 / camera.width
         size = {"height": 4 * camera.height + 1, "width": 4 * camera.width + 3}
@@ -313,13 +314,13 @@ def test_training_that_is_no_longer_finite_stops_with_what_was_good(capture_fold
         key = jax.random.key(0)
         state = init_state(key, *points, field=programs.field, optimizer=programs.optimizer)
         broken = scene.train.replace(rgb=jnp.full(scene.train.rgb.shape, jnp.nan))
-        checkpoints = Checkpoints(tmp_path, {"scene": "plane"})
+        training = Training(programs, Checkpoints(tmp_path, {"scene": "plane"}))
         good, calls, run = [], [], programs.run
 
-        def breaks_in_the_second_and_after_four(kind, state, views, *, count):
+        def breaks_in_the_second_and_after_four(state, data, *, count):
             calls.append(count)
             broke = len(calls) == 2 or len(calls) > 4
-            now = run(kind, state, broken if broke else views, count=count)
+            now = run(state, TrainData(broken) if broke else data, count=count)
             if not broke:
                 good.append(now[0])
             return now
@@ -327,16 +328,7 @@ def test_training_that_is_no_longer_finite_stops_with_what_was_good(capture_fold
         programs.run = breaks_in_the_second_and_after_four
         message = r"stopped after 8 good .* kept in .* not finite in each of the next 10:"
         with pytest.raises(TrainingError, match=message):
-            run_stage(
-                "baseline",
-                programs,
-                "photographs",
-                state,
-                scene.train,
-                steps=20,
-                checkpoints=checkpoints,
-                save_every=1000,
-            )
+            train_stage(training, "baseline", state, TrainData(scene.train), steps=20)
         step, kept, progress = Checkpoints(tmp_path, {"scene": "plane"}).load("baseline", state)
     assert [entry["skipped"] for entry in progress["history"]] == [0, 2, 0, 0]
     assert step == 8 and calls == [2] * 9

@@ -24,13 +24,16 @@ from tiny_training import assert_same_step
 from jaxcloseup.app.cli import sweep
 from jaxcloseup.app.report.pictures import comparisons
 from jaxcloseup.app.report.sweep_tables import paired_bootstrap, rows, write_sweep
+from jaxcloseup.app.run.keys import run_keys
+from jaxcloseup.app.run.labels import start_labels
 from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.run.setup import initial_points, start_labels
+from jaxcloseup.app.run.states import initial_points
+from jaxcloseup.app.run.step_data import CloseupData, TrainData
 from jaxcloseup.app.sweep import arm_training as sweep_stages
-from jaxcloseup.app.sweep.arm_training import run_sweep, stack_arms
+from jaxcloseup.app.sweep.arm_training import join_arms, run_sweep
 from jaxcloseup.app.sweep.arms import make_arm
 from jaxcloseup.captures.load import load_scene
-from jaxcloseup.training.steps import init_state
+from jaxcloseup.training.state import init_state
 
 
 ARMS = ["control", "labels", "diverse", "rgb_tolerance=0.5+magnification=2:3"]
@@ -48,8 +51,8 @@ def begin(preset, capture_folder):
     state = init_state(
         jax.random.key(0), *points, field=programs.field, optimizer=programs.optimizer
     )
-    state, _ = programs.run("photographs", state, scene.train, count=3)
-    start = start_labels(programs, state, seed=0)
+    state, _ = programs.run(state, TrainData(scene.train), count=3)
+    start = start_labels(programs, state, run_keys(0))
     return programs, start, [make_arm(name, preset).settings for name in ARMS]
 
 
@@ -71,14 +74,15 @@ def test_an_arm_is_the_run_alone(preset, capture_folder):
     with jax.numpy_dtype_promotion("standard"):
         programs, start, arms = begin(preset, capture_folder)
         state, sources = start
-        states, *data = stack_arms(arms, [start] * len(arms), len(jax.devices()))
-        together, metrics = programs.run("arms", states, sources.views, *data, count=1)
+        starts, devices = [start] * len(arms), len(jax.devices())
+        states, data = join_arms(arms, starts, sources.views, devices=devices)
+        together, metrics = programs.run(states, data, count=1)
         for i, settings in enumerate(arms):
             if ARMS[i] == "control":
-                alone, _ = programs.run("photographs", state, sources.views, count=1)
+                alone, _ = programs.run(state, TrainData(sources.views), count=1)
             else:
-                data = sources.views, sources, settings
-                alone, _ = programs.run("random_closeups", state, *data, count=1)
+                data = CloseupData(sources.views, sources, settings)
+                alone, _ = programs.run(state, data, count=1)
             arm = jax.tree.map(lambda leaf, i=i: leaf[i], together.replace(step=alone.step[None]))
             assert_same_step(arm.replace(step=alone.step), alone, state)
             assert int(together.step) == int(alone.step)
@@ -97,8 +101,9 @@ def test_an_arm_that_diverges_takes_no_other_down(capture_folder, capsys):
         both = []
         for second in (arms[1], broken):
             settings = [arms[0], second, arms[2]]
-            states, *data = stack_arms(settings, [start] * 3, len(jax.devices()))
-            both.append(programs.run("arms", states, start.sources.views, *data, count=2))
+            views, devices = start.sources.views, len(jax.devices())
+            states, data = join_arms(settings, [start] * 3, views, devices=devices)
+            both.append(programs.run(states, data, count=2))
     (healthy, _), (after, metrics) = both
     assert metrics["skipped"][:3] == [0, 2, 0]  # then copies of the last, one a device
     assert "skipped, not finite" in capsys.readouterr().out

@@ -43,7 +43,7 @@ from wrong_input import binary
 
 from jaxcloseup.app.run.logs import TrainLog
 from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.run.setup import state_shapes
+from jaxcloseup.app.run.states import state_shapes
 from jaxcloseup.app.store.stored_run import RunError, load_run_scene, read_run
 from jaxcloseup.app.view.camera_files import read_camera_path, read_camera_transform
 from jaxcloseup.app.view.camera_paths import CameraError

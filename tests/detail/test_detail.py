@@ -14,9 +14,10 @@ from jaxcloseup.app.methods.method import TargetConfig
 from jaxcloseup.app.run import fine_tuning, gate
 from jaxcloseup.app.run import kept_detail as training_detail
 from jaxcloseup.app.run.fine_tuning import fine_tune, tuned_detail
-from jaxcloseup.app.run.kept_detail import detail_finder, detail_path, detailed, find_detail
+from jaxcloseup.app.run.kept_detail import detail_getter, detail_path, detailed, find_detail
+from jaxcloseup.app.run.keys import run_keys
+from jaxcloseup.app.run.labels import label_closeups, label_target_views, start_labels
 from jaxcloseup.app.run.residuals import enlarge
-from jaxcloseup.app.run.setup import label_closeups, label_targets, start_labels
 from jaxcloseup.app.score.targets import targets_by_split
 from jaxcloseup.app.store.stored_run import load_run_scene, read_run, restore
 from jaxcloseup.captures.load import DRAWN_SCENES, SceneError, load_scene
@@ -203,9 +204,9 @@ def test_target_views_may_be_labeled_by_their_detail(rendered, found, monkeypatc
     monkeypatch.setattr(programs, "preset", gated)
     monkeypatch.setattr(gate, "weigh_labels", lambda *_: pytest.fail("asked the gate"))
     monkeypatch.setattr(training_detail, "make_detail", lambda *_: pytest.fail("made again"))
-    views, start = programs.scene.test, start_labels(programs, state, seed=0)
-    find = detail_finder(programs, state, path)
-    labels = label_targets(programs, start, views.cameras, by_detail, None, find)
+    views, start = programs.scene.test, start_labels(programs, state, run_keys(0))
+    find = detail_getter(programs, state, path)
+    labels = label_target_views(programs, start, views.cameras, by_detail, None, find)
     truth = np.asarray(to_float(views.rgb))
     render = functools.partial(programs.render, state)
 
@@ -215,25 +216,25 @@ def test_target_views_may_be_labeled_by_their_detail(rendered, found, monkeypatc
     seen = [render(camera_at(views.cameras, i)).rgb for i in range(len(views))]
     assert error(labels.rgb) < 0.9 * error(np.stack(seen))
     monkeypatch.setattr(programs, "run", lambda *data, count: (data, {"skipped": 0}))
-    kind, begun, photographs, learned, _ = fine_tune(programs, start, views.cameras, find, most=1)
-    assert (kind, begun, photographs) == ("target_views", state, programs.scene.train)
-    jax.tree.map(np.testing.assert_array_equal, learned, labels)
+    begun, data = fine_tune(programs, start, views.cameras, find, most=1)
+    assert (begun, data.views) == (state, programs.scene.train)
+    jax.tree.map(np.testing.assert_array_equal, data.labels, labels)
 
     # Of views larger than the windows of photographs, windows as large as these are learned.
     train, size = programs.scene.train, (views.cameras.height - 2, views.cameras.width - 3)
     windows = view_windows(train, *size)
     monkeypatch.setitem(vars(programs), "photographs", windows)
-    learned = fine_tune(programs, start, views.cameras, find, most=1)[3]
+    learned = fine_tune(programs, start, views.cameras, find, most=1)[1].labels
     assert learned.size == size
     np.testing.assert_allclose(
         to_float(learned.pyramid.level(0))[..., 3], labels.weight, atol=0.002
     )
 
-    near = label_closeups(programs, start, by_detail, 0, find)
+    near = label_closeups(programs, start, by_detail, run_keys(0), find)
     assert len(near) == gated.closeup_steps and 0.1 < near.weight.mean() < 1
     far = np.asarray(programs.scene.train.cameras.position)
 
-    others = label_closeups(programs, start, by_detail, 1, find)
+    others = label_closeups(programs, start, by_detail, run_keys(1), find)
     drawn = [np.asarray(views.cameras.position)[:, None] for views in (near, others)]
     assert all(np.linalg.norm(far - one, axis=-1).min() > 0 for one in drawn)
     assert not np.any(drawn[0] == drawn[1])

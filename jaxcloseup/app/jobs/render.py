@@ -13,9 +13,10 @@ from absl import flags
 from jaxcloseup.app import progress
 from jaxcloseup.app.cli.start import check_unused, prepare_to_stop, set_up
 from jaxcloseup.app.run.fine_tuning import fine_tune, tuned_detail
-from jaxcloseup.app.run.kept_detail import detail_finder, detail_path
+from jaxcloseup.app.run.kept_detail import detail_getter, detail_path
+from jaxcloseup.app.run.keys import run_keys
+from jaxcloseup.app.run.labels import start_labels
 from jaxcloseup.app.run.loop import TrainingError
-from jaxcloseup.app.run.setup import start_labels
 from jaxcloseup.app.store.stored_run import RunError, load_run_scene, restore
 from jaxcloseup.app.view import camera_files, camera_paths
 from jaxcloseup.app.view.camera_paths import CameraError, Shots
@@ -93,11 +94,13 @@ def _render() -> None:
     sources = None
     if FLAGS.support or fine_tuned:
         expected = record.preset.labels.expected_depth
-        start = start_labels(programs, state, record.identity["seed"], expected_depth=expected)
+        start = start_labels(
+            programs, state, run_keys(record.identity["seed"]), expected_depth=expected
+        )
         sources = start.sources if FLAGS.support else None
     begin = start.state if fine_tuned else state
     kept = detail_path(record.folder, stage) if begin is state else None
-    find, detail = detail_finder(programs, begin, kept), None
+    find, detail = detail_getter(programs, begin, kept), None
     if fine_tuned:
         state = fine_tune(programs, start, shots.cameras, find, most=FLAGS.target_steps)
     if FLAGS.detail:

@@ -18,12 +18,12 @@ from jaxcloseup.app.methods.settings import plain_config
 from jaxcloseup.app.report.page import Picture
 from jaxcloseup.app.report.pictures import comparisons
 from jaxcloseup.app.report.sweep_tables import print_sweep, write_sweep
+from jaxcloseup.app.run.devices import HOSTS_WAIT
 from jaxcloseup.app.run.logs import TrainLog, check_tensorboard
 from jaxcloseup.app.run.loop import TrainingError
 from jaxcloseup.app.run.manifest import NAME as MANIFEST
 from jaxcloseup.app.run.manifest import about_scene, versions, write_manifest
 from jaxcloseup.app.run.plan import in_words
-from jaxcloseup.app.run.programs import HOSTS_WAIT
 from jaxcloseup.app.score.scores import Perceptual, find_perceptual
 from jaxcloseup.app.store.stored_run import RunError, read_fields
 from jaxcloseup.app.sweep.arm_training import run_sweep

@@ -16,7 +16,7 @@ if TYPE_CHECKING:  # flags read presets, and must not wait for JAX
     from jaxcloseup.artifacts.viewer_gaussians import Gaussians
     from jaxcloseup.fields.contract import RadianceField
     from jaxcloseup.photos.scene import Scene
-    from jaxcloseup.training.steps import TrainState
+    from jaxcloseup.training.state import TrainState
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,7 +6,6 @@ import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax
 import numpy as np
 
 from jaxcloseup.app.report.audits import (
@@ -21,9 +20,11 @@ from jaxcloseup.app.report.page import Picture, by_section, fill_page
 from jaxcloseup.app.report.pictures import comparisons, label_pictures
 from jaxcloseup.app.report.showcase import Exhibit, exhibits
 from jaxcloseup.app.run.gate import verdict
+from jaxcloseup.app.run.keys import run_keys
+from jaxcloseup.app.run.loop import Training
 from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.run.setup import Training, timed
 from jaxcloseup.app.run.stages import Outcome
+from jaxcloseup.app.run.timers import timed
 from jaxcloseup.app.score.metrics_text import FINER, SPLIT_TITLES
 from jaxcloseup.app.score.targets import Target
 from jaxcloseup.artifacts.images import encode_webp_animation
@@ -60,9 +61,8 @@ def report_run(
         targets = outcome.held_out.targets
         brief = list(dict.fromkeys(["baseline", best_stage(outcome.scores)]))
         pictures = comparisons(output_dir / "compare", targets, outcome.images, in_report=brief)
-        _, _, key = jax.random.split(jax.random.key(about["seed"]), 3)
         pictures += label_pictures(
-            key,
+            run_keys(about["seed"]).pictures,
             targets.get("test", []),
             output_dir / "labels",
             scene=scene,
@@ -77,10 +77,7 @@ def report_run(
         "resolution": [size.width, size.height],
         "finer_resolution": _finer_resolution(targets),
         "stages": outcome.scores,
-        "labels": outcome.audit,
-        "left_out": outcome.left_out,
-        "gate": outcome.gate,
-        "detail": outcome.detail,
+        **outcome.evidence,
         "seconds": training.seconds,
         "history": training.history,
     }
@@ -115,7 +112,7 @@ def _showcase(programs: Programs, outcome: Outcome) -> list[Exhibit]:
 def _loaded_photographs(programs: Programs, outcome: Outcome) -> Pyramid:
     """Return the finest photographs that stages have read; a report reads and draws no others."""
     windows, finest = programs.preset.windows, programs.preset.downscale
-    if outcome.detail is not None:
+    if outcome.evidence["detail"] is not None:
         finest = 1
     elif windows is not None:
         finest = windows.finest

@@ -1,19 +1,20 @@
-"""Fine-tuning for target views: the cameras that somebody wants rendered."""
+"""Fine-tuning for target views: the cameras that somebody asks to be rendered."""
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxcloseup.app import progress
-from jaxcloseup.app.run.gate import gated, lets_in, weigh
-from jaxcloseup.app.run.kept_detail import FindDetail, refresh_detail
+from jaxcloseup.app.run.gate import gated, uses_labels, weigh
+from jaxcloseup.app.run.kept_detail import GetDetail, refresh_detail
+from jaxcloseup.app.run.labels import LabelStart, label_target_views, rendered_depths
 from jaxcloseup.app.run.loop import TrainingError
 from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.run.setup import LabelStart, label_targets, rendered_depths
+from jaxcloseup.app.run.step_data import LabeledData
 from jaxcloseup.detail.add import Detail
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.labels.config import LabelConfig
@@ -23,121 +24,126 @@ from jaxcloseup.photos.gather import gather
 from jaxcloseup.photos.pyramids import Pyramid
 from jaxcloseup.photos.views import Views, camera_at
 from jaxcloseup.photos.windows import Windows, view_windows, windows_that_see
-from jaxcloseup.training.steps import TrainState
+from jaxcloseup.training.state import TrainState
 
 
 _REPORTS = 10
-_ENOUGH = 0.95  # share of a view's detail that the photographs must carry that are rendered for it
-_PIXELS = 4096  # of a view, that tell these shares
-_TOGETHER = 8  # numbers of photographs are multiples of this, so that little is compiled
+_ENOUGH = 0.95  # share of a view's detail that the photographs rendered for it must carry
+_PIXELS = 4096  # of a view, on which these shares are measured
+_TOGETHER = 8  # numbers of photographs are multiples of this, so that few shapes are compiled
 
 
-class TargetData(NamedTuple):
-    """What steps for target views begin with and learn from, as `Programs.run` takes it.
+class TargetTraining(NamedTuple):
+    """What training for target views begins with and learns from.
 
     Attributes:
-      state: with what the method adds to it for these labels.
-      photographs: as training reads them, or windows of them that see what the targets see.
-      labels: of the target views, or windows of those that are larger than training's.
-      settings: of these labels.
+      state: the first state, with what the method adds to it for these labels.
+      data: what the steps learn from.
       steps: how many.
-      coverage: share of the target views that has labels.
+      coverage: share of the target views' pixels that have labels.
     """
 
     state: TrainState
-    photographs: Views | Windows
-    labels: Views | Windows
-    settings: PseudoSettings
+    data: LabeledData
     steps: int
     coverage: float
 
 
-def target_data(
+def prepare_target_views(
     programs: Programs,
     start: LabelStart,
     cameras: Camera,
-    how: LabelConfig,
+    labels: LabelConfig,
     settings: PseudoSettings,
-    find: FindDetail,
-) -> TargetData:
-    """What a state learns from for target views.
+    get_detail: GetDetail,
+) -> TargetTraining:
+    """Label target views, and prepare what a state learns from for them.
 
     Args:
       programs: the run's.
       start: the state, and the photographs with its depths.
       cameras: stacked `[Q]`, of the target views.
-      how: how these are labeled.
+      labels: says what labels are.
       settings: of warps, after the gate, and of the steps.
-      find: finds the detail of the state, if labels need it.
+      get_detail: returns the detail of the state; called if labels need it.
     """
     method, field, state = programs.method, programs.preset.field, start.state
     photographs, render = programs.photographs, functools.partial(programs.render, state)
-    labels = label_targets(programs, start, cameras, how, settings, find)
-    steps, coverage = method.target_steps(field, len(labels)), float(jnp.mean(labels.weight))
-    if how.label == "residual":
+    views = label_target_views(programs, start, cameras, labels, settings, get_detail)
+    steps, coverage = method.target_steps(field, len(views)), float(jnp.mean(views.weight))
+    learned: Views | Windows = views
+    if labels.label == "residual":
         key_add, key_windows = jax.random.split(jax.random.fold_in(state.key, state.step))
-        state = method.add_for_targets(key_add, field, state, labels, render, programs.scene)
+        state = method.add_for_targets(key_add, field, state, views, render, programs.scene)
         if isinstance(photographs, Windows):
             depths = rendered_depths(render, cameras, programs.scene)
-            seen = cameras, depths, start.sources.views, start.sources.depths
-            photographs = jax.jit(windows_that_see)(key_windows, photographs, *seen)
-            height, width = photographs.size
-            # What is compiled for windows of photographs serves, and a step takes as long.
-            if _is_larger(labels.cameras, height, width):
-                labels = view_windows(labels, height, width)
-    return TargetData(state, photographs, labels, settings, steps, coverage)
+            photographs = jax.jit(windows_that_see)(
+                key_windows, photographs, cameras, depths, start.sources.views, start.sources.depths
+            )
+            # What is compiled for windows of photographs serves windows of labels too, and a step
+            # takes as long.
+            if _is_larger(cameras, photographs.size):
+                learned = view_windows(views, *photographs.size)
+    return TargetTraining(state, LabeledData(photographs, learned, settings), steps, coverage)
 
 
-def _is_larger(cameras, height, width):
-    """Whether images hold such a window, and are not just that."""
+def _is_larger(cameras: Camera, size: tuple[int, int]) -> bool:
+    """Return True if images hold a window of this height and width, and are not just that."""
+    height, width = size
     holds = cameras.height >= height and cameras.width >= width
-    return holds and (cameras.height, cameras.width) != (height, width)
+    return holds and (cameras.height, cameras.width) != size
 
 
 def tuned_detail(programs: Programs, state: TrainState, cameras: Camera, detail: Detail) -> Detail:
-    """Detail of a state that was fine-tuned for target views, of the photographs that it needs.
+    """Return the detail of a fine-tuned state, of the photographs that its target views need.
 
     Args:
       programs: the run's.
-      state: what fine-tuning ended with.
+      state: the state after fine-tuning.
       cameras: stacked `[Q]`, of the target views.
-      detail: of the state that fine-tuning began with.
+      detail: of the state before fine-tuning.
     """
-    shares = []
-    for index in range(cameras.intrinsics.shape[0]):
-        camera = camera_at(cameras, index)
-        depth = label_depth(programs.render(state, camera), near=0, far=programs.scene.far)
-        shares.append(np.asarray(_shares(detail, camera, depth)))
-    shares = np.stack(shares)
+    shares = np.stack(
+        [
+            np.asarray(_shares(programs, state, camera_at(cameras, index), detail))
+            for index in range(cameras.intrinsics.shape[0])
+        ]
+    )
     order = np.argsort(-shares, axis=1)
     reached = np.cumsum(np.take_along_axis(shares, order, axis=1), axis=1)
-    needed = [own[: np.sum(sums < _ENOUGH) + 1] for own, sums in zip(order, reached, strict=True)]
+    counts = np.sum(reached < _ENOUGH, axis=1) + 1
+    needed = [views[:count] for views, count in zip(order, counts, strict=True)]
     count = len(np.unique(np.concatenate(needed)))
     count = min(-(-count // _TOGETHER) * _TOGETHER, len(detail.sources.trust))
     views = np.argsort(-shares.max(axis=0), kind="stable")[:count]
     return refresh_detail(programs, state, detail, np.sort(views).tolist())
 
 
+def _shares(programs: Programs, state: TrainState, camera: Camera, detail: Detail) -> jax.Array:
+    depth = label_depth(programs.render(state, camera), near=0, far=programs.scene.far)
+    return _shares_at(detail, camera, depth)
+
+
 @jax.jit
-def _shares(detail, camera, depth):
-    """The share of each photograph in what is gathered into a view, `[V]`; its sum is at most 1."""
+def _shares_at(detail: Detail, camera: Camera, depth: jax.Array) -> jax.Array:
+    """Return each photograph's share in what a view gathers, `[V]`; the sum is at most 1."""
     count = detail.sources.trust.shape[0]
     # Each photograph shows nothing but its own number, in as fine pixels as it has.
     numbers = Pyramid(jnp.eye(count)[:, None], detail.shown.intrinsics[:, :1], ((1, 1),))
     every = max(1, round((depth.size / _PIXELS) ** 0.5))
     pixels = pixel_grid(camera.height, camera.width)[::every, ::every]
-    found = gather(camera, pixels, depth[::every, ::every], detail.sources, numbers)
-    return jnp.mean(found.mean, axis=(0, 1))
+    gathered = gather(camera, pixels, depth[::every, ::every], detail.sources, numbers)
+    return jnp.mean(gathered.mean, axis=(0, 1))
 
 
 def fine_tune(
     programs: Programs,
     start: LabelStart,
     cameras: Camera,
-    find: FindDetail,
+    get_detail: GetDetail,
     *,
     most: int | None = None,
-    tell: Callable[[int, int], None] = lambda done, steps: None,
+    report: Callable[[int, int], None] = lambda done, steps: None,
 ) -> TrainState:
     """Train a state for target views, with labels made once for them.
 
@@ -148,36 +154,40 @@ def fine_tune(
       programs: the run's.
       start: the state, and the photographs with its depths.
       cameras: stacked `[Q]`, of the target views.
-      find: finds the detail of the state, if labels need it.
+      get_detail: returns the detail of the state; called if labels need it.
       most: the largest number of steps in all; by default the method's.
-      tell: is told ten times how many steps are done, and how many there are.
+      report: called ten times with the number of steps done, and of all steps.
 
     Raises:
       TrainingError: no step was finite.
     """
     labels, state = programs.preset.target_labels, start.state
     gate = weigh(programs, start) if labels.label == "warp" else None
-    if not lets_in(labels, gate):
+    if not uses_labels(labels, gate):
         print("nothing is fine-tuned")
         return state
-    data = target_data(programs, start, cameras, labels, gated(labels, gate), find)
-    steps = min(data.steps, most or data.steps)
-    print(f"labels on {data.coverage:.0%} of the pixels to be rendered; {steps} steps", flush=True)
-    if data.coverage == 0:
+    prepared = prepare_target_views(
+        programs, start, cameras, labels, gated(labels, gate), get_detail
+    )
+    steps = min(prepared.steps, most or prepared.steps)
+    print(
+        f"labels on {prepared.coverage:.0%} of the pixels to be rendered; {steps} steps", flush=True
+    )
+    if prepared.coverage == 0:
         print("nothing is fine-tuned")
         return state
-    state, *learned = data[:4]
-    done = skipped = 0
+    state, done, skipped = prepared.state, 0, 0
+    metrics: dict[str, Any] = {}
     with progress.part("fine-tuning"):
         progress.count("fine-tuning", done, steps)
         while done < steps:
-            tell(done, steps)
+            report(done, steps)
             count = min(-(-steps // _REPORTS), steps - done)
-            state, values = programs.run("target_views", state, *learned, count=count)
-            done, skipped = done + count, skipped + values["skipped"]
+            state, metrics = programs.run(state, prepared.data, count=count)
+            done, skipped = done + count, skipped + metrics["skipped"]
             progress.count("fine-tuning", done, steps)
     if skipped == steps:
         raise TrainingError(f"loss or gradient was not finite in each of {steps} steps for them")
-    numbers = {key: value for key, value in values.items() if isinstance(value, float)}
+    numbers = {key: value for key, value in metrics.items() if isinstance(value, float)}
     print("  ".join(f"{key} {value:.4g}" for key, value in numbers.items()))
     return state

@@ -7,14 +7,15 @@ harm: it is about a tenth where colors or depth are poor, and a fifth to a third
 (docs/labels.md has the figures).
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax.numpy as jnp
 
+from jaxcloseup.app.run.labels import LabelStart
 from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.run.setup import LabelStart
 from jaxcloseup.app.score.audit import audit_left_out
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
@@ -28,19 +29,20 @@ TOLERANCES = [(rgb, depth) for rgb in (0.02, 0.04, 0.08) for depth in (0.005, 0.
 AGREEMENT = (0.1, 0.2)
 
 
-def verdict(found: Mapping[str, Any]) -> str:
+def verdict(record: Mapping[str, Any]) -> str:
     """Return in one sentence what the gate decided and why, without a final period."""
-    weight = found["weight"]
+    weight = record["weight"]
     used = "labels have full weight" if weight == 1 else f"labels have {weight:.0%} of their weight"
     used = used if weight else "labels are not used"
     return (
-        f"{used}, because they agree closely on {found['agreement']:.0%} of the pixels of left-out "
-        f"photographs (no weight up to {AGREEMENT[0]:.0%}, full weight from {AGREEMENT[1]:.0%})"
+        f"{used}, because they agree closely on {record['agreement']:.0%} of the pixels of "
+        f"left-out photographs (no weight up to {AGREEMENT[0]:.0%}, full weight from "
+        f"{AGREEMENT[1]:.0%})"
     )
 
 
 def weigh(programs: Programs, start: LabelStart) -> dict[str, Any] | None:
-    """The gate's record, if the preset has one: see `weigh_labels`.
+    """Return the record of `weigh_labels` and print its verdict; None without a gate.
 
     Labels with detail have weights of their own, and no gate.
     """
@@ -48,23 +50,23 @@ def weigh(programs: Programs, start: LabelStart) -> dict[str, Any] | None:
     if not preset.gated or "warp" not in (preset.labels.label, preset.target_labels.label):
         return None
     render = functools.partial(programs.render, start.state)
-    found = weigh_labels(start.sources, render, pseudo_settings(preset.labels))
-    print(f"     gate: {verdict(found)}")
-    return found
+    record = weigh_labels(start.sources, render, pseudo_settings(preset.labels))
+    print(f"     gate: {verdict(record)}")
+    return record
 
 
-def lets_in(labels: LabelConfig, gate: Mapping[str, Any] | None) -> bool:
-    """Whether labels have any weight: the gate, if there is one, may shut warped ones out."""
+def uses_labels(labels: LabelConfig, gate: Mapping[str, Any] | None) -> bool:
+    """Return True if pseudo-labels are used; the gate can disable warped ones."""
     return labels.label != "warp" or gate is None or gate["weight"] > 0
 
 
 def gated(labels: LabelConfig, gate: Mapping[str, Any] | None) -> PseudoSettings:
-    """The settings of labels; the gate scales the weight of warped ones."""
+    """Return the settings of labels; the gate scales the weight of warped ones."""
     settings = pseudo_settings(labels)
     if gate is None or labels.label != "warp":
         return settings
-    weight = jnp.float32(gate["weight"])
-    return settings.replace(label_loss_weight=weight * settings.label_loss_weight)
+    weight = jnp.float32(gate["weight"]) * settings.label_loss_weight
+    return dataclasses.replace(settings, label_loss_weight=weight)
 
 
 def weigh_labels(
@@ -72,7 +74,7 @@ def weigh_labels(
     render: Callable[[Camera], Rendering],
     settings: PseudoSettings,
 ) -> dict[str, Any]:
-    """How much labels may weigh, by how well they agree on left-out photographs.
+    """Measure how well labels agree on left-out photographs, and derive their weight.
 
     Args:
       sources: the training photographs with their depths.
@@ -86,12 +88,15 @@ def weigh_labels(
       pixels.
     """
     candidates = [
-        settings.replace(
-            use_mask=jnp.float32(1), rgb_tolerance=jnp.float32(rgb), depth_tolerance=jnp.float32(d)
+        dataclasses.replace(
+            settings,
+            use_mask=jnp.float32(1),
+            rgb_tolerance=jnp.float32(rgb),
+            depth_tolerance=jnp.float32(depth),
         )
-        for rgb, d in TOLERANCES
+        for rgb, depth in TOLERANCES
     ]
-    rows = audit_left_out(sources, render, candidates)
+    rows: list[dict[str, Any]] = audit_left_out(sources, render, candidates)
     agreement = rows[0]["coverage"]
     low, high = AGREEMENT
     weight = min(max((agreement - low) / (high - low), 0.0), 1.0)

@@ -28,7 +28,7 @@ from jaxcloseup.photos.gather import GatherSources, gather_sources
 from jaxcloseup.photos.pyramids import Pyramid
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.views import Views
-from jaxcloseup.training.steps import TrainState
+from jaxcloseup.training.state import TrainState
 
 
 _RECIPE = 8  # a change of how detail is made raises it, so that kept detail is made again
@@ -50,13 +50,13 @@ def detailed_views(programs: Programs, state: TrainState, detail: Detail, camera
     )
 
 
-FindDetail = Callable[[], tuple[Detail, dict[str, Any]]]
+GetDetail = Callable[[], tuple[Detail, dict[str, Any]]]
 
 
-def detail_finder(
+def detail_getter(
     programs: Programs, state: TrainState, path: pathlib.Path | None = None
-) -> FindDetail:
-    """`find_detail` of a state, the first time that it is asked for."""
+) -> GetDetail:
+    """Return a function that finds the detail of a state on its first call, and keeps it."""
     return functools.cache(functools.partial(find_detail, programs, state, path))
 
 

@@ -1,4 +1,4 @@
-"""One stage of training: steps in chunks, with checkpoints."""
+"""One stage of training: steps in chunks, with checkpoints and reports."""
 
 import dataclasses
 from typing import Any
@@ -6,11 +6,14 @@ from typing import Any
 from jaxcloseup.app import progress
 from jaxcloseup.app.run.logs import TrainLog
 from jaxcloseup.app.run.programs import Programs
+from jaxcloseup.app.run.step_data import ArmsData, StepData
+from jaxcloseup.app.run.timers import timed
 from jaxcloseup.artifacts.checkpoints import Checkpoints
-from jaxcloseup.training.steps import TrainState
+from jaxcloseup.training.state import TrainState
 
 
 PERSISTENT = 10  # steps in a row whose loss is not finite
+_REPORTS, _MOST_STEPS = 10, 500  # reports of a stage, and steps between two
 
 
 class TrainingError(Exception):
@@ -18,104 +21,108 @@ class TrainingError(Exception):
 
 
 @dataclasses.dataclass
-class _Progress:
-    """How far a stage has come.
+class Training:
+    """Training on one scene with one preset.
 
     Attributes:
-      done: steps taken.
-      saved: steps of the newest checkpoint.
-      state: after these steps.
-      history: metrics of each chunk, with `step`.
+      programs: what is compiled.
+      checkpoints: keep the states of every stage.
+      log: gets every report; None keeps none.
+      save_every: steps between checkpoints.
+      seconds: filled with the wall time of each part.
+      history: filled with the metrics of each stage, for each chunk of steps with `step`, counted
+        within the stage.
     """
 
-    done: int
-    saved: int
-    state: TrainState
-    history: list[dict[str, Any]]
+    programs: Programs
+    checkpoints: Checkpoints
+    log: TrainLog | None = None
+    save_every: int = 1000
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+    history: dict[str, list[dict[str, Any]]] = dataclasses.field(default_factory=dict)
 
 
-def run_stage(
-    name: str,
-    programs: Programs,
-    kind: str,
-    state: TrainState,
-    *data: Any,
-    steps: int,
-    checkpoints: Checkpoints,
-    save_every: int,
-    log: TrainLog | None = None,
-) -> tuple[TrainState, list[dict[str, Any]]]:
-    """Take `steps` steps, reporting ten times or at least every 500 steps.
+def train_stage(
+    training: Training, stage: str, state: TrainState, data: StepData | ArmsData, *, steps: int
+) -> TrainState:
+    """Take `steps` steps of the kind that learns from `data`, and report ten times or more often.
 
     Resumes from the stage's newest checkpoint, if there is one, with the same next steps.
 
     Args:
-      name: the stage's name.
-      programs: what is compiled.
-      kind: kind of step, as `Programs.run` knows it.
+      training: what is compiled; keeps checkpoints, and gets the stage's history and seconds.
+      stage: name of the stage.
       state: the state before the first step.
-      *data: as `Programs.run` takes it.
+      data: what the steps learn from.
       steps: how many.
-      checkpoints: keep the states.
-      save_every: steps between checkpoints, rounded up to a report; the last state is always kept.
-      log: gets every report.
 
     Returns:
-      The state, and for each chunk its metrics with `step`, counted within the stage.
+      The state after the last step.
 
     Raises:
       TrainingError: `PERSISTENT` steps in a row, or all steps of the stage, were not finite; the
         last good state is kept.
     """
-    chunk = max(1, min(-(-steps // 10), 500))
-    reached = _resume(name, programs, state, checkpoints, steps)
-    progress.count(name, reached.done, steps)
-    if log is not None:
-        log.begin(name, reached.history)
-
-    def keep():
-        kept = {"history": reached.history, "growth": programs.growth}
-        checkpoints.save(name, reached.done, reached.state, kept)
-        reached.saved = reached.done
-
-    failing, good = 0, (reached.done, reached.state)
-    while reached.done < steps:
-        count = min(chunk, steps - reached.done)
-        reached.state, values = programs.run(kind, reached.state, *data, count=count)
-        reached.done += count
-        failing = failing + count if values["skipped"] == count else 0
-        if failing >= min(PERSISTENT, steps):
-            reached.done, reached.state = good
-            reached.history = [e for e in reached.history if e["step"] <= reached.done]
-            if reached.done > reached.saved:
-                keep()
-            raise TrainingError(_why_stopped(name, reached.done, failing, checkpoints))
-        if not failing:
-            good = reached.done, reached.state
-        reached.history.append({"step": reached.done} | values)
-        numbers = {key: value for key, value in values.items() if isinstance(value, float)}
-        shown = (f"{key} {value:.4g}" for key, value in numbers.items())
-        print("  ".join([progress.count(name, reached.done, steps), *shown]), flush=True)
-        if log is not None:
-            log.write(reached.history[-1])
-        if reached.done == steps or (reached.done - reached.saved >= save_every and not failing):
-            keep()
-    return reached.state, reached.history
+    with timed(training.seconds, stage):
+        chunk = max(1, min(-(-steps // _REPORTS), _MOST_STEPS))
+        done, state, history = _resume(training, stage, state, steps)
+        training.history[stage] = history
+        saved, failing, good = done, 0, (done, state)
+        while done < steps:
+            count = min(chunk, steps - done)
+            state, metrics = training.programs.run(state, data, count=count)
+            done += count
+            failing = failing + count if metrics["skipped"] == count else 0
+            if failing >= min(PERSISTENT, steps):
+                done, state = good
+                history[:] = [entry for entry in history if entry["step"] <= done]
+                if done > saved:
+                    _save(training, stage, done, state)
+                raise TrainingError(_why_stopped(stage, done, failing, training.checkpoints))
+            if not failing:
+                good = done, state
+            history.append({"step": done} | metrics)
+            report_steps(stage, done, steps, metrics)
+            if training.log is not None:
+                training.log.write(history[-1])
+            if done == steps or (done - saved >= training.save_every and not failing):
+                _save(training, stage, done, state)
+                saved = done
+    return state
 
 
-def _resume(name, programs, state, checkpoints, steps):
-    kept = checkpoints.load(name, state)
-    if kept is None:
-        return _Progress(0, 0, state, [])
-    done, state, stored = kept
-    programs.make_room(stored["growth"])
-    print(f"{name} {done}/{steps}  resumed")
-    return _Progress(done, done, state, stored["history"])
+def report_steps(stage: str, done: int, steps: int, metrics: dict[str, Any]) -> None:
+    """Print how far a stage is, and the means of its newest steps."""
+    numbers = {key: value for key, value in metrics.items() if isinstance(value, float)}
+    shown = (f"{key} {value:.4g}" for key, value in numbers.items())
+    print("  ".join([progress.count(stage, done, steps), *shown]), flush=True)
 
 
-def _why_stopped(name, done, failing, checkpoints):
+def _resume(
+    training: Training, stage: str, state: TrainState, steps: int
+) -> tuple[int, TrainState, list[dict[str, Any]]]:
+    """Return the steps taken, the state and the history of a stage's newest checkpoint, if any."""
+    done, history = 0, []
+    kept = training.checkpoints.load(stage, state)
+    if kept is not None:
+        done, state, stored = kept
+        history = stored["history"]
+        training.programs.make_room(stored["growth"])
+        print(f"{stage} {done}/{steps}  resumed")
+    progress.count(stage, done, steps)
+    if training.log is not None:
+        training.log.begin(stage, history)
+    return done, state, history
+
+
+def _save(training: Training, stage: str, done: int, state: TrainState) -> None:
+    kept = {"history": training.history[stage], "growth": training.programs.growth}
+    training.checkpoints.save(stage, done, state, kept)
+
+
+def _why_stopped(stage: str, done: int, failing: int, checkpoints: Checkpoints) -> str:
     where = f", whose state is kept in {checkpoints.folder}" if done else ""
     return (
-        f"{name} stopped after {done} good steps{where}: loss or gradient was not finite in each "
+        f"{stage} stopped after {done} good steps{where}: loss or gradient was not finite in each "
         f"of the next {failing}: lower the learning rate, or look for broken photographs or poses"
     )

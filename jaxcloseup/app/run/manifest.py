@@ -13,14 +13,10 @@ import jax
 import numpy as np
 
 import jaxcloseup
-from jaxcloseup.captures.load import Scene
+from jaxcloseup.app.methods.method import Preset
+from jaxcloseup.app.methods.settings import plain_config
 from jaxcloseup.io.files import read_object, write_json
-
-
-try:
-    import resource
-except ImportError:  # not a Unix: what a run uses is not measured
-    resource = None
+from jaxcloseup.photos.scene import Scene
 
 
 NAME = "manifest.json"
@@ -75,6 +71,26 @@ def about_scene(scene: Scene, load_options: Mapping[str, Any]) -> dict[str, Any]
     }
 
 
+def identity_of(scene: Scene, preset: Preset, names: Mapping[str, str]) -> dict[str, Any]:
+    """Return what tells one training from another, as JSON; programs add entries of their own.
+
+    Args:
+      scene: what is trained.
+      preset: how.
+      names: "method" and "preset" by name.
+    """
+    size = scene.train.cameras
+    return {
+        "scene": scene.name,
+        "config": plain_config(preset),
+        **names,
+        "resolution": [size.width, size.height],
+        "version": jaxcloseup.__version__,
+        "data_sha256": hash_data(scene),
+        "target_views_sha256": hash_targets(scene),
+    }
+
+
 def write_dataparser_transforms(folder: pathlib.Path, scene: Scene) -> None:
     """Write `dataparser_transforms.json`, nerfstudio's record of a run's change of coordinates.
 
@@ -115,7 +131,7 @@ def hash_targets(scene: Scene) -> str | None:
     return _hash({"camtoworld": cameras.camtoworld, "intrinsics": cameras.intrinsics})
 
 
-def _hash(arrays):
+def _hash(arrays: Mapping[str, Any]) -> str:
     digest = hashlib.sha256()
     for name, array in arrays.items():
         array = np.ascontiguousarray(array)
@@ -124,9 +140,11 @@ def _hash(arrays):
     return digest.hexdigest()
 
 
-def _resources_used():
-    """Core-seconds and the largest resident memory in bytes, of this process since it began."""
-    if resource is None:
+def _resources_used() -> dict[str, float]:
+    """Return the core-seconds and the largest resident memory in bytes of this process so far."""
+    try:
+        import resource
+    except ImportError:  # not a Unix: what a run uses is not measured
         return {}
     used = resource.getrusage(resource.RUSAGE_SELF)
     unit = 1 if platform.system() == "Darwin" else 1024
@@ -147,7 +165,7 @@ def git_commit(folder: pathlib.Path) -> tuple[str | None, bool | None]:
     return commit, None if changes is None else bool(changes)
 
 
-def _git(folder, *args):
+def _git(folder: pathlib.Path, *args: str) -> str | None:
     try:
         done = subprocess.run(
             ["git", "-C", str(folder), *args], capture_output=True, text=True, timeout=30

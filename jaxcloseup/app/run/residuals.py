@@ -16,7 +16,7 @@ from jaxcloseup.detail import residuals
 from jaxcloseup.detail.residuals import Residuals
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.photos.pyramids import Pyramid
-from jaxcloseup.training.steps import TrainState
+from jaxcloseup.training.state import TrainState
 
 
 # How many times finer than reduced photographs a state is rendered; for finer ones it is enlarged.

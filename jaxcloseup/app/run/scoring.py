@@ -8,8 +8,10 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxcloseup.app.run.labels import LabelStart
+from jaxcloseup.app.run.loop import Training
 from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.run.setup import LabelStart, Training, timed
+from jaxcloseup.app.run.timers import timed
 from jaxcloseup.app.score.ladder import describe_ladder, ladder_targets
 from jaxcloseup.app.score.metrics_text import describe_split
 from jaxcloseup.app.score.renders import write_renders
@@ -17,11 +19,11 @@ from jaxcloseup.app.score.scores import Perceptual, evaluate
 from jaxcloseup.app.score.targets import Target, exact_depths, targets_by_split
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
-from jaxcloseup.training.steps import TrainState
+from jaxcloseup.training.state import TrainState
 
 
 class HeldOut(NamedTuple):
-    """What stages are scored on.
+    """The views that stages are scored on.
 
     Attributes:
       targets: held-out views by split.
@@ -40,7 +42,7 @@ class HeldOut(NamedTuple):
 
 
 def hold_out(programs: Programs, start: LabelStart) -> HeldOut:
-    """The views to score on. Their coverage is that of `start`, so that all are scored alike."""
+    """Return the views to score on. Coverage is that of `start`, so that all are scored alike."""
     scene, render = programs.scene, functools.partial(programs.render, start.state)
     exact = exact_depths(scene, scene.train.cameras) if scene.surface else None
     finer = programs.preset.score_downscale
@@ -53,6 +55,7 @@ class Scorer:
     """Scores stages on the held-out views, and writes their renders and exports.
 
     Attributes:
+      held_out: the views.
       scores: by stage and split.
       images: renders by stage and split, then by the view's name; without the zoom ladder's.
     """
@@ -65,7 +68,7 @@ class Scorer:
         perceptual: Perceptual,
     ) -> None:
         """Score nothing yet."""
-        self._training, self._held_out = training, held_out
+        self._training, self.held_out = training, held_out
         self._folder, self._perceptual = output_dir, perceptual
         self.scores: dict[str, dict[str, Any]] = {}
         self.images: dict[tuple[str, str], Mapping[str, np.ndarray]] = {}
@@ -84,16 +87,19 @@ class Scorer:
         if render is None:
             render = functools.partial(programs.render, state)
             programs.method.export(self._folder, stage, state.params, state.buffers)
-        targets, ladder = self._held_out.targets, self._held_out.ladder
+        targets, ladder = self.held_out.targets, self.held_out.ladder
         with timed(self._training.seconds, f"{stage}_evaluation"):
-            scores, shown = {}, {}
-            for split, views in self._held_out.all.items():
+            scores: dict[str, Any] = {}
+            shown: dict[str, np.ndarray] = {}
+            for split, views in self.held_out.all.items():
                 scores[split], seen = evaluate(render, views, self._perceptual)
                 write_renders(self._folder / "renders" / stage / split, seen, programs.scene)
                 if split in targets:
-                    self.images[stage, split] = {name: one.rgb for name, one in seen.items()}
+                    self.images[stage, split] = {
+                        name: np.asarray(rendering.rgb) for name, rendering in seen.items()
+                    }
                     name, first = next(iter(seen.items()))
-                    shown[f"{split}/{name}"] = first.rgb
+                    shown[f"{split}/{name}"] = np.asarray(first.rgb)
                     print(f"{stage:>9} {split}: {describe_split(scores[split])}", flush=True)
             self.scores[stage] = scores
             if log is not None:

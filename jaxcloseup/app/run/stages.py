@@ -1,7 +1,6 @@
-"""The stages of a run on one scene: baseline, control, closeup, test_time, detail."""
+"""The stages of a run on one scene: baseline, control, closeup, detail, test_time."""
 
-import functools
-import itertools
+import dataclasses
 import pathlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -10,30 +9,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcloseup.app.run.fine_tuning import target_data
-from jaxcloseup.app.run.gate import gated, lets_in, weigh
-from jaxcloseup.app.run.kept_detail import FindDetail, detail_finder, detail_path, detailed
+from jaxcloseup.app.run.fine_tuning import prepare_target_views
+from jaxcloseup.app.run.gate import gated, uses_labels, weigh
+from jaxcloseup.app.run.kept_detail import GetDetail, detail_getter, detail_path, detailed
+from jaxcloseup.app.run.keys import RunKeys, run_keys
+from jaxcloseup.app.run.labels import LabelStart, label_closeups, start_labels
+from jaxcloseup.app.run.loop import Training, train_stage
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.scoring import HeldOut, Scorer, hold_out
-from jaxcloseup.app.run.setup import (
-    LabelStart,
-    Training,
-    label_closeups,
-    say_which_points_fit,
-    start_labels,
-    timed,
-)
 from jaxcloseup.app.run.stage_names import STAGES
+from jaxcloseup.app.run.states import say_which_points_fit, train_baseline
+from jaxcloseup.app.run.step_data import CloseupData, LabeledData, StepData, TrainData
+from jaxcloseup.app.run.timers import timed
 from jaxcloseup.app.score.audit import audit_labels, left_out_curve
 from jaxcloseup.app.score.expected_errors import compare_errors
 from jaxcloseup.app.score.renders import write_truth
 from jaxcloseup.app.score.scores import NO_PERCEPTUAL, Perceptual
+from jaxcloseup.detail.add import Detailed
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
-from jaxcloseup.labels.make import LabelSources, PseudoSettings, label_sources
+from jaxcloseup.labels.make import PseudoSettings, label_sources
 from jaxcloseup.labels.rules import label_depth
-from jaxcloseup.photos.views import Views
-from jaxcloseup.training.steps import TrainState
+from jaxcloseup.training.state import TrainState
+
+
+Render = Callable[[Camera], Rendering]
 
 
 class Outcome(NamedTuple):
@@ -42,26 +42,71 @@ class Outcome(NamedTuple):
     Attributes:
       start: what fine-tuning began with.
       settings: how labels are made, after the gate.
-      gate: the evidence of the left-out photographs, or None without a gate.
       held_out: the views that were scored.
       scores: by stage and split.
       images: renders of held-out views, by stage and split, then by name.
-      audit: labels against the truth, by the depth they are made from; empty on captures.
-      left_out: `error_curve` of labels of left-out photographs.
-      detail: what `find_detail` says of the stage that got detail, with its `stage`; None without.
+      evidence: for JSON. `labels`: labels against the truth, by the depth they are made from, empty
+        on captures. `left_out`: `error_curve` of labels of left-out photographs. `gate`: see
+        `weigh`. `detail`: see `add_detail_stage`; None without.
       render: `camera -> Rendering` as the last stage renders.
     """
 
     start: LabelStart
     settings: PseudoSettings
-    gate: Mapping[str, Any] | None
     held_out: HeldOut
     scores: Mapping[str, Mapping[str, Any]]
     images: Mapping[tuple[str, str], Mapping[str, np.ndarray]]
-    audit: Mapping[str, Any]
-    left_out: Mapping[str, Any] | None
-    detail: Mapping[str, Any] | None
-    render: Callable[[Camera], Rendering]
+    evidence: Mapping[str, Any]
+    render: Render
+
+
+@dataclasses.dataclass
+class Run:
+    """What the stages of a run share.
+
+    Attributes:
+      training: what trains.
+      keys: random keys.
+      folder: the run's folder.
+      start: what fine-tuning begins with.
+      scorer: scores the stages.
+      gate: the evidence of the left-out photographs, or None without a gate.
+      settings: how close-ups are labeled, after the gate.
+      stage: name of the latest stage that trained.
+      state: its state.
+    """
+
+    training: Training
+    keys: RunKeys
+    folder: pathlib.Path
+    start: LabelStart
+    scorer: Scorer
+    gate: Mapping[str, Any] | None
+    settings: PseudoSettings
+    stage: str
+    state: TrainState
+
+    @property
+    def programs(self) -> Programs:
+        """What is compiled."""
+        return self.training.programs
+
+    def train(
+        self, stage: str, state: TrainState, data: StepData, *, steps: int | None = None
+    ) -> TrainState:
+        """Train and score a stage; by default for as many steps as `closeup`."""
+        steps = self.programs.preset.closeup_steps if steps is None else steps
+        state = train_stage(self.training, stage, state, data, steps=steps)
+        self.scorer.score(stage, state)
+        return state
+
+    def render(self, camera: Camera) -> Rendering:
+        """Render the latest state."""
+        return self.programs.render(self.state, camera)
+
+    def get_detail(self, stage: str, state: TrainState) -> GetDetail:
+        """Return a function that finds the detail of a stage's state in the folder, or makes it."""
+        return detail_getter(self.programs, state, detail_path(self.folder, stage))
 
 
 def run_stages(
@@ -81,155 +126,143 @@ def run_stages(
       to_run: names of stages; `baseline` always runs.
       perceptual: networks of LPIPS.
     """
-    programs = training.programs
-    preset, scene, photographs = programs.preset, programs.scene, programs.photographs
-    say_which_points_fit(programs)
-    baseline = training.train_baseline("baseline", seed)
-    with timed(training.seconds, "depths"):
-        expected = preset.labels.expected_depth
-        start = start_labels(programs, baseline, seed, expected_depth=expected)
-        held_out = hold_out(programs, start)
-    write_truth(output_dir / "renders" / "truth", held_out.all)
-    scorer = Scorer(training, held_out, output_dir, perceptual)
-    scorer.score("baseline", baseline)
-    with timed(training.seconds, "gate"):
-        gate = weigh(programs, start)
-    settings = gated(preset.labels, gate)
-    latest = "baseline", baseline
-
-    def find(stage, state):
-        return detail_finder(programs, state, detail_path(output_dir, stage))
-
-    def continue_from(state, stage, kind, *data):
-        steps = preset.closeup_steps
-        state = training.train(stage, kind, state, photographs, *data, steps=steps)
-        scorer.score(stage, state)
-        return stage, state
-
+    run = train_baseline_stage(training, run_keys(seed), output_dir, perceptual)
+    preset, baseline = run.programs.preset, run.state
     # Without labels `closeup` is its control: the same steps on the same photographs.
-    use_labels = lets_in(preset.labels, gate)
-    if "control" in to_run or ("closeup" in to_run and not use_labels):
-        latest = continue_from(baseline, "control", "photographs")
-    if "closeup" in to_run and use_labels:
-        kind, labels = closeup_labels(training, start, seed, find("baseline", start.state))
-        latest = continue_from(start.state, "closeup", kind, labels, settings)
+    labeled = uses_labels(preset.labels, run.gate)
+    if "control" in to_run or ("closeup" in to_run and not labeled):
+        data = TrainData(run.programs.photographs)
+        run.stage, run.state = "control", run.train("control", baseline, data)
+    if "closeup" in to_run and labeled:
+        closeups = closeup_data(run)
+        run.stage, run.state = "closeup", run.train("closeup", run.start.state, closeups)
     elif "closeup" in to_run:
-        scorer.score("closeup", latest[1])
-    detail, render = None, functools.partial(programs.render, latest[1])
-    find_latest = find(*latest)
+        run.scorer.score("closeup", run.state)
+    get_detail = run.get_detail(run.stage, run.state)
+    detail, render = None, run.render
     if "detail" in to_run:
-        detail, render = add_detail_stage(training, scorer, held_out, *latest, find_latest)
-    if "test_time" in to_run and scene.test is None:
-        print(f"no test_time: {scene.name} holds out no close-ups (--split=closest does)")
-    elif "test_time" in to_run:
-        by_detail = preset.target_labels.label == "residual"
-        # The detail of the latest state is there, or made anyway.
-        begin = start._replace(state=latest[1]) if by_detail else start
-        train_for_targets(
-            *(training, scorer, begin, gate, find_latest), controlled="control" in to_run
-        )
+        detail, render = add_detail_stage(run, get_detail)
+    if "test_time" in to_run:
+        train_for_target_views(run, get_detail, controlled="control" in to_run)
     with timed(training.seconds, "audit"):
-        audit, left_out = audit_all(programs, start, held_out.exact, settings, seed)
+        audit = audit_all(run)
     return Outcome(
-        *(start, settings, gate, held_out, scorer.scores, scorer.images),
-        *(audit, left_out, detail, render),
+        start=run.start,
+        settings=run.settings,
+        held_out=run.scorer.held_out,
+        scores=run.scorer.scores,
+        images=run.scorer.images,
+        evidence={**audit, "gate": run.gate, "detail": detail},
+        render=render,
     )
 
 
-def train_for_targets(
-    training: Training,
-    scorer: Scorer,
-    start: LabelStart,
-    gate: Mapping[str, Any] | None,
-    find: FindDetail,
-    *,
-    controlled: bool,
-) -> None:
-    """Train and score `test_time`, and its control: as many steps on the same photographs alone."""
-    programs, stage, control = training.programs, "test_time", "test_time_control"
-    with timed(training.seconds, "test_time_labels"):
-        how, cameras = programs.preset.target_labels, programs.scene.test.cameras
-        data = target_data(programs, start, cameras, how, gated(how, gate), find)
-
-    def train(name, kind, state, *labels):
-        state = training.train(name, kind, state, data.photographs, *labels, steps=data.steps)
-        scorer.score(name, state)
-        return state
-
-    labeled = lets_in(how, gate)
-    if controlled or not labeled:
-        targets = programs.preset.targets
-        rate = data.settings.lr_scale if targets is None else jnp.float32(targets.control_lr_scale)
-        without = train(control, "photographs", start.state, rate)
-    if labeled:
-        train(stage, "target_views", data.state, data.labels, data.settings)
-    else:
-        scorer.score(stage, without)
+def train_baseline_stage(
+    training: Training, keys: RunKeys, output_dir: pathlib.Path, perceptual: Perceptual
+) -> Run:
+    """Train and score `baseline`, and prepare what the other stages share."""
+    programs, labels = training.programs, training.programs.preset.labels
+    say_which_points_fit(programs)
+    state = train_baseline(training, "baseline", keys)
+    with timed(training.seconds, "depths"):
+        start = start_labels(programs, state, keys, expected_depth=labels.expected_depth)
+        held_out = hold_out(programs, start)
+    write_truth(output_dir / "renders" / "truth", held_out.all)
+    scorer = Scorer(training, held_out, output_dir, perceptual)
+    scorer.score("baseline", state)
+    with timed(training.seconds, "gate"):
+        gate = weigh(programs, start)
+    settings = gated(labels, gate)
+    return Run(training, keys, output_dir, start, scorer, gate, settings, "baseline", state)
 
 
-def add_detail_stage(
-    training: Training,
-    scorer: Scorer,
-    held_out: HeldOut,
-    stage: str,
-    state: TrainState,
-    find: FindDetail,
-) -> tuple[dict[str, Any], Callable[[Camera], Rendering]]:
-    """Score the renders of a stage again with the photographs' detail; its record, and them.
+def closeup_data(run: Run) -> CloseupData | LabeledData:
+    """Return what the steps of `closeup` learn from: labels, or what each step labels."""
+    programs, labels = run.programs, run.programs.preset.labels
+    if labels.label == "warp":
+        return CloseupData(programs.photographs, run.start.sources, run.settings)
+    get_detail = run.get_detail("baseline", run.start.state)
+    with timed(run.training.seconds, "closeup_labels"):
+        views = label_closeups(programs, run.start, labels, run.keys, get_detail)
+    return LabeledData(programs.photographs, views, run.settings)
 
-    The record has what `find_detail` says, and `errors`, expected and actual ones.
+
+def add_detail_stage(run: Run, get_detail: GetDetail) -> tuple[dict[str, Any], Render]:
+    """Score the renders of the latest stage again with the photographs' detail.
+
+    Returns:
+      A record for JSON: the `stage`, what `find_detail` says, and `errors`, expected and actual
+      ones; and a function that renders with detail.
     """
-    programs = training.programs
-    with timed(training.seconds, "detail"):
-        detail, about = find()
+    programs, state, scorer = run.programs, run.state, run.scorer
+    with timed(run.training.seconds, "detail"):
+        detail, about = get_detail()
 
-    def render(camera):
+    def render(camera: Camera) -> Rendering:
         rendering = programs.render(state, camera)
         return rendering._replace(rgb=detailed(programs, detail, camera, rendering).rgb)
 
-    def detail_of(camera):
+    def detail_of(camera: Camera) -> Detailed:
         return detailed(programs, detail, camera, programs.render(state, camera))
 
     scorer.score("detail", state, render)
-    with timed(training.seconds, "expected_errors"):
-        targets = (held_out.targets[name] for name in programs.scene.names if name != "train")
-        errors = compare_errors(detail_of, list(itertools.chain(*targets)))
-    return {"stage": stage, **about, "errors": errors}, render
+    with timed(run.training.seconds, "expected_errors"):
+        splits = (name for name in programs.scene.names if name != "train")
+        targets = [target for name in splits for target in scorer.held_out.targets[name]]
+        errors = compare_errors(detail_of, targets)
+    return {"stage": run.stage, **about, "errors": errors}, render
 
 
-def closeup_labels(
-    training: Training, start: LabelStart, seed: int, find: FindDetail
-) -> tuple[str, LabelSources | Views]:
-    """The kind of steps of `closeup`, and its labels, or what each step makes them from."""
-    programs = training.programs
-    if programs.preset.labels.label == "warp":
-        return "random_closeups", start.sources
-    with timed(training.seconds, "closeup_labels"):
-        labels = label_closeups(programs, start, programs.preset.labels, seed, find)
-    return "target_views", labels
+def train_for_target_views(run: Run, get_detail: GetDetail, *, controlled: bool) -> None:
+    """Train and score `test_time`, and its control: as many steps on the same photographs alone."""
+    programs, preset, scene = run.programs, run.programs.preset, run.programs.scene
+    if scene.test is None:
+        print(f"no test_time: {scene.name} holds out no close-ups (--split=closest does)")
+        return
+    labels, start = preset.target_labels, run.start
+    if labels.label == "residual":  # the detail of the latest state is there, or made anyway
+        start = start._replace(state=run.state)
+    settings = gated(labels, run.gate)
+    with timed(run.training.seconds, "test_time_labels"):
+        prepared = prepare_target_views(
+            programs, start, scene.test.cameras, labels, settings, get_detail
+        )
+    labeled = uses_labels(labels, run.gate)
+    if controlled or not labeled:
+        rate = settings.lr_scale
+        if preset.targets is not None:
+            rate = jnp.float32(preset.targets.control_lr_scale)
+        data = TrainData(prepared.data.views, rate)
+        control = run.train("test_time_control", start.state, data, steps=prepared.steps)
+    if labeled:
+        run.train("test_time", prepared.state, prepared.data, steps=prepared.steps)
+    else:
+        run.scorer.score("test_time", control)
 
 
-def audit_all(
-    programs: Programs,
-    start: LabelStart,
-    exact: jax.Array | None,
-    settings: PseudoSettings,
-    seed: int,
-) -> tuple[dict[str, Any], Mapping[str, Any] | None]:
-    """Labels against the truth, for each depth they can have, and against left-out photographs."""
-    _, key, _ = jax.random.split(jax.random.key(seed), 3)
-    scene, render = programs.scene, functools.partial(programs.render, start.state)
-    audit = {}
+def audit_all(run: Run) -> dict[str, Any]:
+    """Compare labels with the truth, for each depth they can have, and with left-out photographs.
+
+    Returns:
+      `labels` and `left_out`, see `Outcome`.
+    """
+    programs, start, scene = run.programs, run.start, run.programs.scene
+    exact, labels = run.scorer.held_out.exact, {}
+
+    def render(camera: Camera) -> Rendering:
+        return programs.render(start.state, camera)
+
     if exact is not None:
+        assert scene.surface is not None
+        exact_sources = jax.jit(label_sources)(scene.train, exact)
         ways = {
-            "exact_depth": (
-                jax.jit(label_sources)(scene.train, exact),
-                lambda camera: scene.surface(camera).depth,
-            ),
+            "exact_depth": (exact_sources, lambda camera: scene.surface(camera).depth),
             "trained_depth": (start.sources, lambda camera: label_depth(render(camera))),
         }
-        audit = {
-            name: audit_labels(key, exact, scene, sources, settings, render_depth=render_depth)
+        labels = {
+            name: audit_labels(
+                run.keys.audit, exact, scene, sources, run.settings, render_depth=render_depth
+            )
             for name, (sources, render_depth) in ways.items()
         }
-    return audit, left_out_curve(start.sources, render, settings)
+    return {"labels": labels, "left_out": left_out_curve(start.sources, render, run.settings)}

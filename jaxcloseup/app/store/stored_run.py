@@ -14,14 +14,14 @@ from jaxcloseup.app.methods.settings import with_settings
 from jaxcloseup.app.run import manifest
 from jaxcloseup.app.run.loop import TrainingError
 from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.run.setup import state_shapes
+from jaxcloseup.app.run.states import state_shapes
 from jaxcloseup.app.store.stored_config import preset_from_config
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.io.files import read_object
 from jaxcloseup.io.messages import printable
 from jaxcloseup.photos.scene import Scene
-from jaxcloseup.training.steps import TrainState
+from jaxcloseup.training.state import TrainState
 
 
 # The stage to render by default is the first of these that a run has.

@@ -12,21 +12,17 @@ import numpy as np
 
 from jaxcloseup.app import progress
 from jaxcloseup.app.methods.method import Preset
-from jaxcloseup.app.run.fine_tuning import target_data
-from jaxcloseup.app.run.kept_detail import FindDetail, detail_finder
+from jaxcloseup.app.run.fine_tuning import prepare_target_views
+from jaxcloseup.app.run.kept_detail import GetDetail, detail_getter
+from jaxcloseup.app.run.keys import RunKeys, run_keys
+from jaxcloseup.app.run.labels import LabelStart, label_closeups, rendered_depths, start_labels
 from jaxcloseup.app.run.logs import TrainLog
-from jaxcloseup.app.run.loop import TrainingError
+from jaxcloseup.app.run.loop import Training, TrainingError, train_stage
+from jaxcloseup.app.run.manifest import identity_of
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.scoring import HeldOut, hold_out
-from jaxcloseup.app.run.setup import (
-    LabelStart,
-    Training,
-    identity_of,
-    label_closeups,
-    rendered_depths,
-    say_which_points_fit,
-    start_labels,
-)
+from jaxcloseup.app.run.states import say_which_points_fit, train_baseline
+from jaxcloseup.app.run.step_data import ArmsData, LabeledData
 from jaxcloseup.app.score.metrics_text import SPLIT_TITLES
 from jaxcloseup.app.score.scores import NO_PERCEPTUAL, Perceptual, evaluate
 from jaxcloseup.app.score.targets import Target
@@ -36,14 +32,16 @@ from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.labels.make import LabelSources, PseudoSettings
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.views import Views
-from jaxcloseup.training.steps import TrainState
+from jaxcloseup.photos.windows import Windows
+from jaxcloseup.training.arms import arm_state, stack_arms, stack_states
+from jaxcloseup.training.state import TrainState
 
 
 SHOWN = 2  # views of a split
 
 
 class SweepOutcome(NamedTuple):
-    """What a sweep found on one scene.
+    """The results of a sweep on one scene.
 
     Attributes:
       scores: for each arm, then seed, `skipped` steps and the metrics of each split in `splits`.
@@ -128,23 +126,32 @@ def order_arms(
 
 
 class Starts:
-    """Baselines of all seeds, and what fine-tuning on labels begins with."""
+    """Baselines of all seeds, and what fine-tuning on labels begins with.
+
+    Attributes:
+      skipped: steps of each seed's baseline that were skipped.
+    """
 
     def __init__(self, training: Training, seeds: int) -> None:
         """Train a baseline for each seed."""
         self._programs = training.programs
-        self._baselines: list[TrainState] = []
-        self.skipped: list[int] = []
-        for seed in range(seeds):
-            self._baselines.append(training.train_baseline(f"baseline_{seed}", seed))
-            self.skipped.append(count_skipped(training.history[f"baseline_{seed}"]))
+        self._keys = [run_keys(seed) for seed in range(seeds)]
+        self._baselines = [
+            train_baseline(training, f"baseline_{seed}", keys)
+            for seed, keys in enumerate(self._keys)
+        ]
+        histories = (training.history[f"baseline_{seed}"] for seed in range(seeds))
+        self.skipped = [count_skipped(history) for history in histories]
         self._starts: dict[tuple[int, bool | None], LabelStart] = {}
 
     def of(self, seed: int, expected_depth: bool | None = None) -> LabelStart:
-        """The start of a seed; `expected_depth` as in `LabelConfig`."""
+        """Return the start of a seed; `expected_depth` as in `LabelConfig`."""
         if (seed, expected_depth) not in self._starts:
             self._starts[seed, expected_depth] = start_labels(
-                self._programs, self._baselines[seed], seed, expected_depth=expected_depth
+                self._programs,
+                self._baselines[seed],
+                self._keys[seed],
+                expected_depth=expected_depth,
             )
         return self._starts[seed, expected_depth]
 
@@ -153,6 +160,8 @@ class ArmScorer:
     """Scores arms on the held-out views.
 
     Attributes:
+      programs: what is compiled.
+      held_out: the views.
       scores: see `SweepOutcome`.
     """
 
@@ -168,21 +177,18 @@ class ArmScorer:
 
     def score(self, arm: str, seed: int, state: TrainState, skipped: int) -> None:
         """Render and score one arm of one seed."""
+        render, splits = functools.partial(self.programs.render, state), {}
         with progress.part(f"{arm}_{seed}_evaluation"):
-            self._score(arm, seed, state, skipped)
-
-    def _score(self, arm, seed, state, skipped):
-        splits = {}
-        for split, targets in self.held_out.all.items():
-            render = functools.partial(self.programs.render, state)
-            splits[split], seen = evaluate(render, targets, self._perceptual)
-            if seed == 0 and split in self._shown:
-                shown = self._shown[split]
-                self._images[arm, split] = {view.name: seen[view.name].rgb for view in shown}
+            for split, targets in self.held_out.all.items():
+                splits[split], seen = evaluate(render, targets, self._perceptual)
+                if seed == 0 and split in self._shown:
+                    self._images[arm, split] = {
+                        view.name: np.asarray(seen[view.name].rgb) for view in self._shown[split]
+                    }
         self.scores[arm][str(seed)] = {"skipped": skipped, "splits": splits}
 
     def outcome(self) -> SweepOutcome:
-        """Everything that was scored, with arms in the order in which the user named them."""
+        """Return all scores, with arms in the order in which the user named them."""
         order = {arm: i for i, arm in enumerate(self.scores)}
         pairs = sorted(self._images.items(), key=lambda pair: order[pair[0][0]])
         return SweepOutcome(self.scores, self._shown, dict(pairs))
@@ -197,44 +203,48 @@ def train_together(
 ) -> None:
     """Train and score arms as one program."""
     print(f"{name}: " + ", ".join(f"{arm.name} {seed}" for arm, seed in group))
-    begun = [starts.of(seed, arm.labels.expected_depth) for arm, seed in group]
-    state, sources, settings = stack_arms(
-        [arm.settings for arm, _ in group], begun, len(jax.devices())
+    states, data = join_arms(
+        [arm.settings for arm, _ in group],
+        [starts.of(seed, arm.labels.expected_depth) for arm, seed in group],
+        training.programs.photographs,
+        devices=len(jax.devices()),
     )
     steps = training.programs.preset.closeup_steps
-    views = training.programs.photographs
-    states = training.train(name, "arms", state, views, sources, settings, steps=steps)
+    states = train_stage(training, name, states, data, steps=steps)
     # A slice of what lies on all devices would too: each would render it, in step with the others,
     # while threads render several views at once.
     states = jax.device_put(states, jax.local_devices()[0])
     for i, (arm, seed) in enumerate(group):
-        alone = jax.tree.map(lambda leaf, i=i: leaf[i], states.replace(step=None))
         skipped = sum(chunk["skipped"][i] for chunk in training.history[name])
-        scorer.score(arm.name, seed, alone.replace(step=states.step), skipped)
+        scorer.score(arm.name, seed, arm_state(states, i), skipped)
 
 
-def stack_arms(
-    settings: Sequence[PseudoSettings], starts: Sequence[LabelStart], devices: int
-) -> tuple[TrainState, LabelSources, PseudoSettings]:
-    """States, sources and settings with a leading axis of arms, as `Programs.run` takes them.
+def join_arms(
+    settings: Sequence[PseudoSettings],
+    starts: Sequence[LabelStart],
+    photographs: Views | Windows,
+    *,
+    devices: int,
+) -> tuple[TrainState, ArmsData]:
+    """Return the states of arms and what they learn from, as `Programs.run` takes them.
 
-    Arms share the count of steps and the photographs. The last arm is repeated until each device
-    has as many.
+    The last arm is repeated until each device has as many.
+
+    Args:
+      settings: of each arm's labels.
+      starts: what each arm begins with.
+      photographs: what all arms read.
+      devices: how many there are.
     """
     fill = -len(starts) % devices
     starts, settings = [*starts, *[starts[-1]] * fill], [*settings, *[settings[-1]] * fill]
-
-    def stack(records):
-        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *records)
-
-    states = stack([start.state for start in starts])
-    first = starts[0].sources
     sources = LabelSources(
-        first.views,
-        jnp.stack([start.sources.depths for start in starts]),
-        stack([start.sources.blocks for start in starts]),
+        views=starts[0].sources.views,
+        depths=jnp.stack([start.sources.depths for start in starts]),
+        blocks=stack_arms([start.sources.blocks for start in starts]),
     )
-    return states.replace(step=states.step[0]), sources, stack(settings)
+    states = stack_states([start.state for start in starts])
+    return states, ArmsData(photographs, sources, stack_arms(settings))
 
 
 def train_in_turn(
@@ -242,17 +252,20 @@ def train_in_turn(
 ) -> None:
     """Train and score one arm on views that are labeled before its first step."""
     name, programs = f"{arm.name}_{seed}", training.programs
-    preset, scene = programs.preset, programs.scene
-    find = detail_finder(programs, start.state)
+    state, steps = start.state, programs.preset.closeup_steps
+    get_detail = detail_getter(programs, state)
     if arm.kind == "test_time":
-        data = target_data(programs, start, scene.test.cameras, arm.labels, arm.settings, find)
-        *learned, steps, _ = data
+        assert programs.scene.test is not None  # `choose_arms` leaves out arms that need it
+        cameras = programs.scene.test.cameras
+        state, data, steps, _ = prepare_target_views(
+            programs, start, cameras, arm.labels, arm.settings, get_detail
+        )
     else:
-        labels = label_arm(programs, arm, seed, start, find, scorer.held_out.exact)
-        learned = [start.state, programs.photographs, labels, arm.settings]
-        steps = preset.closeup_steps
+        exact = scorer.held_out.exact
+        labels = label_arm(programs, arm, run_keys(seed), start, get_detail, exact)
+        data = LabeledData(programs.photographs, labels, arm.settings)
     try:
-        state = training.train(name, "target_views", *learned, steps=steps)
+        state = train_stage(training, name, state, data, steps=steps)
     except TrainingError as error:
         print(f"{name} is left out: {error}")
         return
@@ -262,30 +275,31 @@ def train_in_turn(
 def label_arm(
     programs: Programs,
     arm: Arm,
-    seed: int,
+    keys: RunKeys,
     start: LabelStart,
-    find: FindDetail,
+    get_detail: GetDetail,
     exact: jax.Array | None,
 ) -> Views:
-    """The labeled views of an arm that trains in turn, other than `test_time`."""
-    scene, key = programs.scene, jax.random.key(seed)
-    if arm.depth_error is not None:
-        render = functools.partial(programs.render, start.state)
-        return labels_with_better_depth(
-            key,
-            scene,
-            start.sources,
-            exact,
-            functools.partial(rendered_depths, render, scene=scene),
-            arm.settings,
-            share=arm.depth_error,
-        )
-    if arm.labels.label == "residual":
-        return label_closeups(programs, start, arm.labels, seed, find)
-    blurred = arm.kind == "resolved"
-    return true_close_ups(key, scene, start.sources, exact, arm.settings, blurred=blurred)
+    """Return the labeled views of an arm that trains in turn, other than `test_time`."""
+    scene, sources = programs.scene, start.sources
+    if arm.depth_error is None and arm.labels.label == "residual":
+        return label_closeups(programs, start, arm.labels, keys, get_detail)
+    assert exact is not None  # `choose_arms` leaves out arms that need it
+    if arm.depth_error is None:
+        blurred = arm.kind == "resolved"
+        return true_close_ups(keys.ceilings, scene, sources, exact, arm.settings, blurred=blurred)
+    render = functools.partial(programs.render, start.state)
+    return labels_with_better_depth(
+        keys.ceilings,
+        scene,
+        sources,
+        exact,
+        functools.partial(rendered_depths, render, scene=scene),
+        arm.settings,
+        share=arm.depth_error,
+    )
 
 
 def count_skipped(history: Sequence[Mapping[str, Any]]) -> int:
-    """Steps of a stage that were skipped because they were not finite."""
+    """Count the steps of a stage that were skipped because they were not finite."""
     return sum(chunk["skipped"] for chunk in history)

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 
 from jaxcloseup.app.score.footprints import resolved_by_photographs
-from jaxcloseup.captures.load import Scene
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.labels.make import (
     LabelSources,
@@ -15,6 +14,7 @@ from jaxcloseup.labels.make import (
     sample_virtual_camera,
 )
 from jaxcloseup.labels.target_views import label_views
+from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.views import Views, camera_at
 
 
@@ -47,9 +47,10 @@ def true_close_ups(
       `CEILING_VIEWS` close-ups; weight 0 where no photograph sees the surface.
     """
     sample, surface = jax.jit(sample_virtual_camera), scene.surface
+    assert surface is not None
     images = []
-    for one in jax.random.split(key, CEILING_VIEWS):
-        camera, _ = sample(one, sources, settings)
+    for key_view in jax.random.split(key, CEILING_VIEWS):
+        camera, _ = sample(key_view, sources, settings)
         resolved, seen = resolved_by_photographs(scene, camera, exact)
         rgb = resolved if blurred else surface(camera).rgb
         images.append(Views(camera, jnp.asarray(rgb, jnp.float32), jnp.asarray(seen, jnp.float32)))
@@ -83,12 +84,13 @@ def labels_with_better_depth(
       `CEILING_VIEWS` labeled close-ups.
     """
 
-    def mix(trained, true):
+    def mix(trained: jax.Array, true: jax.Array) -> jax.Array:
         return jnp.where((trained > 0) & (true > 0), true + share * (trained - true), 0)
 
     sample, surface = jax.jit(sample_virtual_camera), scene.surface
+    assert surface is not None
     keys = jax.random.split(key, CEILING_VIEWS)
-    cameras = [sample(one, sources, settings)[0] for one in keys]
+    cameras = [sample(key_view, sources, settings)[0] for key_view in keys]
     cameras = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
     true = jnp.stack([surface(camera_at(cameras, i)).depth for i in range(CEILING_VIEWS)])
     targets, mixed = mix(render_depths(cameras), true), mix(sources.depths, exact)

@@ -25,7 +25,7 @@ from jaxcloseup.labels.make import LabelSources
 from jaxcloseup.labels.rules import label_depth
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.support import find_support
-from jaxcloseup.training.steps import TrainState
+from jaxcloseup.training.state import TrainState
 
 
 SOLID = 0.5  # opacity of a pixel that shows the scene

@@ -17,7 +17,7 @@ from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.support import count_seen
 from jaxcloseup.photos.tsdf import depth_maps, fuse, fuse_grid
 from jaxcloseup.photos.views import Views, camera_at
-from jaxcloseup.training.steps import TrainState
+from jaxcloseup.training.state import TrainState
 
 
 TRUNCATION = 4  # voxels at which distances are cut

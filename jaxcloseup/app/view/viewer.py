@@ -13,10 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcloseup.app.run.fine_tuning import fine_tune, tuned_detail
-from jaxcloseup.app.run.kept_detail import detail_finder
+from jaxcloseup.app.run.kept_detail import detail_getter
+from jaxcloseup.app.run.keys import run_keys
+from jaxcloseup.app.run.labels import LabelStart, start_labels
 from jaxcloseup.app.run.loop import TrainingError
 from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.run.setup import LabelStart, start_labels
 from jaxcloseup.app.view.camera_paths import focus_point
 from jaxcloseup.app.view.frames import render_pictures
 from jaxcloseup.app.view.orientation import up_direction
@@ -27,7 +28,7 @@ from jaxcloseup.artifacts.viewer_gaussians import Gaussians
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.labels.rules import label_depth
 from jaxcloseup.photos.support import count_seen_points
-from jaxcloseup.training.steps import TrainState
+from jaxcloseup.training.state import TrainState
 
 
 _BUSY = "The viewer is still busy: wait until it has finished, and try again."
@@ -69,7 +70,7 @@ class Viewer:
         """
         self.programs, self.state, self.scene = programs, state, programs.scene
         self.title = f"{self.scene.name}, {stage}"
-        self._seed, self._find = seed, detail_finder(programs, state, kept)
+        self._keys, self._find = run_keys(seed), detail_getter(programs, state, kept)
         self._jobs: queue.Queue = queue.Queue(maxsize=1)
         cameras = self.scene.train.cameras
         positions, rotations = (np.asarray(a) for a in (cameras.position, cameras.rotation))
@@ -178,8 +179,8 @@ class Viewer:
         cameras = jax.tree.map(lambda leaf: leaf[None], camera)
         if tuned:
             same = start.state is self.state
-            find = self._find if same else detail_finder(self.programs, start.state)
-            state = fine_tune(self.programs, start, cameras, find, tell=say_steps)
+            find = self._find if same else detail_getter(self.programs, start.state)
+            state = fine_tune(self.programs, start, cameras, find, report=say_steps)
         added = self._find()[0] if detail else None
         if added is not None and tuned and state is not start.state:
             added = tuned_detail(self.programs, state, cameras, added)
@@ -209,4 +210,4 @@ class Viewer:
     def labels(self) -> LabelStart:
         """Start of fine-tuning, with the depths that support needs; made once."""
         expected = self.programs.preset.labels.expected_depth
-        return start_labels(self.programs, self.state, self._seed, expected_depth=expected)
+        return start_labels(self.programs, self.state, self._keys, expected_depth=expected)

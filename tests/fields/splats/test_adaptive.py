@@ -23,7 +23,8 @@ from jaxcloseup.fields.splats.splat_field import surfel_field
 from jaxcloseup.fields.splats.splat_optimizer import surfel_optimizer
 from jaxcloseup.geometry.cameras import points_to_pixels
 from jaxcloseup.training.config import TrainConfig
-from jaxcloseup.training.steps import init_state, run_steps, train_step
+from jaxcloseup.training.state import init_state
+from jaxcloseup.training.steps import run_steps, train_step
 
 
 CONFIG = AdaptiveConfig(gradient=1.0, small=0.01, min_opacity=0.05, huge=0.1)

@@ -15,7 +15,8 @@ from jaxcloseup.fields.splats.splat_field import surfel_field
 from jaxcloseup.fields.splats.splat_optimizer import surfel_optimizer
 from jaxcloseup.photos.views import camera_at
 from jaxcloseup.training.config import TrainConfig
-from jaxcloseup.training.steps import init_state, run_steps, train_step
+from jaxcloseup.training.state import init_state
+from jaxcloseup.training.steps import run_steps, train_step
 
 
 EVERY, STEPS = 10, 35  # relocations come at 20 and 30

@@ -24,7 +24,8 @@ from jaxcloseup.fields.splats.surfels import random_points
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.metrics.image_metrics import psnr
 from jaxcloseup.training.config import TrainConfig
-from jaxcloseup.training.steps import init_state, run_steps, train_step
+from jaxcloseup.training.state import init_state
+from jaxcloseup.training.steps import run_steps, train_step
 
 
 STEPS = 200

@@ -15,8 +15,10 @@ from tiny_training import assert_same_step
 
 from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.methods.settings import plain_config
+from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.run.setup import initial_state
+from jaxcloseup.app.run.states import initial_state
+from jaxcloseup.app.run.step_data import TrainData
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.fields.volume import intervals
@@ -37,7 +39,8 @@ from jaxcloseup.fields.volume.tensorf import (
 )
 from jaxcloseup.fields.volume.zipnerf import zipnerf_field
 from jaxcloseup.geometry.cameras import Camera
-from jaxcloseup.training.steps import TrainState, train_step
+from jaxcloseup.training.state import TrainState
+from jaxcloseup.training.steps import train_step
 
 
 GRID = HashGridConfig(levels=3, features=2, log2_entries=8, coarsest=4, finest=16)
@@ -258,8 +261,8 @@ def trained(name, capture_folder):
     rgb = np.float32(plane.texture(points))
     scene = dataclasses.replace(load_scene(str(capture_folder)), points=points, rgb=rgb)
     programs = Programs(tiny_preset(name), scene)
-    state = initial_state(programs, seed=0)
-    return programs, programs.run("photographs", state, scene.train, count=3)[0]
+    state = initial_state(programs, run_keys(0))
+    return programs, programs.run(state, TrainData(scene.train), count=3)[0]
 
 
 @pytest.mark.parametrize("name", TRAINED)
@@ -267,8 +270,8 @@ def test_a_step_lowers_the_loss_of_what_it_saw(name, capture_folder):
     with jax.numpy_dtype_promotion("standard"):
         programs, state = trained(name, capture_folder)
         views = programs.scene.train
-        after, before = programs.run("photographs", state, views, count=1)
-        _, again = programs.run("photographs", after.replace(step=state.step), views, count=1)
+        after, before = programs.run(state, TrainData(views), count=1)
+        _, again = programs.run(after.replace(step=state.step), TrainData(views), count=1)
     assert again["loss"] < before["loss"]
 
 
@@ -277,12 +280,12 @@ def test_a_resumed_training_is_the_same_to_the_last_bit(name, capture_folder, tm
     with jax.numpy_dtype_promotion("standard"):
         programs, state = trained(name, capture_folder)
         views = programs.scene.train
-        whole, _ = programs.run("photographs", state, views, count=4)
-        half, _ = programs.run("photographs", state, views, count=2)
+        whole, _ = programs.run(state, TrainData(views), count=4)
+        half, _ = programs.run(state, TrainData(views), count=2)
         kept = Checkpoints(tmp_path, {"config": plain_config(programs.preset)})
         kept.save("baseline", 2, half, {"history": [], "growth": 1})
         _, half, _ = kept.load("baseline", state)
-        ended, _ = programs.run("photographs", half, views, count=2)
+        ended, _ = programs.run(half, TrainData(views), count=2)
     jax.tree.map(np.testing.assert_array_equal, ended.params, whole.params)
     jax.tree.map(np.testing.assert_array_equal, ended.opt_state, whole.opt_state)
 
@@ -293,7 +296,7 @@ def test_a_batch_of_steps_is_these_steps_alone(name, capture_folder):
     with jax.numpy_dtype_promotion("standard"):
         programs, state = trained(name, capture_folder)
         views = programs.scene.train
-        other, _ = programs.run("photographs", state, views, count=1)
+        other, _ = programs.run(state, TrainData(views), count=1)
         other = other.replace(step=state.step)
         states = jax.tree.map(lambda *x: jnp.stack(x), state, other).replace(step=state.step)
         axes = TrainState(step=None, params=0, buffers=0, opt_state=0, key=0)
@@ -301,7 +304,7 @@ def test_a_batch_of_steps_is_these_steps_alone(name, capture_folder):
         step = functools.partial(train_step, **bound, config=programs.preset.train)
         batch = jax.jit(jax.vmap(step, in_axes=(axes, None), out_axes=(axes, 0)))
         together, metrics = batch(states, views)
-        alone, _ = programs.run("photographs", other, views, count=1)
+        alone, _ = programs.run(other, TrainData(views), count=1)
     assert not np.any(metrics["skipped"])
     arm = jax.tree.map(lambda leaf: leaf[1], together.replace(step=alone.step[None]))
     assert_same_step(arm, alone, other)

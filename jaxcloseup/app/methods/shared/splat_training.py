@@ -29,7 +29,7 @@ from jaxcloseup.labels.rules import label_depth
 from jaxcloseup.photos.pyramids import Pyramid
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.views import Views, camera_at, to_float
-from jaxcloseup.training.steps import TrainState
+from jaxcloseup.training.state import TrainState
 
 
 SplatTrainingConfig = SurfelTrainingConfig | GaussianTrainingConfig

@@ -14,18 +14,15 @@ from tiny_runs import TINY_SURFELS, write_plane
 from tiny_training import RATE, fresh_state, one_color_field, settings
 
 from jaxcloseup.app.run.programs import Programs
+from jaxcloseup.app.run.step_data import TrainData
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.labels.make import label_sources
 from jaxcloseup.photos.views import sample_image, sample_pixels
 from jaxcloseup.training.config import TrainConfig
-from jaxcloseup.training.sampling import (
-    draw_keys,
-    in_a_loop,
-    in_threads,
-    over_devices,
-    sample_closeup,
-)
-from jaxcloseup.training.steps import closeup_step, init_state, train_step
+from jaxcloseup.training.parallel import in_a_loop, in_threads, over_devices
+from jaxcloseup.training.sampling import draw_keys, sample_closeup
+from jaxcloseup.training.state import init_state
+from jaxcloseup.training.steps import closeup_step, train_step
 
 
 DRAWS = 8
@@ -112,7 +109,7 @@ def test_surfels_learn_the_same_on_one_device_and_on_eight(tmp_path, monkeypatch
         begin = functools.partial(init_state, field=programs.field, optimizer=programs.optimizer)
         state = begin(jax.random.key(0), points, jnp.full_like(points, 0.5))
         with jax.numpy_dtype_promotion("standard"):  # optax mixes integers and floats
-            state, metrics = programs.run("photographs", state, scene.train, count=3)
+            state, metrics = programs.run(state, TrainData(scene.train), count=3)
         assert metrics["skipped"] == 0 and state.step == 3
         states.append(state)
         assert all(len(leaf.devices()) == 1 for leaf in jax.tree.leaves(state.params))

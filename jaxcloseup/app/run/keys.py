@@ -1,0 +1,42 @@
+"""The random keys of a run."""
+
+import jax
+from flax import struct
+
+
+@struct.dataclass
+class RunKeys:
+    """A key for each use of random numbers, all from the seed of a run.
+
+    Attributes:
+      init: draws the initial parameters, and from there the steps of all stages.
+      depths: renders the depths of photographs, where the label rule asks for sampling noise.
+      points: draws initial points.
+      closeups: draws the cameras of close-ups that are labeled before the first step.
+      audit: draws the close-ups of the audit of labels.
+      pictures: draws the close-ups that the report shows.
+      ceilings: draws the close-ups of a sweep's upper bounds.
+    """
+
+    init: jax.Array
+    depths: jax.Array
+    points: jax.Array
+    closeups: jax.Array
+    audit: jax.Array
+    pictures: jax.Array
+    ceilings: jax.Array
+
+
+def run_keys(seed: int) -> RunKeys:
+    """Return the keys of a seed."""
+    root = jax.random.key(seed)
+    init, audit, pictures = jax.random.split(root, 3)
+    return RunKeys(
+        init=init,
+        depths=jax.random.fold_in(init, 1),
+        points=jax.random.fold_in(init, 2),
+        closeups=jax.random.fold_in(root, 3),
+        audit=audit,
+        pictures=pictures,
+        ceilings=root,
+    )

@@ -1,0 +1,148 @@
+"""Labels of a run: the depths and photographs that they are made from, and labeled views."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxcloseup.app import progress
+from jaxcloseup.app.run.kept_detail import GetDetail, detailed_views
+from jaxcloseup.app.run.keys import RunKeys
+from jaxcloseup.app.run.programs import Programs
+from jaxcloseup.fields.contract import Rendering
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.labels.config import LabelConfig, pseudo_settings
+from jaxcloseup.labels.make import (
+    LabelSources,
+    PseudoSettings,
+    label_sources,
+    sample_virtual_camera,
+)
+from jaxcloseup.labels.rules import LABEL_RULES, label_depth
+from jaxcloseup.labels.target_views import label_views
+from jaxcloseup.photos.scene import Scene
+from jaxcloseup.photos.views import Views, camera_at
+from jaxcloseup.training.state import TrainState
+
+
+_MOST_CLOSEUPS = 200  # that are labeled before the first step
+
+
+class LabelStart(NamedTuple):
+    """What fine-tuning on labels begins with.
+
+    Attributes:
+      state: that of the baseline, rendering the depth that labels are made from.
+      sources: the training photographs with this state's depths.
+    """
+
+    state: TrainState
+    sources: LabelSources
+
+
+def start_labels(
+    programs: Programs, state: Any, keys: RunKeys, *, expected_depth: bool | None = None
+) -> LabelStart:
+    """Return the state whose depth labels are made from, and the photographs with its depths.
+
+    Args:
+      programs: what is compiled.
+      state: the baseline's.
+      keys: the run's.
+      expected_depth: see `LabelConfig`.
+    """
+    if expected_depth is not None:
+        assert programs.method.with_expected_depth is not None  # settings are checked before
+        buffers = programs.method.with_expected_depth(state.buffers, expected_depth)
+        state = state.replace(buffers=buffers)
+    scene, rule = programs.scene, LABEL_RULES[programs.preset.train.label_rule]
+    depths = rendered_depths(
+        functools.partial(programs.render, state),
+        scene.train.cameras,
+        scene,
+        near=scene.near,
+        key=rule.depth_key(keys.depths),
+        depth=rule.depth,
+    )
+    return LabelStart(state, jax.jit(label_sources)(scene.train, depths))
+
+
+def rendered_depths(
+    render: Callable[..., Rendering],
+    cameras: Camera,
+    scene: Scene,
+    *,
+    near: float = 0.0,
+    key: jax.Array | None = None,
+    depth: Callable[..., jax.Array] = label_depth,
+) -> jax.Array:
+    """Render the depths `[V, H, W]` of stacked cameras, for labels and anchors.
+
+    Args:
+      render: `(camera, key) -> Rendering`.
+      cameras: stacked `[V]`.
+      scene: limits depths to its `far`.
+      near: smallest depth; 0 by default, because close-ups may be nearer to the surface than any
+        photograph.
+      key: consumed by the renderings; None renders deterministically.
+      depth: that of a `LabelRule`.
+    """
+    count = cameras.intrinsics.shape[0]
+    keys = [None] * count if key is None else jax.random.split(key, count)
+
+    def depth_of(view: int) -> jax.Array:
+        return depth(render(camera_at(cameras, view), keys[view]), near=near, far=scene.far)
+
+    return jnp.stack(list(progress.each(depth_of, range(count), "rendering depths")))
+
+
+def label_target_views(
+    programs: Programs,
+    start: LabelStart,
+    cameras: Camera,
+    labels: LabelConfig,
+    settings: PseudoSettings,
+    get_detail: GetDetail,
+) -> Views:
+    """Label target views, or other views that are labeled before the first step.
+
+    Args:
+      programs: the run's.
+      start: what fine-tuning begins with.
+      cameras: stacked `[Q]`.
+      labels: says what labels are.
+      settings: of warps, after the gate.
+      get_detail: returns the detail of the state that fine-tuning begins with; called if labels
+        need it.
+    """
+    if labels.label == "residual":
+        detail, _ = get_detail()
+        return detailed_views(programs, start.state, detail, cameras)
+    render = functools.partial(programs.render, start.state)
+    depths = rendered_depths(render, cameras, programs.scene)
+    return jax.jit(label_views)(cameras, depths, start.sources, settings)
+
+
+def label_closeups(
+    programs: Programs,
+    start: LabelStart,
+    labels: LabelConfig,
+    keys: RunKeys,
+    get_detail: GetDetail,
+) -> Views:
+    """Label random close-ups with detail, all before the first step: each costs a render.
+
+    Args:
+      programs: the run's.
+      start: what fine-tuning begins with.
+      labels: says how close-ups are drawn.
+      keys: the run's.
+      get_detail: as in `label_target_views`.
+    """
+    settings = pseudo_settings(labels)
+    count = min(programs.preset.closeup_steps, _MOST_CLOSEUPS)
+    drawn = jax.random.split(keys.closeups, count)
+    draw = jax.vmap(lambda key: sample_virtual_camera(key, start.sources, settings)[0])
+    return label_target_views(programs, start, jax.jit(draw)(drawn), labels, settings, get_detail)

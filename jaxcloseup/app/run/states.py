@@ -1,0 +1,130 @@
+"""The states that training begins with: initial points, a coarse model, the baseline."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcloseup.app.run.keys import RunKeys, run_keys
+from jaxcloseup.app.run.loop import Training, TrainingError, train_stage
+from jaxcloseup.app.run.programs import Programs
+from jaxcloseup.app.run.step_data import TrainData
+from jaxcloseup.app.run.timers import timed
+from jaxcloseup.fields.contract import Rendering
+from jaxcloseup.fields.splats.surfels import random_points
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.io.memory import installed_memory
+from jaxcloseup.photos.scene import Scene
+from jaxcloseup.training.state import TrainState, init_state
+
+
+FEWEST_POINTS = 100  # a capture with fewer gets random points too
+
+# One program for all seeds; without it, every array program would be compiled apart.
+_init_state = jax.jit(init_state, static_argnames=("field", "optimizer"))
+
+
+def train_baseline(training: Training, stage: str, keys: RunKeys) -> TrainState:
+    """Train stage 1 on photographs alone, and before it the preset's coarse model, if any."""
+    programs, preset = training.programs, training.programs.preset
+    if preset.coarse is None:
+        start = initial_state(programs, keys)
+    else:
+        start = _refine_coarse(training, stage, keys)
+    data = TrainData(programs.photographs)
+    return train_stage(training, stage, start, data, steps=preset.baseline_steps)
+
+
+def _refine_coarse(training: Training, stage: str, keys: RunKeys) -> TrainState:
+    """Train `preset.coarse`, and give its state the room and the detail of the preset itself."""
+    programs, preset = training.programs, training.programs.preset
+    assert preset.coarse is not None and preset.windows is not None
+    assert programs.method.refine is not None
+    coarse = dataclasses.replace(training, programs=programs.coarse)
+    state: Any = train_stage(
+        coarse,
+        f"coarse_{stage}",
+        initial_state(coarse.programs, keys),
+        TrainData(coarse.programs.photographs),
+        steps=preset.coarse.steps,
+    )
+    pyramid, _ = programs.pyramid(preset.windows.finest)
+
+    def render(params: Any, buffers: Any, camera: Camera) -> Rendering:
+        return programs.render(state.replace(params=params, buffers=buffers), camera)
+
+    key_fine, key_refine = jax.random.split(jax.random.fold_in(state.key, state.step))
+    with timed(training.seconds, f"refine_{stage}"):
+        params, buffers = programs.method.refine(
+            key_refine,
+            preset.field,
+            state.params,
+            state.buffers,
+            render,
+            programs.scene,
+            pyramid,
+        )
+    moments = jax.jit(programs.optimizer.init)(params)
+    return TrainState(jnp.zeros_like(state.step), params, buffers, moments, key_fine)
+
+
+def initial_state(programs: Programs, keys: RunKeys) -> TrainState:
+    """Return the state before the first step of a baseline.
+
+    Raises:
+      TrainingError: it does not fit into memory.
+    """
+    state_shapes(programs)
+    points, rgb = initial_points(keys.points, programs.scene)
+    return _initialize(programs)(keys.init, points, rgb)
+
+
+def state_shapes(programs: Programs) -> TrainState:
+    """Return the structure of a state, with shapes and types in place of arrays.
+
+    Raises:
+      TrainingError: such a state does not fit into memory.
+    """
+    keys = run_keys(0)
+    points, rgb = initial_points(keys.points, programs.scene)
+    shapes = jax.eval_shape(_initialize(programs), keys.init, points, rgb)
+    needed = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(shapes))
+    if needed > (held := installed_memory()):
+        raise TrainingError(
+            f"what is trained takes {needed / 2**30:.1f} GiB, but this computer has "
+            f"{held / 2**30:.1f}: choose fewer surfels or a smaller network with --set"
+        )
+    return shapes
+
+
+def _initialize(programs: Programs) -> functools.partial[TrainState]:
+    return functools.partial(_init_state, field=programs.field, optimizer=programs.optimizer)
+
+
+def initial_points(key: jax.Array, scene: Scene, count: int = 5000) -> tuple[Any, Any]:
+    """Return points `[P, 3]` and colors to start from.
+
+    They are the capture's; if it has few, random gray ones are added.
+    """
+    if len(scene.points) >= FEWEST_POINTS:
+        return scene.points, scene.rgb
+    points = random_points(key, scene.train.cameras, near=scene.near, far=scene.far, count=count)
+    gray = jnp.full_like(points, 0.5)
+    if not len(scene.points):
+        return points, gray
+    return np.concatenate([scene.points, points]), np.concatenate([scene.rgb, gray])
+
+
+def say_which_points_fit(programs: Programs) -> None:
+    """Print how many of the initial points a field begins with, if not with all."""
+    preset, count = programs.preset, len(programs.scene.points)
+    coarse = preset.coarse
+    field, name = (
+        (preset.field, "capacity") if coarse is None else (coarse.field, "coarse.capacity")
+    )
+    most = programs.method.max_points(field)
+    if most is not None and count > most:
+        print(f"training begins with {most} of {count} points: --set {name}=N makes room for more")

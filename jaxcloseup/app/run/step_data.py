@@ -1,0 +1,85 @@
+"""The kinds of training steps: each record holds what its step learns from, and calls that step."""
+
+from typing import Any
+
+import jax
+from flax import struct
+
+from jaxcloseup.labels.make import LabelSources, PseudoSettings
+from jaxcloseup.photos.views import Views
+from jaxcloseup.photos.windows import Windows
+from jaxcloseup.training.state import Metrics, TrainState
+from jaxcloseup.training.steps import closeup_step, labeled_step, train_step
+
+
+@struct.dataclass
+class TrainData:
+    """Photographs alone, for `train_step`.
+
+    Attributes:
+      views: training photographs, or windows of finer ones.
+      lr_scale: `[]` factor on the learning rates; None: 1.
+    """
+
+    views: Views | Windows
+    lr_scale: jax.Array | None = None
+
+    def step(self, state: TrainState, **static: Any) -> tuple[TrainState, Metrics]:
+        """Take one step; `static` are the static arguments of `train_step`."""
+        return train_step(state, self.views, self.lr_scale, **static)
+
+
+@struct.dataclass
+class CloseupData:
+    """Photographs and random close-ups that each step labels anew, for `closeup_step`.
+
+    Attributes:
+      views: training photographs, or windows of finer ones.
+      sources: what labels are made from.
+      settings: how close-ups are drawn and labeled.
+    """
+
+    views: Views | Windows
+    sources: LabelSources
+    settings: PseudoSettings
+
+    def step(self, state: TrainState, **static: Any) -> tuple[TrainState, Metrics]:
+        """Take one step; `static` are the static arguments of `closeup_step`."""
+        return closeup_step(state, self.views, self.sources, self.settings, **static)
+
+
+@struct.dataclass
+class LabeledData:
+    """Photographs and views that were labeled once, such as target views, for `labeled_step`.
+
+    Attributes:
+      views: training photographs, or windows of finer ones.
+      labels: the labeled views, or windows of them.
+      settings: the weight of labels and the learning rates.
+    """
+
+    views: Views | Windows
+    labels: Views | Windows
+    settings: PseudoSettings
+
+    def step(self, state: TrainState, **static: Any) -> tuple[TrainState, Metrics]:
+        """Take one step; `static` are the static arguments of `labeled_step`."""
+        return labeled_step(state, self.views, self.labels, self.settings, **static)
+
+
+@struct.dataclass
+class ArmsData:
+    """What all arms of a sweep learn from together, as `run_arms` takes it.
+
+    Attributes:
+      views: training photographs, which all arms share.
+      sources: as in `CloseupData`; depths and blocks have a leading axis of arms.
+      settings: as in `CloseupData`, with a leading axis of arms.
+    """
+
+    views: Views | Windows
+    sources: LabelSources
+    settings: PseudoSettings
+
+
+StepData = TrainData | CloseupData | LabeledData

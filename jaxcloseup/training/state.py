@@ -1,0 +1,151 @@
+"""The state that training changes, and how the mean gradient of a step's draws changes it."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax  # type: ignore[import-untyped]  # ships no types
+from flax import struct
+
+from jaxcloseup.fields.contract import RadianceField
+from jaxcloseup.training.parallel import Spread
+from jaxcloseup.training.sampling import DrawKeys, draw_keys
+
+
+Metrics = dict[str, jax.Array]
+# `(params, buffers, keys, data) -> loss, metrics` of one draw.
+DrawLoss = Callable[[Any, Any, DrawKeys, Any], tuple[jax.Array, Metrics]]
+
+
+@struct.dataclass
+class TrainState:
+    """Everything a step changes. Steps draw from `fold_in(key, step)`, so a resumed run repeats.
+
+    Attributes:
+      step: `[]` int32 steps taken.
+      params: what the optimizer trains.
+      buffers: what the field keeps besides.
+      opt_state: the optimizer's state.
+      key: the run's key, never changed.
+    """
+
+    step: jax.Array
+    params: Any
+    buffers: Any
+    opt_state: Any
+    key: jax.Array
+
+
+def init_state(
+    key: jax.Array,
+    points: jax.Array,
+    rgb: jax.Array,
+    *,
+    field: RadianceField,
+    optimizer: optax.GradientTransformation,
+) -> TrainState:
+    """Return the state before the first step; `key` is consumed.
+
+    Args:
+      key: random key.
+      points: `[P, 3]` initial points, for fields that start from them.
+      rgb: `[P, 3]` their colors.
+      field: static; what is trained.
+      optimizer: static.
+    """
+    key_init, key_steps = jax.random.split(key)
+    params, buffers = field.init(key_init, points, rgb)
+    return TrainState(jnp.zeros((), jnp.int32), params, buffers, optimizer.init(params), key_steps)
+
+
+def update_state(
+    state: TrainState,
+    loss: DrawLoss,
+    data: Any,
+    *,
+    field: RadianceField,
+    optimizer: optax.GradientTransformation,
+    draws: int,
+    spread: Spread,
+    lr_scale: jax.Array | None = None,
+) -> tuple[TrainState, Metrics]:
+    """Take one optimizer step along the mean gradient of the draws' losses.
+
+    Args:
+      state: what is trained.
+      loss: loss and metrics of one draw.
+      data: what all draws read; passed to `loss`.
+      field: static; its `adapt` follows the update.
+      optimizer: static.
+      draws: static; how many there are.
+      spread: how several draws are taken.
+      lr_scale: `[]` factor on the optimizer's updates; None: 1.
+
+    Returns:
+      The next state and the metrics, as in `train_step`.
+    """
+    keys, key_adapt = draw_keys(state.key, state.step, draws)
+
+    def gradient(keys: DrawKeys, shared: tuple[Any, Any, Any]) -> Any:
+        params, buffers, data = shared
+
+        def of_params(params: Any) -> tuple[jax.Array, Metrics]:
+            return loss(params, buffers, keys, data)
+
+        return jax.value_and_grad(of_params, has_aux=True)(params)
+
+    shared = state.params, state.buffers, data
+    found = spread(gradient, keys, shared) if draws > 1 else gradient(keys, shared)
+    (value, metrics), gradients = found
+    after, skipped = _advance(
+        state,
+        key_adapt,
+        value,
+        gradients,
+        jnp.ones(()) if lr_scale is None else lr_scale,
+        update=optimizer.update,
+        adapt=field.adapt,
+    )
+    return after, {"loss": value, "skipped": skipped} | metrics
+
+
+# Compiled by itself for fields that render whole images: all kinds of steps share it.
+@functools.partial(jax.jit, static_argnames=("update", "adapt"))
+def _advance(
+    state: Any,
+    key: jax.Array,
+    value: jax.Array,
+    gradients: Any,
+    lr_scale: jax.Array,
+    *,
+    update: Callable[..., Any],
+    adapt: Callable[..., Any],
+) -> tuple[TrainState, jax.Array]:
+    """Return the state after a step, and whether the step was skipped, 0 or 1.
+
+    A step whose loss or gradient is not finite must not spoil the run: it is skipped, whole, and
+    counted.
+    """
+    finite = jnp.isfinite(value)
+    for leaf in jax.tree.leaves(gradients):
+        finite &= jnp.all(jnp.isfinite(leaf))
+
+    updates, opt_state = update(gradients, state.opt_state, state.params)
+    updates = jax.tree.map(lambda leaf: lr_scale.astype(leaf.dtype) * leaf, updates)
+    new = optax.apply_updates(state.params, updates), opt_state
+    # Selected, not in a branch of a conditional, which would copy everything once more.
+    params, opt_state = jax.tree.map(
+        lambda new, old: jnp.where(finite, new, old), new, (state.params, state.opt_state)
+    )
+    moved = state.replace(step=state.step + 1, params=params, opt_state=opt_state)
+
+    def changed(state: TrainState) -> tuple[Any, Any, Any]:
+        return state.params, state.buffers, state.opt_state
+
+    params, buffers, opt_state = jax.lax.cond(
+        finite, lambda: changed(adapt(key, moved)), lambda: changed(moved)
+    )
+    after = moved.replace(params=params, buffers=buffers, opt_state=opt_state)
+    return after, 1 - finite.astype(jnp.float32)
