@@ -10,6 +10,7 @@ from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_rays
 from jaxcloseup.geometry.poses import PoseSettings
 from jaxcloseup.labels.make import PseudoSettings
 from jaxcloseup.training.state import init_state
+from jaxcloseup.training.steps import run_steps, train_step
 
 
 RATE = 0.25
@@ -88,3 +89,8 @@ def assert_same_step(arm, alone, before):
     jax.tree.map(compare, arm.params, alone.params, arm.opt_state[0].mu, alone.opt_state[0].mu)
     changed = jax.tree.map(lambda x, y: float(jnp.abs(x - y).max()), alone.params, before.params)
     assert max(jax.tree.leaves(changed)) > 1e-3
+
+
+def run_train_steps(state, views, *, count, **static):
+    """Take `count` steps on photographs in one loop."""
+    return run_steps(lambda state: train_step(state, views, **static), state, count=count)

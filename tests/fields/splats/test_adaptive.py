@@ -9,6 +9,7 @@ import plane
 import pytest
 from reference_splats import rotation_of
 from splat_scenes import COUNT, HEIGHT, WIDTH, random_scene, to_camera, to_surfels
+from tiny_training import run_train_steps
 
 from jaxcloseup.fields.splats import RasterizeConfig, SurfelConfig
 from jaxcloseup.fields.splats.adaptive import (
@@ -24,7 +25,6 @@ from jaxcloseup.fields.splats.splat_optimizer import surfel_optimizer
 from jaxcloseup.geometry.cameras import points_to_pixels
 from jaxcloseup.training.config import TrainConfig
 from jaxcloseup.training.state import init_state
-from jaxcloseup.training.steps import run_steps, train_step
 
 
 CONFIG = AdaptiveConfig(gradient=1.0, small=0.01, min_opacity=0.05, huge=0.1)
@@ -140,7 +140,7 @@ def test_training_records_image_gradients_and_adds_surfels():
         jax.random.key(0), points, np.full_like(points, 0.5), field=field, optimizer=optimizer
     )
     bound = {"field": field, "optimizer": optimizer, "config": TrainConfig(None, None)}
-    run = jax.jit(functools.partial(run_steps, functools.partial(train_step, **bound)))
+    run = jax.jit(functools.partial(run_train_steps, **bound))
     with jax.numpy_dtype_promotion("standard"):  # optax mixes integers and floats
         one, _ = run(state, views, count=1)
         grown, _ = run(state, views, count=21)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import plane
 import pytest
+from tiny_training import run_train_steps
 
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.fields.splats import McmcConfig, RasterizeConfig, sampling_intervals
@@ -16,7 +17,6 @@ from jaxcloseup.fields.splats.splat_optimizer import surfel_optimizer
 from jaxcloseup.photos.views import camera_at
 from jaxcloseup.training.config import TrainConfig
 from jaxcloseup.training.state import init_state
-from jaxcloseup.training.steps import run_steps, train_step
 
 
 EVERY, STEPS = 10, 35  # relocations come at 20 and 30
@@ -39,7 +39,7 @@ BOUND = {
     "optimizer": OPTIMIZER,
     "config": TrainConfig(num_rays=None, num_label_rays=None),
 }
-run = jax.jit(functools.partial(run_steps, functools.partial(train_step, **BOUND)))
+run = jax.jit(functools.partial(run_train_steps, **BOUND))
 
 
 @pytest.fixture(scope="module")

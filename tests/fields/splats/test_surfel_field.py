@@ -10,6 +10,7 @@ import numpy as np
 import plane
 import pytest
 from splat_scenes import random_scene, to_camera, to_surfels
+from tiny_training import run_train_steps
 
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.fields.splats import RasterizeConfig, SurfelConfig
@@ -25,7 +26,6 @@ from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.metrics.image_metrics import psnr
 from jaxcloseup.training.config import TrainConfig
 from jaxcloseup.training.state import init_state
-from jaxcloseup.training.steps import run_steps, train_step
 
 
 STEPS = 200
@@ -60,7 +60,7 @@ def run():
         "optimizer": OPTIMIZER,
         "config": TrainConfig(num_rays=None, num_label_rays=None),
     }
-    return jax.jit(functools.partial(run_steps, functools.partial(train_step, **bound)))
+    return jax.jit(functools.partial(run_train_steps, **bound))
 
 
 @pytest.fixture(scope="module")
