@@ -6,7 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optax  # type: ignore[import-untyped]  # ships no types
+import optax
 from flax import struct
 
 from jaxcloseup.fields.contract import RadianceField

@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optax  # type: ignore[import-untyped]  # ships no types
+import optax
 
 from jaxcloseup.fields.contract import RadianceField, Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
