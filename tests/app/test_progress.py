@@ -1,13 +1,18 @@
 """What a run shows while it computes: by a clock that the test moves, and line by line."""
 
 import io
+import os
+import pathlib
 import re
+import signal
+import subprocess
 import sys
 import time
 
 import pytest
 
 from jaxcloseup.app import progress
+from jaxcloseup.app.cli.interrupt import STOPPED
 from jaxcloseup.app.process.counting import progress as stage_progress
 from jaxcloseup.app.progress import display, threads
 from jaxcloseup.app.progress.estimate import Estimate
@@ -153,6 +158,37 @@ def test_a_terminal_shows_one_line_below_what_is_printed(monkeypatch):
     assert said.count("\x1b[1A") == 1  # one line is removed at the end
     assert said.rindex("\x1b[?25h") > said.rindex("[1/4] a")  # the cursor is back
     assert progress.count("a", 1, 2) == "a 1/2"
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs a pseudo-terminal")
+def test_ctrl_c_leaves_a_terminal_with_a_cursor():
+    program = (
+        "import time\n"
+        "from jaxcloseup.app import progress\n"
+        "from jaxcloseup.app.cli.interrupt import end_at_ctrl_c\n"
+        "end_at_ctrl_c('program')\n"
+        "with progress.showing(), progress.saying('waiting'):\n"
+        "    time.sleep(60)\n"
+    )
+    terminal, inner = os.openpty()
+    with subprocess.Popen(
+        [sys.executable, "-c", program],
+        stdin=inner,
+        stdout=inner,
+        stderr=inner,
+        env=os.environ | {"TERM": "xterm", "COLUMNS": "80"},
+        cwd=pathlib.Path(__file__).parents[2],
+    ) as process:
+        os.close(inner)
+        said = b""
+        while b"waiting" not in said:
+            said += os.read(terminal, 4096)
+        process.send_signal(signal.SIGINT)
+        while b"program: stopped" not in said:
+            said += os.read(terminal, 4096)
+    os.close(terminal)
+    assert process.returncode == STOPPED
+    assert said.rindex(b"\x1b[?25h") > said.rindex(b"\x1b[?25l")
 
 
 def test_parts_have_words():

@@ -35,7 +35,8 @@ def _watch(wakeups: socket.socket, program: str) -> None:
     flush = threading.Thread(target=sys.stdout.flush, daemon=True)
     flush.start()
     flush.join(timeout=1)
-    shown = "\033[?25h\n" if sys.stderr.isatty() else ""  # progress bars hide the cursor
+    # A progress line hides the cursor, and stands for sys.stderr meanwhile.
+    shown = "\033[?25h\n" if os.isatty(2) else ""
     os.write(2, f"{shown}{program}: {sentence}\n".encode())
     os._exit(STOPPED)
 
