@@ -9,11 +9,11 @@ import importlib.util
 import os
 import pathlib
 import re
+from typing import Any
 
 import chex
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jax import lax
 
@@ -28,7 +28,7 @@ _SCALE = (0.458, 0.448, 0.450)
 # Layers in order: "conv" with channels, size, stride and padding, and a ReLU after it; "max"
 # pooling with size and stride; "tap" where features enter the distance.
 _VGG_BLOCKS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
-_LAYERS = {
+_LAYERS: dict[str, list[tuple[Any, ...]]] = {
     "vgg": [
         layer
         for i, block in enumerate(_VGG_BLOCKS)
@@ -64,8 +64,7 @@ class LpipsError(Exception):
     """LPIPS cannot be computed. The message is one sentence that says what to do."""
 
 
-@struct.dataclass
-class LpipsWeights:
+class LpipsWeights(struct.PyTreeNode):
     """The weights of one backbone and its heads.
 
     Attributes:
@@ -103,11 +102,11 @@ def lpips(weights: LpipsWeights, image: jax.Array, target: jax.Array) -> jax.Arr
     return total.reshape(batch)
 
 
-def _features(weights, images):
+def _features(weights: LpipsWeights, images: jax.Array) -> list[jax.Array]:
     """The features `[N, h, w, C]` of each tapped layer of images `[N, H, W, 3]`."""
     shift, scale = (jnp.array(v, images.dtype)[None, None, None] for v in (_SHIFT, _SCALE))
     now = (2 * images - 1 - shift) / scale
-    convolutions, found = iter(weights.convolutions), []
+    convolutions, tapped = iter(weights.convolutions), []
     for kind, *sizes in _LAYERS[weights.backbone]:
         if kind == "conv":
             _, _, stride, padding = sizes
@@ -126,13 +125,15 @@ def _features(weights, images):
             window = (1, size, size, 1), (1, stride, stride, 1)
             now = lax.reduce_window(now, -jnp.inf, lax.max, *window, "VALID")
         else:
-            found.append(now)
-    return found
+            tapped.append(now)
+    return tapped
 
 
 def layer_shapes(backbone: str) -> tuple[list[tuple[int, ...]], list[int]]:
     """Kernel shapes `[out, in, kh, kw]` of the convolutions, and channels of the heads."""
-    kernels, heads, channels = [], [], 3
+    kernels: list[tuple[int, ...]] = []
+    heads: list[int] = []
+    channels = 3
     for kind, *sizes in _LAYERS[backbone]:
         if kind == "conv":
             kernels.append((sizes[0], channels, sizes[1], sizes[1]))
@@ -183,11 +184,11 @@ def load_lpips(backbone: str, folder: str | os.PathLike[str] | None = None) -> L
         (jnp.asarray(kernel, jnp.float32), jnp.asarray(bias, jnp.float32))
         for kernel, bias in zip(kernels, biases, strict=True)
     )
-    flat = tuple(jnp.asarray(np.reshape(head, -1), jnp.float32) for head in linear)
+    flat = tuple(jnp.asarray(head, jnp.float32).reshape(-1) for head in linear)
     return LpipsWeights(convolutions, flat, backbone)
 
 
-def _folders(folder):
+def _folders(folder: str | os.PathLike[str] | None) -> list[pathlib.Path]:
     if folder is None:
         folder = os.environ.get(FOLDER_VARIABLE)
     if folder is not None:
@@ -201,7 +202,7 @@ def _folders(folder):
     return folders
 
 
-def _find(folders, patterns, what):
+def _find(folders: list[pathlib.Path], patterns: list[str], what: str) -> pathlib.Path:
     for folder in folders:
         for pattern in patterns:
             for path in sorted(folder.glob(pattern)):

@@ -115,7 +115,7 @@ def frustum_samples(
     return along + turned * away[None], 0.5 * away
 
 
-def _across(unit):
+def _across(unit: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Two unit vectors `[3, R]` across unit vectors, and across each other."""
     axes = jnp.eye(3, dtype=unit.dtype)
     least = axes[:, jnp.argmin(jnp.abs(unit), axis=0)]

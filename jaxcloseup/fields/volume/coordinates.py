@@ -1,5 +1,7 @@
 """Changes of coordinates: distances along rays, and all of space into a ball."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -36,7 +38,7 @@ def unspaced(s: jax.Array, near: float, far: float, *, spacing: float) -> jax.Ar
     return bend * ((1 + spacing * y / bend) ** (1 / spacing) - 1)
 
 
-def _power(x, p, xnp):
+def _power(x: Any, p: float, xnp: Any) -> Any:
     if p == 1:
         return x
     if p == 0:

@@ -98,5 +98,6 @@ def mean_divergence(
     drawn = jax.random.randint(key_draw, (count,), 0, len(points.view))
     view, pixels, depth, deviation = (jnp.asarray(x)[drawn] for x in points[1:])
     cameras = jax.tree.map(lambda leaf: leaf[view], points.cameras)
-    each = [depth_divergence(*seen, depth, deviation) for seen in see(key_see, cameras, pixels)]
-    return supervision.weight * sum(jnp.mean(one) for one in each)
+    passes = see(key_see, cameras, pixels)
+    each = [depth_divergence(*seen, depth, deviation) for seen in passes]
+    return supervision.weight * jnp.asarray(sum(jnp.mean(divergence) for divergence in each))

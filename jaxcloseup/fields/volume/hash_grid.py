@@ -4,6 +4,8 @@ Levels of cubic grids, each finer than the last by one factor, hold trained feat
 vertices. A grid with more vertices than a level has entries shares these by a hash.
 """
 
+from typing import Any
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -53,7 +55,7 @@ def grid_rows(config: HashGridConfig, positions: jax.Array) -> tuple[jax.Array, 
       first.
     """
 
-    def by_level(values, dtype):
+    def by_level(values: Any, dtype: Any) -> Any:
         return np.array(values, dtype)[None, :, None]  # [1, L, 1]
 
     cells = by_level(config.resolutions, positions.dtype)

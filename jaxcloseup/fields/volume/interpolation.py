@@ -21,25 +21,29 @@ def weighted_rows(table: jax.Array, rows: jax.Array, weights: jax.Array) -> jax.
       `[L, F, M]`.
     """
 
-    def feature(column):
+    def feature(column: jax.Array) -> jax.Array:
         return sum(w * _at(column, r) for r, w in zip(rows, weights, strict=True))
 
     return jnp.stack([feature(column) for column in table.T], axis=1)
 
 
-def _at(table, rows):
+def _at(table: jax.Array, rows: jax.Array) -> jax.Array:
     return table.at[rows].get(mode="promise_in_bounds")
 
 
-def _forward(table, rows, weights):
+def _forward(
+    table: jax.Array, rows: jax.Array, weights: jax.Array
+) -> tuple[jax.Array, tuple[jax.Array, jax.Array, jax.Array]]:
     return weighted_rows(table, rows, weights), (table, rows, weights)
 
 
-def _backward(residuals, cotangent):
+def _backward(
+    residuals: tuple[jax.Array, jax.Array, jax.Array], cotangent: jax.Array
+) -> tuple[jax.Array, None, jax.Array]:
     table, rows, weights = residuals
     cotangent = jnp.moveaxis(cotangent, 1, -1)  # [L, M, F]
 
-    def add_corner(total, corner):
+    def add_corner(total: jax.Array, corner: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
         rows, weights = corner
         each = weights[..., None] * cotangent
         return total.at[rows].add(each, mode="promise_in_bounds"), None

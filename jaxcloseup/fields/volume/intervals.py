@@ -62,7 +62,7 @@ def interval_field(
     *,
     init: Callable[[jax.Array, jax.Array, jax.Array], tuple[Any, Any]],
     rounds: Sequence[Round],
-    penalty: Callable[[Any, Any, Sequence[Histogram]], jax.Array] | None = None,
+    penalty: Callable[[Any, Any, list[Histogram]], jax.Array] | None = None,
     blur: Callable[[jax.Array], jax.Array] = lambda weights: weights,
     loss: Callable[..., tuple[jax.Array, dict[str, jax.Array]]] | None = None,
     supervision: DepthSupervision | None = None,
@@ -84,7 +84,8 @@ def interval_field(
 
     def trace(params: Any, buffers: Any, key: jax.Array | None, rays: Rays) -> Traced:
         keys = [None] * 2 * len(rounds) if key is None else jax.random.split(key, 2 * len(rounds))
-        seen, histograms, colored = [], [], []
+        histograms: list[Histogram] = []
+        seen, colored = [], []
         for i, (count, query) in enumerate(rounds):
             if not histograms:
                 edges = interval_quantiles(keys[0], count, rays.length.shape)

@@ -12,8 +12,8 @@ from jaxcloseup.fields.volume.config import MipNerfConfig
 from jaxcloseup.fields.volume.depth_supervision import DepthSupervision
 from jaxcloseup.fields.volume.encodings import positional_encoding
 from jaxcloseup.fields.volume.intervals import IntervalConfig, Round, interval_field
-from jaxcloseup.fields.volume.networks import apply_network, init_network, rays_in_cache
-from jaxcloseup.fields.volume.rays import Extent, photometric_loss
+from jaxcloseup.fields.volume.networks import Params, apply_network, init_network, rays_in_cache
+from jaxcloseup.fields.volume.rays import Extent, Rays, photometric_loss
 from jaxcloseup.fields.volume.renderer import Samples
 from jaxcloseup.fields.volume.samplers import widen
 
@@ -43,7 +43,9 @@ def mipnerf_field(
         )
         return network, ()
 
-    def query(params, buffers, key, rays, edges) -> Samples:
+    def query(
+        params: Params, buffers: Any, key: jax.Array | None, rays: Rays, edges: jax.Array
+    ) -> Samples:
         del buffers, key
         shape = edges.shape[0], edges.shape[1] - 1
         mean, variance = (x.reshape(3, -1) for x in frustum_gaussians(rays, edges))

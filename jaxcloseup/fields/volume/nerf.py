@@ -9,7 +9,7 @@ from jaxcloseup.fields.contract import RadianceField
 from jaxcloseup.fields.volume.config import NerfConfig
 from jaxcloseup.fields.volume.depth_supervision import DepthSupervision
 from jaxcloseup.fields.volume.encodings import positional_encoding
-from jaxcloseup.fields.volume.networks import apply_network, init_network, rays_in_cache
+from jaxcloseup.fields.volume.networks import Params, apply_network, init_network, rays_in_cache
 from jaxcloseup.fields.volume.rays import Extent
 from jaxcloseup.fields.volume.renderer import Samples, VolumeConfig, volume_field
 
@@ -35,7 +35,14 @@ def nerf_field(
         key_coarse, key_fine = jax.random.split(key)
         return {"coarse": _init(key_coarse, config), "fine": _init(key_fine, config)}, ()
 
-    def query(params, buffers, stage, key, positions, directions) -> Samples:
+    def query(
+        params: Params,
+        buffers: Any,
+        stage: str,
+        key: jax.Array | None,
+        positions: jax.Array,
+        directions: jax.Array,
+    ) -> Samples:
         del buffers
         shape = positions.shape[1:]
         encoded_directions = positional_encoding(directions, config.direction_octaves)
@@ -63,7 +70,7 @@ def nerf_field(
     )
 
 
-def _init(key: jax.Array, config: NerfConfig) -> Any:
+def _init(key: jax.Array, config: NerfConfig) -> Params:
     return init_network(
         key,
         depth=config.depth,

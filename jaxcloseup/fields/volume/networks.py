@@ -63,7 +63,7 @@ def init_network(
       direction_features: number of features of an encoded direction.
       direction_width: width of the layer that sees directions.
     """
-    fan_ins = [(position_features,)] + [(width,)] * (depth - 1)
+    fan_ins: list[tuple[int, ...]] = [(position_features,), *[(width,)] * (depth - 1)]
     if skip_after + 1 < depth:
         fan_ins[skip_after + 1] = (width, position_features)
     keys = jax.random.split(key, depth + 4)
@@ -185,17 +185,22 @@ def dense(
     """
     chex.assert_rank([*weights, bias, *inputs], 2)
     dtype = inputs[0].dtype
-    out = sum(_dot(w.astype(dtype), x, w.dtype) for w, x in zip(weights, inputs, strict=True))
+    products = [_dot(w.astype(dtype), x, w.dtype) for w, x in zip(weights, inputs, strict=True)]
+    out = jnp.asarray(sum(products))
     out = (out.reshape(*bias.shape, -1) + bias[..., None]).reshape(out.shape)
     return jax.nn.relu(out).astype(dtype) if relu else out
 
 
-def _dense_forward(weights, bias, inputs, relu):
+def _dense_forward(
+    weights: Sequence[jax.Array], bias: jax.Array, inputs: Sequence[jax.Array], relu: bool
+) -> tuple[jax.Array, tuple[Any, ...]]:
     out = dense(weights, bias, inputs, relu)
     return out, (weights, bias, inputs, out if relu else None)
 
 
-def _dense_backward(relu, residuals, cotangent):
+def _dense_backward(
+    relu: bool, residuals: tuple[Any, ...], cotangent: jax.Array
+) -> tuple[tuple[jax.Array, ...], jax.Array, tuple[jax.Array, ...]]:
     weights, bias, inputs, out = residuals
     dtype = inputs[0].dtype
     cotangent = cotangent.astype(dtype)
@@ -214,7 +219,12 @@ def _dense_backward(relu, residuals, cotangent):
 dense.defvjp(_dense_forward, _dense_backward)
 
 
-def _dot(a, b, dtype, contracting=((1,), (0,))):
+def _dot(
+    a: jax.Array,
+    b: jax.Array,
+    dtype: jnp.dtype,
+    contracting: tuple[tuple[int], tuple[int]] = ((1,), (0,)),
+) -> jax.Array:
     # Do not pass a transposed array: its bfloat16 product is three times slower on a CPU.
     return jax.lax.dot_general(a, b, (contracting, ((), ())), preferred_element_type=dtype)
 

@@ -7,6 +7,7 @@ Where it encodes view directions by spherical harmonics, they are encoded as a N
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from jaxcloseup.fields.contract import RadianceField
 from jaxcloseup.fields.volume.config import NgpConfig
@@ -56,7 +57,7 @@ def ngp_field(
     def penalty(params: Params, buffers: Any, histograms: list[Histogram]) -> jax.Array:
         del params, buffers
         *proposals, last = histograms
-        total = sum(proposal_penalty(*last, *proposed) for proposed in proposals)
+        total = jnp.asarray(sum(proposal_penalty(*last, *proposed) for proposed in proposals))
         if config.distortion_weight:
             total += config.distortion_weight * distortion(*last)
         return total

@@ -96,7 +96,7 @@ class VolumeAux(NamedTuple):
 
 
 class Traced(NamedTuple):
-    """What tracing R rays gives.
+    """What R rays show.
 
     Attributes:
       rendering: `[R]`, with a `VolumeAux`.
@@ -137,11 +137,18 @@ def ray_field(
       A field whose `render` takes single pixels, also with stacked cameras.
     """
 
-    def trace_pixels(params, buffers, camera, pixels, key, take):
+    def trace_pixels(
+        params: Any,
+        buffers: Any,
+        camera: Camera,
+        pixels: jax.Array,
+        key: jax.Array | None,
+        take: Callable[[Traced], Any],
+    ) -> Any:
         """`take(Traced)` of pixels `[N, 2]`, chunk by chunk."""
 
-        def trace_rays(rays):
-            key, origins, directions, pixel = rays
+        def trace_rays(keyed: tuple[Any, jax.Array, jax.Array, jax.Array]) -> Any:
+            key, origins, directions, pixel = keyed
             scale = extent.scale
             rays = Rays(
                 origins=(origins - jnp.array([extent.center])) * scale,
@@ -167,7 +174,9 @@ def ray_field(
         rendering = bound(camera, pixels, key, lambda traced: traced.rendering)
         if supervision is not None and key is not None:
 
-            def see(key, cameras, pixels):
+            def see(
+                key: jax.Array, cameras: Camera, pixels: jax.Array
+            ) -> list[tuple[jax.Array, jax.Array]]:
                 return bound(cameras, pixels, key, lambda traced: traced.light)
 
             key = jax.random.fold_in(key, _SUPERVISED)
@@ -201,10 +210,10 @@ def photometric_loss(
     chex.assert_equal_shape([rendering.rgb, target_rgb])
     chex.assert_shape(weight, target_rgb.shape[:-1])
 
-    def mean(values):
+    def mean(values: jax.Array) -> jax.Array:
         return safe_divide(jnp.sum(weight * values), jnp.sum(weight))
 
-    def error(rgb):
+    def error(rgb: jax.Array) -> jax.Array:
         return mean(jnp.mean((rgb - target_rgb) ** 2, axis=-1))
 
     aux, fine = rendering.aux, error(rendering.rgb)
@@ -226,7 +235,12 @@ def _rays(camera: Camera, pixels: jax.Array) -> tuple[jax.Array, jax.Array, jax.
     return *jax.vmap(pixels_to_rays)(camera, pixels), width
 
 
-def _map_chunks(fn, key, rays, chunk):
+def _map_chunks(
+    fn: Callable[[Any], Any],
+    key: jax.Array | None,
+    rays: tuple[jax.Array, jax.Array, jax.Array],
+    chunk: int | None,
+) -> Any:
     """`fn((key, *rays))` on chunks of the rays' leading axis `[R]`, in fixed memory.
 
     A backward pass computes each chunk again: remembering all of them takes as long, and gigabytes.
@@ -236,12 +250,12 @@ def _map_chunks(fn, key, rays, chunk):
         return fn((key, *rays))
     num_chunks = -(-num_rays // chunk)
     pad = num_chunks * chunk - num_rays
-    rays = [
+    padded = [
         jnp.pad(x, ((0, pad), *((0, 0),) * (x.ndim - 1)), mode="edge").reshape(
             num_chunks, chunk, *x.shape[1:]
         )
         for x in rays
     ]
     keys = None if key is None else jax.random.split(key, num_chunks)
-    out = jax.lax.map(jax.checkpoint(fn), (keys, *rays))
+    out = jax.lax.map(jax.checkpoint(fn), (keys, *padded))
     return jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:]))[:num_rays], out)

@@ -74,10 +74,11 @@ def antialiased_proposal_penalty(
     edges, weights = jax.lax.stop_gradient((edges, weights))
     ahead = proposed_edges[..., None] - edges[..., None, :]  # [..., P + 1, S + 1]
 
-    def share(u):  # of a blurred point at 0, that lies below u
+    def share(u: jax.Array) -> jax.Array:
+        # The part of a point at 0, once blurred, that lies below u.
         return jnp.clip((u + pulse) / (2 * pulse), 0, 1)
 
-    def integral(u):
+    def integral(u: jax.Array) -> jax.Array:
         return jnp.maximum(u - pulse, 0) + pulse * share(u) ** 2
 
     # An interval's light below a proposed edge is the mean of `share` over it; where it is narrow,

@@ -38,7 +38,7 @@ class VolumeConfig:
 
 
 class Samples(NamedTuple):
-    """A query function's answer for S samples on each of R rays.
+    """What a query function returns for S samples on each of R rays.
 
     Attributes:
       density: `[R, S]` non-negative, per world unit, whatever the scale of the field's coordinates.
@@ -102,12 +102,14 @@ def _two_passes(
     keys = (None,) * 4 if key is None else jax.random.split(key, 4)
     key_coarse, key_fine, key_coarse_query, key_fine_query = keys
 
-    def see(stage, key, depth) -> Composite:
+    def see(stage: str, key: jax.Array | None, depth: jax.Array) -> Composite:
         samples = query(stage, key, rays.at(depth), rays.unit)
+        assert samples.rgb is not None  # both passes have colors
         chex.assert_shape(samples.density, depth.shape)
         return composite(samples.rgb, samples.density, depth, rays.length)
 
-    def light(depth, seen):  # each sample stands for the interval up to the next
+    def light(depth: jax.Array, seen: Composite) -> tuple[jax.Array, jax.Array]:
+        # Each sample stands for the interval up to the next, the last one for the rest.
         return jnp.concatenate([depth, jnp.full_like(depth[..., :1], far)], axis=-1), seen.weights
 
     depth = stratified(key_coarse, near, far, config.num_coarse, rays.length.shape)

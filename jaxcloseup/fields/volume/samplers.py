@@ -102,7 +102,7 @@ def widen(weights: jax.Array) -> jax.Array:
     return 0.5 * (larger[..., :-1] + larger[..., 1:]) + 0.01
 
 
-def _cdf(edges, weights):
+def _cdf(edges: jax.Array, weights: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Edges, and where the CDF of the raised weights begins and what it gains in each bin."""
     chex.assert_equal_shape_prefix([edges, weights], weights.ndim - 1)
     chex.assert_axis_dimension(edges, -1, weights.shape[-1] + 1)
@@ -112,7 +112,7 @@ def _cdf(edges, weights):
     return edges, jnp.cumsum(pdf, axis=-1) - pdf, pdf
 
 
-def _invert(edges, cdf, pdf, quantiles):
+def _invert(edges: jax.Array, cdf: jax.Array, pdf: jax.Array, quantiles: jax.Array) -> jax.Array:
     # The inverse is a sum of clipped ramps, one per bin, without search or gather.
     inside = jnp.clip((quantiles[..., None] - cdf[..., None, :]) / pdf[..., None, :], 0, 1)
     widths = jnp.diff(edges, axis=-1)

@@ -18,8 +18,8 @@ from jaxcloseup.fields.volume.config import TensorfConfig
 from jaxcloseup.fields.volume.depth_supervision import DepthSupervision
 from jaxcloseup.fields.volume.encodings import positional_encoding
 from jaxcloseup.fields.volume.interpolation import weighted_rows
-from jaxcloseup.fields.volume.intervals import IntervalConfig, Round, interval_field
-from jaxcloseup.fields.volume.networks import apply_colors, apply_mlp, init_colors, init_mlp
+from jaxcloseup.fields.volume.intervals import Histogram, IntervalConfig, Round, interval_field
+from jaxcloseup.fields.volume.networks import Params, apply_colors, apply_mlp, init_colors, init_mlp
 from jaxcloseup.fields.volume.rays import Extent, Rays
 from jaxcloseup.fields.volume.renderer import Samples
 
@@ -29,8 +29,7 @@ _LINES = (2, 1, 0)
 _INITIAL = 0.1  # standard deviation of initial factors
 
 
-@struct.dataclass
-class TensorfBuffers:
+class TensorfBuffers(struct.PyTreeNode):
     """Vertices along each side of the grid, `[]` int32."""
 
     vertices: jax.Array
@@ -59,17 +58,31 @@ def tensorf_field(
         }
         return params, TensorfBuffers(jnp.asarray(config.sizes[0], jnp.int32))
 
-    def density(params, buffers, rays: Rays, edges: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def density(
+        params: Params, buffers: TensorfBuffers, rays: Rays, edges: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
         positions = rays.at_middles(edges)
         total = jnp.sum(factor_products(params["density"], buffers.vertices, positions), (0, 1))
         per_field_unit = config.density_scale * jax.nn.softplus(total + config.density_shift)
         return positions, extent.scale * per_field_unit.reshape(edges.shape[0], -1)
 
-    def look(params, buffers, key, rays, edges) -> Samples:
+    def look(
+        params: Params,
+        buffers: TensorfBuffers,
+        key: jax.Array | None,
+        rays: Rays,
+        edges: jax.Array,
+    ) -> Samples:
         del key
         return Samples(density(params, buffers, rays, edges)[1], None)
 
-    def render(params, buffers, key, rays, edges) -> Samples:
+    def render(
+        params: Params,
+        buffers: TensorfBuffers,
+        key: jax.Array | None,
+        rays: Rays,
+        edges: jax.Array,
+    ) -> Samples:
         del key
         positions, absorbed = density(params, buffers, rays, edges)
         products = factor_products(params["color"], buffers.vertices, positions)
@@ -77,14 +90,14 @@ def tensorf_field(
         encoded = positional_encoding(features, config.octaves)
         return Samples(absorbed, apply_colors(params["network"], encoded, rays, config.octaves))
 
-    def penalty(params, buffers, histograms):
+    def penalty(params: Params, buffers: TensorfBuffers, histograms: list[Histogram]) -> jax.Array:
         n = buffers.vertices
         total = config.sparsity_weight * _mean_size(params["density"], n)
         for factors in (params["density"], params["color"]):
             total += config.smoothness_weight * _mean_step(factors, n)
         return jnp.broadcast_to(total, histograms[0].weights.shape[:1])
 
-    def adapt(key, state):
+    def adapt(key: jax.Array, state: Any) -> Any:
         del key
         for i, (old, new) in enumerate(zip(config.sizes, config.sizes[1:], strict=False)):
             due = state.step == (i + 1) * config.grow_every
@@ -133,13 +146,13 @@ def factor_products(factors: Any, vertices: jax.Array, positions: jax.Array) -> 
     return planes * weighted_rows(factors["lines"].reshape(-1, components), rows, weights)
 
 
-def _init_factors(key, size, components):
+def _init_factors(key: jax.Array, size: int, components: int) -> dict[str, jax.Array]:
     keys = jax.random.split(key)
     planes = _INITIAL * jax.random.normal(keys[0], (3, size, size, components))
     return {"planes": planes, "lines": _INITIAL * jax.random.normal(keys[1], (3, size, components))}
 
 
-def _mean_size(factors, vertices):
+def _mean_size(factors: dict[str, jax.Array], vertices: jax.Array) -> jax.Array:
     """The mean absolute factor, planes plus lines (TensoRF, eq. 11)."""
     inside = jnp.arange(factors["lines"].shape[1], dtype=jnp.int32) < vertices
     both = inside[:, None] & inside[None]
@@ -147,7 +160,7 @@ def _mean_size(factors, vertices):
     return lines + _mean(jnp.abs(factors["planes"]), both[None, :, :, None])
 
 
-def _mean_step(factors, vertices):
+def _mean_step(factors: dict[str, jax.Array], vertices: jax.Array) -> jax.Array:
     """The mean squared step between neighbors in planes, along both axes (TensoRF, eq. 12)."""
     planes = factors["planes"]
     inside = jnp.arange(planes.shape[1], dtype=jnp.int32) < vertices
@@ -156,15 +169,15 @@ def _mean_step(factors, vertices):
     return down + _mean(jnp.diff(planes, axis=2) ** 2, both[:, :, 1:])
 
 
-def _mean(values, inside):
+def _mean(values: jax.Array, inside: jax.Array) -> jax.Array:
     counted = jnp.broadcast_to(inside, values.shape)
     return jnp.sum(jnp.where(counted, values, 0)) / jnp.sum(counted).astype(values.dtype)
 
 
-def _grown(state, old, new):
+def _grown(state: Any, old: int, new: int) -> Any:
     """The state with a grid of `new` instead of `old` vertices, and an optimizer without memory."""
 
-    def grow(factors):
+    def grow(factors: dict[str, jax.Array]) -> dict[str, jax.Array]:
         size = factors["lines"].shape[1]
         take = _resampling(size, old, new).astype(factors["lines"].dtype)
         lines = jnp.einsum("ni,mic->mnc", take, factors["lines"], precision="highest")
@@ -181,7 +194,7 @@ def _grown(state, old, new):
     return state.replace(params=params, buffers=buffers, opt_state=opt_state)
 
 
-def _resampling(size, old, new):
+def _resampling(size: int, old: int, new: int) -> jax.Array:
     """The matrix `[size, size]` that interpolates `old` vertices to `new` between the same ends."""
     matrix = np.zeros((size, size))
     at = np.arange(new) * (old - 1) / (new - 1)

@@ -48,11 +48,11 @@ def zipnerf_field(
     def init(key: jax.Array, points: jax.Array, rgb: jax.Array) -> tuple[Params, tuple[()]]:
         del points, rgb
         key_color, key_fine, *keys = jax.random.split(key, 2 + len(proposal_counts(config)))
-        fine = init_part(*jax.random.split(key_fine), config.grid, config.width, GEOMETRY)
+        key_grid, key_density = jax.random.split(key_fine)
+        fine = init_part(key_grid, key_density, config.grid, config.width, GEOMETRY)
         fine["color"] = init_color_network(key_color, config)
-        proposals = [
-            init_part(*jax.random.split(key), config.proposal, config.width) for key in keys
-        ]
+        pairs = [jax.random.split(key) for key in keys]
+        proposals = [init_part(k[0], k[1], config.proposal, config.width) for k in pairs]
         return {"fine": fine, "proposal": proposals}, ()
 
     def encode(
@@ -118,4 +118,5 @@ def downweighted_features(
 def mean_squares(table: jax.Array, grid: HashGridConfig) -> jax.Array:
     """The mean square of each level's features, summed over levels (Zip-NeRF, section 2)."""
     starts = np.cumsum([0, *grid.entries])
-    return sum(jnp.mean(jnp.square(table[i:j])) for i, j in itertools.pairwise(starts))
+    squares = [jnp.mean(jnp.square(table[i:j])) for i, j in itertools.pairwise(starts)]
+    return jnp.asarray(sum(squares))
