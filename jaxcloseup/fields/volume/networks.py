@@ -185,8 +185,8 @@ def dense(
     """
     chex.assert_rank([*weights, bias, *inputs], 2)
     dtype = inputs[0].dtype
-    products = [_dot(w.astype(dtype), x, w.dtype) for w, x in zip(weights, inputs, strict=True)]
-    out = jnp.asarray(sum(products))
+    pairs = zip(weights, inputs, strict=True)
+    out = jnp.asarray(sum(_dot(w.astype(dtype), x, w.dtype) for w, x in pairs))
     out = (out.reshape(*bias.shape, -1) + bias[..., None]).reshape(out.shape)
     return jax.nn.relu(out).astype(dtype) if relu else out
 
