@@ -1,21 +1,21 @@
-"""Detail of the newest run of surfels on `table` in `outputs`: flicker of a dolly, and seconds.
+"""Measure flicker and time of detail, with the newest run of surfels on `table` in `outputs`.
 
-*Flicker* is the mean absolute difference between neighboring frames, warped onto each other with
-the rendered depth. Sharp frames also differ by what the warp's interpolation takes from them. So
-frames are rendered twice as large too and their differences averaged over 2 x 2 pixels, the true
-frames of the built-in scene are measured, and frames minus true frames: what a viewer sees change
-that does not change in the scene.
+*Flicker* is the mean absolute difference between neighboring frames of a dolly, warped onto each
+other with the rendered depth. Interpolation by the warp blurs sharp frames, which adds to their
+differences. So the suite also renders frames twice as large and averages differences over 2 x 2
+pixels, and measures the true frames of the scene and the errors of frames, whose flicker is not in
+the scene.
 """
 
 import functools
-import time
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.benchmarks.newest_run import newest_run
-from jaxcloseup.app.run.kept_detail import detail_path, detailed, find_detail
+from experiments.benchmarks.timing import interleaved_medians
+from experiments.trained_run import newest_run
+from jaxcloseup.app.run.kept_detail import detailed
 from jaxcloseup.app.view.camera_paths import dolly, resized
 from jaxcloseup.geometry import warp_to
 from jaxcloseup.labels.rules import label_depth
@@ -29,8 +29,8 @@ VIEWS = (3, 25, 47)  # training photographs from which dollies start
 
 def run() -> None:
     """Print flicker with and without detail, and the seconds of both halves of a view."""
-    folder, stage, scene, programs, state = newest_run()
-    detail, _ = find_detail(programs, state, detail_path(folder, stage))
+    run = newest_run()
+    scene, programs, state, detail = run.scene, run.programs, run.state, run.detail()
 
     def shoot(camera):
         seen = programs.render(state, camera)
@@ -54,22 +54,14 @@ def run() -> None:
             print(f"  {_describe(*found)}, differences averaged over {times} x {times} pixels")
     camera = camera_at(resized(cameras, 480, None), FRAMES // 2)
     seen = jax.block_until_ready(programs.render(state, camera))
-    works = {
+    calls = {
         "render": lambda: programs.render(state, camera),
         "detail": lambda: detailed(programs, detail, camera, seen),
     }
-    for work in works.values():
-        jax.block_until_ready(work())
-    seconds: dict[str, list[float]] = {name: [] for name in works}
-    for _ in range(REPEATS):
-        for name, work in works.items():
-            start = time.perf_counter()
-            jax.block_until_ready(work())
-            seconds[name].append(time.perf_counter() - start)
-    middle = {name: float(np.median(taken)) for name, taken in seconds.items()}
+    seconds = interleaved_medians(calls, REPEATS)
     print(
         f"{camera.width} x {camera.height}: "
-        + ", ".join(f"{n} {s:.2f} s" for n, s in middle.items())
+        + ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items())
     )
 
 
@@ -85,9 +77,9 @@ def _describe(plain, sharp, truth, plain_error, sharp_error):
 
 
 def _flicker(before, after, times):
-    """Mean difference of two frames, for each kind of image that they have.
+    """Return the mean difference of two frames, for each kind of their images.
 
-    Differences are averaged over `times` x `times` pixels first, where all of these are seen.
+    Differences are first averaged over blocks of `times` x `times` visible pixels.
     """
     camera, depth, images = after
     differences = []
@@ -101,7 +93,7 @@ def _flicker(before, after, times):
 
 
 def _averaged(image, times):
-    """Means of an image `[H, W, C]` over `times` x `times` pixels; a rest at its edge is cut."""
+    """Average an image `[H, W, C]` over blocks of `times` x `times` pixels; cut the rest."""
     height, width = (size // times for size in image.shape[:2])
     parts = image[: height * times, : width * times]
     return parts.reshape(height, times, width, times, -1).mean((1, 3))

@@ -1,11 +1,11 @@
-"""How far to trust the detail of photographs, learned from the true close-ups of runs.
+"""Learn how far to trust the detail of photographs, from the true close-ups of runs.
 
 The suite reads the stage `control` of every run in `outputs/teach`, of two scenes or more, and
-writes `outputs/teach/detail_weights.npz`; the package's own `jaxcloseup/detail_weights.npz` is made
-so. What is gathered from the photographs for each held-out view is compared with what is there.
-Small networks learn how much of it to add, and how far colors are off in the end, one without each
-scene. That scene is its test: printed are the PSNR of its held-out views before and after, and
-actual / expected error for every tenth of the pixels.
+writes `outputs/teach/detail_weights.npz`, as the package's `jaxcloseup/detail/weights.npz` was
+made. It compares the detail of photographs in each held-out view with the truth. Small networks,
+each without one scene, learn how much detail to add and the error that remains. Each is tested on
+its scene: the suite prints the PSNR of held-out views before and after, and the ratio of actual to
+expected error for every tenth of the pixels.
 """
 
 import pathlib
@@ -16,9 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcloseup.app.run.kept_detail import detail_path, find_detail
+from experiments.trained_run import open_run
 from jaxcloseup.app.score.expected_errors import error_tenths
-from jaxcloseup.app.store.stored_run import choose_stage, load_run_scene, read_run, restore
 from jaxcloseup.detail.add import find_candidates
 from jaxcloseup.detail.learn import (
     PIXELS,
@@ -44,7 +43,7 @@ FOLDER, STAGE = pathlib.Path("outputs/teach"), "control"
 
 
 def run(folder: pathlib.Path = FOLDER) -> None:
-    """Learn from the runs in a folder, write the weights, and print what they are worth."""
+    """Learn from the runs in a folder, write the weights, and print their scores."""
     scenes: dict[str, list[Evidence]] = {}
     for path in sorted(folder.glob("*/manifest.json")):
         name, found = run_evidence(path.parent)
@@ -62,12 +61,10 @@ def run(folder: pathlib.Path = FOLDER) -> None:
 
 
 def run_evidence(folder: pathlib.Path) -> tuple[str, list[Evidence]]:
-    """The scene of a run, and what its held-out views say of the detail of its photographs."""
-    record = read_run(folder)
-    scene = load_run_scene(record)
-    stage = choose_stage(record, STAGE)
-    programs, state = restore(record, scene, stage)
-    detail, _ = find_detail(programs, state, detail_path(record.folder, stage))
+    """Return the name of a run's scene, and the evidence from each of its held-out views."""
+    trained = open_run(folder, STAGE)
+    scene, programs, state = trained.scene, trained.programs, trained.state
+    detail = trained.detail()
 
     def evidence(views, index):
         camera = camera_at(views.cameras, index)
@@ -92,7 +89,7 @@ def _held_out(scene: Scene, finer: int | None) -> Iterator[Views]:
 
 
 def _describe(weights: DetailWeights, views: Sequence[Evidence]) -> str:
-    """PSNR of all pixels before and after, and how right the expected errors are."""
+    """Describe PSNR of all pixels before and after, and actual over expected errors."""
     found = jax.tree.map(lambda *rows: np.concatenate(rows), *views)
     mixed, share = blend(weights, *map(jnp.asarray, found[:3]))
     errors = [

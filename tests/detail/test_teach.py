@@ -21,10 +21,13 @@ from jaxcloseup.detail.weights import known_weights
 
 
 def test_runs_of_two_scenes_teach_a_network_each(kept, tmp_path, monkeypatch, capsys):
-    names, load = iter(("first", "second")), teach.load_run_scene
-    monkeypatch.setattr(
-        teach, "load_run_scene", lambda record: dataclasses.replace(load(record), name=next(names))
-    )
+    names, open_run = iter(("first", "second")), teach.open_run
+
+    def renamed(folder, stage):
+        run = open_run(folder, stage)
+        return run._replace(scene=dataclasses.replace(run.scene, name=next(names)))
+
+    monkeypatch.setattr(teach, "open_run", renamed)
     monkeypatch.setattr(teach, "STAGE", "closeup")
     quickly = functools.partial(learn_weights, steps=(20, 20))
     monkeypatch.setattr(teach, "learn_weights", quickly)

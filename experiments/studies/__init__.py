@@ -1,0 +1,12 @@
+"""Scripts that make the tables and pictures of the documents, one script each.
+
+    default_runs        tables of default runs: README.md, docs/results.md
+    few_photographs     table of runs with 20 photographs: docs/log/results.md
+    methods_table       table of all methods from a sweep: docs/log/results.md
+    closeups_picture    docs/closeups_table.jpg
+    expected_error      docs/expected_error.jpg
+    api_pages           pages of the library from its docstrings
+
+`python -m experiments.studies.SCRIPT --help` describes each. A script reads finished runs; where
+their folder does not hold a run yet, it makes the run first.
+"""

@@ -1,0 +1,95 @@
+"""Tables of studies from files of made-up runs, whose numbers are easy to check."""
+
+import json
+import re
+
+import numpy as np
+import PIL.Image
+
+from experiments.studies import default_runs, few_photographs, methods_table
+from experiments.studies.pictures import write_rows
+from experiments.studies.tables import finished_runs, format_gain
+
+
+LEVELS = {"baseline": 20.0, "control": 21.0, "closeup": 21.5, "detail": 23.0}
+LEVELS |= {"test_time_control": 21.25, "test_time": 22.25}
+
+
+def write_run(folder, scene, gate=None, better=0.0):
+    """Write results whose second view is 2 dB better, ordinary views 10 dB more."""
+
+    def scores(level):
+        views = {"a": {"psnr": level - 1}, "b": {"psnr": level + 1}}
+        return {"psnr": level, "cc_psnr": level + 0.5, "ssim": 0.5, "views": views}
+
+    stages = {
+        stage: {
+            "test": scores(level + better),
+            "test_far": scores(level + better + 10),
+            "zoom_1": scores(level),
+        }
+        for stage, level in LEVELS.items()
+    }
+    folder.mkdir()
+    results = {"scene": scene, "stages": stages, "gate": gate}
+    (folder / "results.json").write_text(json.dumps(results))
+    return str(folder)
+
+
+def test_tables_of_default_runs(tmp_path, capsys):
+    runs = [write_run(tmp_path / "a", "bench"), write_run(tmp_path / "b", "/data/plush")]
+    reduced = [write_run(tmp_path / "c", "bench", better=-2.0)]
+    default_runs.print_all(*(finished_runs(found, tmp_path, ()) for found in (runs, reduced)))
+    out = capsys.readouterr().out
+    assert "| bench | 19.0 | 21.0 | **23.0** | 29.0 | 31.0 | **33.0** |" in out
+    assert "| plush | - | 21.0 | **23.0** | - | 31.0 | **33.0** |" in out
+    gain = "+2.00 (+2.00 to +2.00) | +2.00 | 31.50 / 33.50 | 0.500 / 0.500 | - / -"
+    assert f"| plush, ordinary | 31.00 | **33.00** | {gain} |" in out
+    assert "mean of drawn scenes, close-ups: +2.00 (+2.00 to +2.00) dB" in out
+    labels = (
+        "+0.500 (+0.500 to +0.500) | +0.500 | 21.25 | **22.25** | +1.00 (+1.00 to +1.00) | +1.00"
+    )
+    assert f"| bench | {labels} |" in out
+
+
+def test_a_closed_gate_is_said(tmp_path, capsys):
+    folder = write_run(tmp_path / "a", "bench", gate={"weight": 0.0})
+    default_runs.print_all(finished_runs([folder], tmp_path, ()), {})
+    assert "| bench | the gate admits no labels |" in capsys.readouterr().out
+
+
+def test_the_table_of_few_photographs(tmp_path, capsys):
+    (tmp_path / "runs").mkdir()
+    write_run(tmp_path / "runs" / "table", "table")
+    runs = finished_runs([], tmp_path / "runs", ["table"])  # it is there already
+    few_photographs.print_photographs(runs, runs, "20 photographs")
+    gain = "+2.00 (+2.00 to +2.00)"
+    row = f"| table | 21.00 / 31.00 | 23.00 / 33.00 | {gain} | {gain} | 21.00 / 23.00 |"
+    assert row in capsys.readouterr().out
+
+
+def test_the_table_of_methods_has_means_of_drawn_scenes(capsys):
+    def record(psnr):
+        scores = {"test": {"psnr": psnr, "depth": 0.02}, "test_far": {"psnr": psnr + 5}}
+        return {"arms": {"control": scores}, "core_seconds": 60 * psnr, "peak_bytes": None}
+
+    found = {"ngp": {"room": record(20.0), "table": record(22.0), "plush": record(30.0)}}
+    methods_table.print_methods(found, "control")
+    out = capsys.readouterr().out
+    assert "| method | 2 drawn scenes: close-ups / ordinary |" in out
+    assert "| ngp | 21.00 / 26.00 | 2.0 / - | 30.00 / 35.00 | 2.0 / - | 24.0 |" in out
+
+
+def test_gains_have_an_interval_over_views():
+    values = [0.0, 1.0, 2.0, 3.0]
+    mean, low, high = map(float, re.findall(r"[+-]\d\.\d\d", format_gain(values)))
+    assert mean == 1.5 and 0 < low < mean < high < 3
+    assert format_gain([0.5]) == "+0.50"
+
+
+def test_pictures_stand_in_rows(tmp_path):
+    tall, flat = np.zeros((30, 40, 3), np.uint8), np.full((20, 40, 3), 200, np.uint8)
+    write_rows(tmp_path / "a.jpg", [[tall, flat], [flat]], ["one", "two"])
+    with PIL.Image.open(tmp_path / "a.jpg") as picture:
+        assert picture.size == (86, 30 + 24 + 20)
+        assert np.abs(np.asarray(picture)[-10, 20].astype(int) - 200).max() < 8
