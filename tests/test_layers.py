@@ -32,14 +32,12 @@ ROOMS = {
     "score": {"methods", "progress"},
     "store": {"methods", "run"},
     "run": {"methods", "score", "progress"},
-    "sweep": {"methods", "score", "progress", "run"},
-    "report": {"methods", "score", "run", "store"},
+    "sweep": {"methods", "score", "progress", "run", "report"},
+    "report": {"methods", "score", "progress", "run", "store", "view"},
     "view": {"methods", "score", "progress", "run", "store"},
     "process": {"progress"},
-    "cli": {"methods", "process", "progress", "run", "jobs"},
-    "jobs": {
+    "cli": {
         *("methods", "score", "progress", "run", "report", "view", "process", "store", "sweep"),
-        "cli",
     },
 }
 LIBRARIES_OF_GEOMETRY = {"jax", "chex", "flax", "typing", "collections", "jaxcloseup"}

@@ -128,7 +128,7 @@ def test_runs_that_cannot_be_compared_are_refused_in_a_sentence(tmp_path, compar
     one = write_run(tmp_path / "one", [20, 21, 22, 23])
 
     def refuse(sentence, *folders):
-        with pytest.raises(SystemExit, match=f"^experiments.compare: {sentence}"):
+        with pytest.raises(SystemExit, match=f"^jaxcloseup compare: {sentence}"):
             compare(*folders)
         assert not (tmp_path / "out").exists()
 

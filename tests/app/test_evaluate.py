@@ -10,7 +10,7 @@ from absl import flags
 from absl.testing import flagsaver
 
 from jaxcloseup.app.cli import evaluate as program
-from jaxcloseup.app.jobs.evaluate import evaluate_folders
+from jaxcloseup.app.score.folders import evaluate_folders
 from jaxcloseup.app.score.scores import NO_PERCEPTUAL
 
 

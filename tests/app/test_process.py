@@ -289,7 +289,7 @@ def test_flags_that_make_no_sense_are_one_sentence(tmp_path):
     ):
         with pytest.raises(SystemExit, match=message) as error:
             run_process(**given)
-        assert "\n" not in error.value.code and error.value.code.startswith("experiments.process: ")
+        assert "\n" not in error.value.code and error.value.code.startswith("jaxcloseup process: ")
         assert not (tmp_path / "out").exists()
     with pytest.raises(flags.IllegalFlagValueError, match="count"):
         run_process(video=video, count=2)

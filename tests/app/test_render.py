@@ -158,7 +158,7 @@ def test_a_mistake_is_one_sentence_and_nothing_is_written(render, kept, tmp_path
     before = files(kept)
     with pytest.raises(SystemExit, match=message) as error:
         render(**{"views": "test"} | changes)
-    assert "\n" not in error.value.code and error.value.code.startswith("experiments.render: ")
+    assert "\n" not in error.value.code and error.value.code.startswith("jaxcloseup render: ")
     assert not (tmp_path / "out").exists()
     assert files(kept) == before
 

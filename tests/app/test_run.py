@@ -14,19 +14,19 @@ import plane
 import pytest
 from tiny_runs import TINY, TINY_SURFELS
 
-from jaxcloseup.app.jobs.evaluate import evaluate_folders
-from jaxcloseup.app.jobs.run import run
 from jaxcloseup.app.methods.method import CoarseConfig, TargetConfig, WindowConfig
 from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.methods.surfels import REDUCED
 from jaxcloseup.app.report.comparison import say_which_is_best, write_comparison
 from jaxcloseup.app.report.finished_runs import read_finished
+from jaxcloseup.app.report.reported_run import run
 from jaxcloseup.app.run.gate import AGREEMENT, gated, verdict, weigh_labels
 from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.loop import Training, TrainingError, train_stage
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.states import initial_points, initial_state
 from jaxcloseup.app.run.step_data import TrainData
+from jaxcloseup.app.score.folders import evaluate_folders
 from jaxcloseup.app.score.footprints import blur_to_footprint
 from jaxcloseup.app.score.scores import NO_PERCEPTUAL, score, summarize
 from jaxcloseup.app.score.targets import Target

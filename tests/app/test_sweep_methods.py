@@ -55,7 +55,7 @@ def run(monkeypatch, tmp_path):
                 )
             return 0 if done else 1
 
-        monkeypatch.setattr("jaxcloseup.app.jobs.sweep_methods.call", start)
+        monkeypatch.setattr("jaxcloseup.app.sweep.method_sweeps.call", start)
         names = {"methods": methods, "scenes": scenes, "output_dir": str(tmp_path / "out")}
         with flagsaver.flagsaver(compilation_cache="", **(names | given)):
             sweep.main(["sweep"])
@@ -76,7 +76,7 @@ def rows_of(text, title):
 
 def test_one_table_has_all_methods(run, tmp_path):
     commands = run(["ngp"], ["table", "room"])
-    assert [command[1:3] for command in commands] == [["-m", "experiments.sweep"]] * 2
+    assert [command[1:3] for command in commands] == [["-m", "jaxcloseup"]] * 2
     assert f"--output_dir={tmp_path / 'out' / 'ngp' / 'room'}" in commands[1]
     # Another method later; what is finished is not made again.
     (command,) = run(["ngp", "surfels"], ["table"], resume=True)
@@ -103,7 +103,7 @@ def test_one_that_fails_costs_no_other(run, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("methods", "given", "message"),
     [
-        (["ngp", "ngp"], {}, "--methods=ngp,ngp must name some of nerf, .*, each once"),
+        (["ngp", "ngp"], {}, "--methods=ngp,ngp must name some of surfels, .*, each once"),
         (["sharp"], {}, "--methods=sharp must name some of"),
         (["ngp", "surfels"], {"preset": "reduced"}, "--preset=reduced is not for --method=ngp"),
         (["surfels", "ngp"], {"arms": ["depth=1"]}, "--arms=depth=1"),

@@ -327,7 +327,7 @@ def test_a_mistake_exits_with_one_sentence(run, viser):
             run(port=port)
     with pytest.raises(SystemExit, match=r"--host=10\.255\.255\.1 .*an address of this computer"):
         run(host="10.255.255.1", port=free_port())
-    with pytest.raises(SystemExit, match=r"experiments\.view: --run=nowhere is not a folder"):
+    with pytest.raises(SystemExit, match=r"jaxcloseup view: --run=nowhere is not a folder"):
         run(run="nowhere")
 
 

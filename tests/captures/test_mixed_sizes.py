@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from tiny_capture import frame, write_image, write_json
 
-from jaxcloseup.app.jobs.evaluate import evaluate_folders
 from jaxcloseup.app.report.pictures import comparisons
+from jaxcloseup.app.score.folders import evaluate_folders
 from jaxcloseup.app.score.renders import write_renders, write_truth
 from jaxcloseup.app.score.scores import NO_PERCEPTUAL, evaluate
 from jaxcloseup.app.score.targets import targets_by_split

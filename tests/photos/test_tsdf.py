@@ -11,10 +11,10 @@ import plane
 import pytest
 from absl import flags
 from absl.testing import flagsaver
+from jaxcloseup.app.jobs import mesh as job
 from tiny_runs import HALF
 
 from jaxcloseup.app.cli import mesh as program
-from jaxcloseup.app.jobs import mesh as job
 from jaxcloseup.app.score import mesh_error
 from jaxcloseup.app.store import stored_run
 from jaxcloseup.app.view import surface
@@ -247,7 +247,7 @@ def test_a_mistake_is_one_sentence(run, monkeypatch):
         ({"voxel": 1e-5}, "voxels take .* GiB, .* choose a smaller --resolution"),
         ({"region": ["0", "0", "5", "1", "1", "6"]}, "no surface lies in the region"),
     ):
-        with pytest.raises(SystemExit, match=f"experiments.mesh: .*{sentence}"):
+        with pytest.raises(SystemExit, match=f"jaxcloseup mesh: .*{sentence}"):
             run(**flags_)
     monkeypatch.setattr(job.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(SystemExit, match='install jaxcloseup with the extra "mesh"'):

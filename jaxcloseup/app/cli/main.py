@@ -9,6 +9,7 @@ import importlib
 import sys
 
 from jaxcloseup.app.cli.interrupt import end_at_ctrl_c
+from jaxcloseup.app.cli.invocation import program_name
 
 
 PROGRAMS = {
@@ -35,7 +36,7 @@ def main() -> None:
         return
     if name not in PROGRAMS:
         sys.exit(f"jaxcloseup: {name} is not a program: choose {', '.join(PROGRAMS)}")
-    end_at_ctrl_c(f"experiments.{name}")
+    end_at_ctrl_c(program_name(name))
     from jaxcloseup.app.cli.start import start
 
     program = importlib.import_module(f"jaxcloseup.app.cli.{name}")

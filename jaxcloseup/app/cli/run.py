@@ -1,6 +1,6 @@
 """Train, fine-tune on pseudo-labeled close-ups, evaluate, report.
 
-    python -m experiments.run --scene=table
+    jaxcloseup run --scene=table
 
 Stages: `baseline` trains on the photographs; `control` and `closeup` both continue from it for the
 same number of steps, without and with pseudo-labels of random close-ups; `detail` adds to renders
@@ -10,14 +10,20 @@ scored. The scene is a built-in one or a folder.
 
 from absl import flags
 
-from jaxcloseup.app.cli import training_flags as define_flags
-from jaxcloseup.app.cli.start import job
+from jaxcloseup.app.cli.flags import (
+    TRAINING,
+    load_options_from_flags,
+    names_from_flags,
+    preset_from_flags,
+)
+from jaxcloseup.app.cli.output_folder import choose_output_dir, lock_output_dir, prepare_to_stop
+from jaxcloseup.app.cli.start import in_one_sentence, loading, set_up
+from jaxcloseup.app.cli.topics import share
 from jaxcloseup.app.run.stage_names import STAGES
 
 
-flags.adopt_module_key_flags(define_flags)  # these are in --help too
-for _name in ("output_dir", "lpips_weights", "compilation_cache"):
-    flags.declare_key_flag(_name)
+FLAGS = flags.FLAGS
+share(TRAINING)
 flags.DEFINE_string(
     "scene", "table", "a built-in scene (counter, table, room, bench, stairs) or a folder"
 )
@@ -36,7 +42,46 @@ flags.DEFINE_list("stages", list(STAGES), "stages to run; baseline always runs")
 
 def main(_: list[str]) -> None:
     """Run all stages with the settings of the flags."""
-    job("run").main()
+    with loading():
+        from jaxcloseup.app import progress
+        from jaxcloseup.app.report.headline import print_results
+        from jaxcloseup.app.report.reported_run import run
+        from jaxcloseup.app.run.logs import check_tensorboard
+        from jaxcloseup.app.run.loop import TrainingError
+        from jaxcloseup.app.run.scene_input import load
+        from jaxcloseup.app.score.scores import find_perceptual
+        from jaxcloseup.artifacts.checkpoints import CheckpointError
+        from jaxcloseup.photos.scene import SceneError
+    set_up()
+    with in_one_sentence("run", SceneError, OSError, ValueError):
+        if FLAGS.tensorboard:
+            check_tensorboard()
+        preset = preset_from_flags()
+        output_dir = choose_output_dir(
+            FLAGS.output_dir, FLAGS.scene, FLAGS.method, resume=FLAGS.resume
+        )
+        prepare_to_stop(output_dir, "run")
+        load_options = load_options_from_flags(preset)
+        with progress.showing(), progress.saying(f"loading {FLAGS.scene}"):
+            scene = load(FLAGS.scene, load_options)
+        perceptual = find_perceptual(FLAGS.lpips_weights)
+        lock = lock_output_dir(output_dir)
+    expected = (TrainingError, CheckpointError, SceneError, OSError)
+    with in_one_sentence("run", *expected), lock, progress.showing():
+        results = run(
+            scene,
+            preset,
+            FLAGS.seed,
+            output_dir,
+            names=names_from_flags(),
+            to_run=FLAGS.stages,
+            save_every=FLAGS.save_every,
+            perceptual=perceptual,
+            load_options=load_options,
+            tensorboard=FLAGS.tensorboard,
+        )
+    print_results(results)
+    print(f"report: {output_dir / 'report.html'}")
 
 
 @flags.multi_flags_validator(["stages"], message=f"--stages takes names of {', '.join(STAGES)}")

@@ -79,10 +79,7 @@ def read_finished(folders: Sequence[str]) -> list[Finished]:
 def _read(folder: pathlib.Path, name: str) -> Finished:
     path = folder / "results.json"
     if not path.exists():
-        raise RunError(
-            f"--runs: {folder} has no results.json: name folders of finished runs of "
-            "experiments.run"
-        )
+        raise RunError(f"--runs: {folder} has no results.json: name folders of finished runs")
     results = read_fields(path, _RESULTS)
     about = read_fields(folder / "manifest.json", {"data_sha256": str})
     stages = results["stages"]

@@ -1,1 +1,1 @@
-"""Metrics of renders, depths and pseudo-labels; the program is `experiments.evaluate`."""
+"""Metrics of renders, depths and pseudo-labels."""

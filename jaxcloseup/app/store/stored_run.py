@@ -72,10 +72,10 @@ def read_run(folder: pathlib.Path) -> StoredRun:
       RunError: the folder holds no run that this version can render.
     """
     if not folder.is_dir():
-        raise RunError(f"--run={folder} is not a folder: name that of a run of experiments.run")
+        raise RunError(f"--run={folder} is not a folder: name the folder of a run")
     about, identity = (_read_json(folder, name) for name in _FIELDS)
     if "scene" not in about or "config" not in identity:
-        raise RunError(f"--run={folder} is of a sweep or unknown: name a run of experiments.run")
+        raise RunError(f"--run={folder} is of a sweep or unknown: name the folder of a run")
     for fields, (name, kinds) in zip((about, identity), _FIELDS.items(), strict=True):
         _check_fields(folder / name, fields, kinds)
     if len(identity["resolution"]) != 2:
@@ -102,7 +102,7 @@ def read_run(folder: pathlib.Path) -> StoredRun:
         if path.is_dir() and any(step.name.isdecimal() for step in path.iterdir())
     )
     if not stages:
-        raise RunError(f"--run={folder} has no checkpoint yet: resume it with experiments.run")
+        raise RunError(f"--run={folder} has no checkpoint yet: resume its training with --resume")
     return StoredRun(folder, about, identity, preset, preset, stages)
 
 
@@ -218,5 +218,5 @@ def _check_fields(path: pathlib.Path, fields: Mapping[str, Any], kinds: Mapping[
 
 def _read_json(folder: pathlib.Path, name: str) -> dict[str, Any]:
     if not (folder / name).exists():
-        raise RunError(f"--run={folder} has no {name}: name the folder of a run of experiments.run")
+        raise RunError(f"--run={folder} has no {name}: name the folder of a run")
     return read_fields(folder / name, {})

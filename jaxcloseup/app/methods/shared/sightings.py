@@ -14,9 +14,9 @@ _COLOR = 0.1  # largest difference of a channel between a point and what shows i
 
 
 def find_sightings(scene: Scene) -> Sightings:
-    """The points of a scene in its training photographs.
+    """Return the points of a scene in its training photographs.
 
-    A COLMAP model tells which photographs show a point, and its reprojection error. Otherwise a
+    A COLMAP model says which photographs show a point, and its reprojection error. Otherwise a
     photograph shows a point that no other point near its pixel hides, and whose color it has. The
     deviation of depth is that of the point's position, estimated from all its sightings with
     independent errors of their pixels, along the ray.
@@ -42,8 +42,8 @@ def find_sightings(scene: Scene) -> Sightings:
         else:
             rows = rows[_shown(scene, view, rows, pixels[rows], depth[rows])]
         found.append((np.full(len(rows), view), rows, pixels[rows], depth[rows]))
-    view, rows, pixels, depth = map(np.concatenate, zip(*found, strict=True))
-    deviation = _deviations(poses, lenses, points, view, rows, depth, _errors(scene))
+    views, rows, pixels, depth = map(np.concatenate, zip(*found, strict=True))
+    deviation = _deviations(poses, lenses, points, views, rows, depth, _errors(scene))
     sure = np.flatnonzero(np.isfinite(deviation))
     if not len(sure):
         raise SceneError(
@@ -54,13 +54,15 @@ def find_sightings(scene: Scene) -> Sightings:
         sure = np.random.default_rng(0).choice(sure, _MOST, replace=False)
     return Sightings(
         cameras,
-        view[sure].astype(np.int32),
+        views[sure].astype(np.int32),
         *(x[sure].astype(np.float32) for x in (pixels, depth, deviation)),
     )
 
 
-def _shown(scene, view, rows, pixels, depth):
-    """Which of the points inside of a photograph it shows."""
+def _shown(
+    scene: Scene, view: int, rows: np.ndarray, pixels: np.ndarray, depth: np.ndarray
+) -> np.ndarray:
+    """Return which of the points inside a photograph it shows."""
     cells = np.floor(pixels / _CELL).astype(np.int64)
     width, height = (
         -(-n // _CELL) for n in (scene.train.cameras.width, scene.train.cameras.height)
@@ -78,8 +80,8 @@ def _shown(scene, view, rows, pixels, depth):
     return (depth <= (1 + _BEHIND) * around) & alike & counts
 
 
-def _errors(scene):
-    """Reprojection errors of the points, in pixels of the training photographs."""
+def _errors(scene: Scene) -> np.ndarray:
+    """Return the points' reprojection errors, in pixels of the training photographs."""
     told = scene.metadata.get("point_errors")
     if told is None:
         return np.full(len(scene.points), _ERROR)
@@ -87,8 +89,16 @@ def _errors(scene):
     return np.where(np.isfinite(errors) & (errors > 0), errors, _ERROR)
 
 
-def _deviations(poses, lenses, points, view, rows, depth, errors):
-    """Standard deviation of each sighting's z-depth; infinite for a point seen once."""
+def _deviations(
+    poses: np.ndarray,
+    lenses: np.ndarray,
+    points: np.ndarray,
+    view: np.ndarray,
+    rows: np.ndarray,
+    depth: np.ndarray,
+    errors: np.ndarray,
+) -> np.ndarray:
+    """Return the standard deviation of each sighting's z-depth; infinite for a point seen once."""
     rays = points[rows] - poses[view][:, :, 3]
     distance = np.linalg.norm(rays, axis=1)
     unit = rays / distance[:, None]

@@ -1,25 +1,18 @@
-"""Scores of a folder of images: what `experiments.evaluate` does."""
+"""Score a folder of images against a folder of true images, whatever made them."""
 
 import pathlib
-import sys
+from collections.abc import Mapping
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from absl import flags
-from rich.console import Console
-from rich.table import Table
 
 from jaxcloseup.app import progress
-from jaxcloseup.app.cli.start import set_up
-from jaxcloseup.app.score.metrics_text import COLUMNS, format_metric
-from jaxcloseup.app.score.scores import Perceptual, find_perceptual, score_image, summarize
-from jaxcloseup.captures.load import SceneError
+from jaxcloseup.app.score.scores import Perceptual, score_image, summarize
 from jaxcloseup.captures.photo_files import ENDINGS, read_image, read_mask
-from jaxcloseup.io.files import write_json
 from jaxcloseup.photos.views import to_float
 
 
-FLAGS = flags.FLAGS
 _NAMES_IN_MESSAGE = 3
 
 
@@ -52,7 +45,7 @@ def images_by_name(flag: str, folder: str | None) -> dict[str, pathlib.Path]:
 
 def evaluate_folders(
     renders: str | None, truth: str | None, masks: str | None, perceptual: Perceptual
-) -> dict:
+) -> dict[str, Any]:
     """Score every render against the true image with its name.
 
     Args:
@@ -86,12 +79,21 @@ def evaluate_folders(
                     f"{path} has {_size(image)} pixels but {what} has {_size(other)}: render at "
                     "the size of the true image, because resizing changes the metrics"
                 )
-        arrays = (to_float(jnp.asarray(array)) for array in (image, target, weight))
-        views[name] = score_image(*arrays, perceptual)
+        views[name] = score_image(
+            to_float(jnp.asarray(image)),
+            to_float(jnp.asarray(target)),
+            to_float(jnp.asarray(weight)),
+            perceptual,
+        )
     return summarize(views)
 
 
-def _check_names(folder, names, other, other_names):
+def _check_names(
+    folder: str,
+    names: Mapping[str, pathlib.Path],
+    other: str,
+    other_names: Mapping[str, pathlib.Path],
+) -> None:
     missing = [name for name in other_names if name not in names]
     if missing:
         shown = _NAMES_IN_MESSAGE
@@ -102,29 +104,5 @@ def _check_names(folder, names, other, other_names):
         )
 
 
-def _size(image):
+def _size(image: np.ndarray) -> str:
     return f"{image.shape[1]} x {image.shape[0]}"
-
-
-def main() -> None:
-    """Score the folders that the flags name."""
-    set_up()
-    output = pathlib.Path(FLAGS.output)
-    try:
-        if output.exists():
-            raise ValueError(f"--output={output} already exists: name a new file, or remove it")
-        perceptual = find_perceptual(FLAGS.lpips_weights)
-        with progress.showing():
-            results = evaluate_folders(FLAGS.renders, FLAGS.truth, FLAGS.masks, perceptual)
-        write_json(output, results)
-    except (SceneError, OSError, ValueError) as error:
-        sys.exit(f"experiments.evaluate: {error}")
-    table = Table(f"{len(results['views'])} images", "mean")
-    for key, name in COLUMNS.items():
-        if key in results:
-            table.add_row(name, format_metric(key, results[key]))
-    Console().print(table)
-    for key in ("lpips_vgg", "lpips_alex"):
-        if results[key] is None:
-            print(f"no {key}: {results[f'{key}_reason']}")
-    print(f"metrics: {output}")

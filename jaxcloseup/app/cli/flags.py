@@ -1,0 +1,193 @@
+"""Flags that several programs share, and what they mean. No JAX is imported for `--help`."""
+
+import pathlib
+import sys
+from typing import TYPE_CHECKING, Any
+
+from absl import flags
+
+from jaxcloseup.app.cli.topics import topic
+from jaxcloseup.app.methods.method import Preset
+from jaxcloseup.app.methods.registry import DEFAULT, METHODS
+from jaxcloseup.app.methods.settings import describe_settings, with_settings
+from jaxcloseup.captures.choices import ALPHA_MODES, FORMATS, SPLITS
+
+
+if TYPE_CHECKING:
+    from jaxcloseup.app.store.stored_run import StoredRun
+
+FLAGS = flags.FLAGS
+
+with topic("What is trained") as _TRAINED:
+    flags.DEFINE_enum(
+        "method",
+        DEFAULT,
+        list(METHODS),
+        "radiance field: "
+        + "; ".join(f"{name}, {method.help}" for name, method in METHODS.items()),
+    )
+    flags.DEFINE_enum(
+        "preset",
+        "quick",
+        list(dict.fromkeys(name for method in METHODS.values() for name in method.presets)),
+        "hyper-parameters: "
+        + "; ".join(f"{name} has {', '.join(method.presets)}" for name, method in METHODS.items()),
+    )
+    flags.DEFINE_integer(
+        "downscale",
+        None,
+        "divide the size of photographs by this, averaging areas; default: the preset's",
+        lower_bound=1,
+    )
+    flags.DEFINE_integer(
+        "windows",
+        None,
+        "windows of photographs that a step learns from, and pseudo-labels, shared out among "
+        "devices, or among the cores of a CPU; default: the preset's",
+        lower_bound=1,
+    )
+with topic("What is trained") as _SET:
+    flags.DEFINE_multi_string(
+        "set",
+        [],
+        "name=value changes a setting of the preset, as in --set label_loss_weight=0.1 or --set "
+        "magnification=2:4; repeatable; --set=help lists all settings with the values that they "
+        "have",
+    )
+with topic("The capture") as _CAPTURE:
+    flags.DEFINE_enum(
+        "format",
+        None,
+        list(FORMATS),
+        "read this from the capture's folder: transforms*.json, a COLMAP model or LLFF's "
+        "poses_bounds.npy; default: the first of them that the folder holds",
+    )
+    flags.DEFINE_enum(
+        "split",
+        "given",
+        list(SPLITS),
+        "photographs to hold out: given: as the capture says; every8: every 8th by name, as "
+        "test_far; closest: the closest tenth, as test, and every 8th of the rest, as test_far; "
+        "zoom: every 8th, as test_far, and unreduced parts of some others, which train reduced "
+        "--zoom times more, as test",
+    )
+    flags.DEFINE_integer(
+        "zoom",
+        None,
+        "with --split=zoom: how many times finer test is than the training photographs; default: 4",
+        lower_bound=2,
+    )
+    flags.DEFINE_integer(
+        "photographs",
+        None,
+        "learn from so many of the training photographs, evenly spread over their order; default: "
+        "all",
+        lower_bound=2,
+    )
+    flags.DEFINE_bool("invert_masks", False, "masks are white where photographs do not count")
+    flags.DEFINE_enum(
+        "alpha_mode",
+        "blend",
+        list(ALPHA_MODES),
+        "blend: transparent pixels show a white background; mask: they weigh as a mask does",
+    )
+with topic("The capture") as _PIXELS:
+    flags.DEFINE_bool(
+        "half_pixel", False, "the capture has pixel centers at integers: add 0.5 to cx, cy"
+    )
+with topic("The run") as _RUN:
+    flags.DEFINE_string("run", None, "folder of a run")
+    flags.DEFINE_string(
+        "stage", None, "stage to render; default: closeup, else control, else baseline"
+    )
+    flags.DEFINE_string(
+        "data", None, "folder of the run's capture, if the capture was moved since training"
+    )
+with topic("Results") as OUTPUT:
+    flags.DEFINE_string(
+        "output_dir",
+        None,
+        "folder for results, new or empty; default: outputs/<scene>/<method>/<date_time> of a run, "
+        "<run>/videos/<date_time> of render, <run>/meshes/<date_time> of mesh, and "
+        "outputs/compare/<date_time> of compare; process needs one",
+    )
+with topic("Results") as _RESULTS:
+    flags.DEFINE_bool("resume", False, "resume the training that was cut off in --output_dir")
+    flags.DEFINE_bool(
+        "tensorboard", False, "also write event files for TensorBoard; needs the extra tensorboard"
+    )
+with topic("Computers") as COMPUTERS:
+    flags.DEFINE_string(
+        "compilation_cache",
+        None,
+        "folder that keeps compiled programs between runs; empty: no cache; default: under "
+        "~/.cache",
+    )
+    flags.DEFINE_string(
+        "lpips_weights",
+        None,
+        "folder of LPIPS weights: vgg16-*.pth with vgg.pth, or alexnet-*.pth with alex.pth; "
+        "default: $JAXCLOSEUP_LPIPS, or PyTorch's cache",
+    )
+# Groups for `share`: of programs that train, and of those that load a stored run.
+TRAINING = [*_TRAINED, *_SET, *_CAPTURE, *_PIXELS, *OUTPUT, *_RESULTS, *COMPUTERS]
+STORED_RUN = [*_RUN, *_SET]
+
+
+def preset_from_flags() -> Preset:
+    """Return the preset with the settings that flags change; `--set=help` ends the program.
+
+    Raises:
+      ValueError: one sentence that names the flag.
+    """
+    presets = METHODS[FLAGS.method].presets
+    if FLAGS.preset not in presets:
+        raise ValueError(
+            f"--preset={FLAGS.preset} is not for --method={FLAGS.method}: choose "
+            + ", ".join(presets)
+        )
+    preset = presets[FLAGS.preset]
+    _help_settings(preset)
+    given = {"downscale": FLAGS.downscale, "num_windows": FLAGS.windows}
+    flagged = [f"{name}={value}" for name, value in given.items() if value is not None]
+    return with_settings(preset, [*FLAGS.set, *flagged])
+
+
+def _help_settings(preset: Preset) -> None:
+    if "help" in FLAGS.set:
+        print(describe_settings(preset))
+        sys.exit(0)
+
+
+def names_from_flags() -> dict[str, str]:
+    """Return what tells runs apart beside their configuration, for reports and checkpoints."""
+    return {"method": FLAGS.method, "preset": FLAGS.preset} | _changed_capture_flags()
+
+
+def load_options_from_flags(preset: Preset) -> dict[str, Any]:
+    """Return what `load_scene` takes beside a scene's name."""
+    options = {name: FLAGS[name].value for name in ("half_pixel", "format", "split")}
+    return {"downscale": preset.downscale, **options, **_changed_capture_flags()}
+
+
+def _changed_capture_flags() -> dict[str, Any]:
+    """Return the flags about the capture that are not at their defaults."""
+    changed = [name for name in _CAPTURE if FLAGS[name].value != FLAGS[name].default]
+    return {name: FLAGS[name].value for name in changed}
+
+
+def run_from_flags() -> "tuple[StoredRun, str]":
+    """Return the run that `--run` names, with the settings of `--set`, and the stage to render.
+
+    `--set=help` ends the program instead.
+
+    Raises:
+      RunError: the run, the stage or a setting does not exist.
+    """
+    from jaxcloseup.app.store import stored_run
+
+    if FLAGS.run is None:
+        raise stored_run.RunError("--run is missing: name the folder of a run")
+    run = stored_run.read_run(pathlib.Path(FLAGS.run))
+    _help_settings(run.preset)
+    return stored_run.change_settings(run, FLAGS.set), stored_run.choose_stage(run, FLAGS.stage)

@@ -1,0 +1,140 @@
+"""Output folders: never one that holds something, and only one process trains in each."""
+
+import contextlib
+import datetime
+import os
+import pathlib
+import shlex
+import sys
+from typing import Any
+
+from absl import flags
+
+from jaxcloseup.app.cli.interrupt import when_stopped
+from jaxcloseup.app.cli.invocation import program_command
+
+
+try:
+    import fcntl
+except ImportError:  # not a Unix: nothing is locked
+    fcntl = None  # type: ignore[assignment]
+
+
+LOCK = ".lock"  # in a folder that a program trains in
+CHECKPOINTS = "checkpoints"  # its folder that can be resumed from
+FLAGS = flags.FLAGS
+
+
+def dated(parent: str | pathlib.Path) -> pathlib.Path:
+    """Return a folder within another whose name is the current date and time."""
+    return pathlib.Path(parent, datetime.datetime.now().strftime("%Y-%m-%d_%H%M%S"))
+
+
+def check_unused(folder: str | pathlib.Path) -> pathlib.Path:
+    """Return the path of an output folder, which must be empty or not exist yet.
+
+    Raises:
+      FileExistsError: the folder holds files, or the path is a file.
+    """
+    path = pathlib.Path(folder)
+    if path.exists() and (not path.is_dir() or any(file.name != LOCK for file in path.iterdir())):
+        raise FileExistsError(
+            f"--output_dir={folder} already exists and is not empty: name a new folder, or remove "
+            "it first"
+        )
+    return path
+
+
+def choose_output_dir(
+    folder: str | None, scene: str, method: str, *, resume: bool = False
+) -> pathlib.Path:
+    """Return the output folder: a new or empty one, or with `resume` that of a run to resume.
+
+    Raises:
+      OSError: one sentence that names the flag.
+    """
+    if resume:
+        if folder is None or not (pathlib.Path(folder) / CHECKPOINTS).is_dir():
+            raise FileNotFoundError(
+                f"--resume finds no run in --output_dir={folder or ''}: name the folder of one "
+                "that was cut off"
+            )
+        return pathlib.Path(folder)
+    if folder is None:
+        scene_name = os.path.basename(os.path.realpath(scene))  # of `..` too
+        return check_unused(dated(pathlib.Path("outputs", scene_name, method)))
+    if (pathlib.Path(folder) / CHECKPOINTS).is_dir():
+        raise FileExistsError(
+            f"--output_dir={folder} already exists and is not empty: resume its training with "
+            "--resume, or name a new folder"
+        )
+    return check_unused(folder)
+
+
+def lock_output_dir(folder: pathlib.Path) -> contextlib.AbstractContextManager[Any]:
+    """Create the output folder, and keep other processes from training in it.
+
+    Returns:
+      A context, which holds the lock until it is left or the process ends, in whatever way. Where
+      files cannot be locked it holds nothing.
+
+    Raises:
+      OSError: the folder cannot be created or written, or another process trains in it.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = (folder / LOCK).open("a+")
+    except OSError as error:
+        raise OSError(
+            f"--output_dir={folder} cannot be created or written ({error.strerror}): name a folder "
+            "where you may write"
+        ) from error
+    if fcntl is None:
+        return file
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        with file:
+            file.seek(0)
+            holder = file.read(20).strip() or "unknown"
+        raise OSError(
+            f"--output_dir={folder} is in use by the process {holder}: wait until it ends, or name "
+            "another folder"
+        ) from None
+    except OSError:  # a file system without locks
+        return file
+    with contextlib.suppress(OSError):  # on a full disk the lock holds too
+        file.truncate(0)
+        file.write(str(os.getpid()))
+        file.flush()
+    return file
+
+
+def prepare_to_stop(folder: pathlib.Path, program: str | None = None) -> None:
+    """Let Ctrl-C remove unfinished files from an output folder, and print how to resume.
+
+    Args:
+      folder: the output folder.
+      program: name of a program that resumes training in it; None cannot be resumed.
+    """
+    arguments = sys.argv[1:]
+    if FLAGS.output_dir is None:
+        arguments += [f"--output_dir={folder}"]
+
+    def say() -> str:
+        remove_unfinished(folder)
+        if program is None:
+            return "stopped"
+        if not (folder / CHECKPOINTS).is_dir():
+            return "stopped before training began: give the same command again"
+        resume = [] if "--resume" in arguments else ["--resume"]
+        command = shlex.join([*program_command(program), *arguments, *resume])
+        return f"stopped: resume it with {command}"
+
+    when_stopped(say)
+
+
+def remove_unfinished(folder: pathlib.Path) -> None:
+    """Remove the files that this process has not finished."""
+    for part in folder.rglob(f".*.{os.getpid()}.part*"):
+        part.unlink(missing_ok=True)

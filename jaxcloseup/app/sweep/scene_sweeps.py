@@ -1,0 +1,86 @@
+"""A sweep on several scenes, with its tables and pictures."""
+
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from jaxcloseup.app.methods.method import Preset
+from jaxcloseup.app.methods.settings import plain_config
+from jaxcloseup.app.report.page import Picture
+from jaxcloseup.app.report.pictures import comparisons
+from jaxcloseup.app.report.sweep_tables import write_sweep
+from jaxcloseup.app.run.logs import TrainLog
+from jaxcloseup.app.run.manifest import about_scene, versions, write_manifest
+from jaxcloseup.app.score.scores import Perceptual
+from jaxcloseup.app.sweep.arm_training import run_sweep
+from jaxcloseup.photos.scene import Scene
+
+
+def sweep_scenes(
+    scenes: Sequence[Scene],
+    preset: Preset,
+    output_dir: pathlib.Path,
+    *,
+    arms: Sequence[str],
+    seeds: int,
+    names: Mapping[str, str],
+    load_options: Mapping[str, Any],
+    perceptual: Perceptual,
+    max_parallel: int,
+    tensorboard: bool,
+    resume: bool,
+    first: bool,
+) -> dict[str, Any]:
+    """Sweep scene by scene; the first host writes tables, pictures and the report after each.
+
+    Args:
+      scenes: what was photographed.
+      preset: how it is trained.
+      output_dir: an empty folder, or with `resume` that of the same sweep.
+      arms: names of the arms.
+      seeds: number of random seeds.
+      names: "method" and "preset" by name, for the report.
+      load_options: what `load_scene` took, for the manifest.
+      perceptual: networks of LPIPS.
+      max_parallel: arms and seeds trained at once.
+      tensorboard: whether to write event files.
+      resume: whether the sweep was begun before.
+      first: whether this is the first host.
+
+    Returns:
+      The scores of `run_sweep` by scene.
+    """
+    about = {**names, "config": plain_config(preset), "versions": versions()}
+    manifest = about | {"seeds": list(range(seeds)), "arms": list(arms)}
+    manifest["scenes"] = {scene.name: about_scene(scene, load_options) for scene in scenes}
+    found: dict[str, Any] = {}
+    pictures: list[Picture] = []
+    seconds: dict[str, dict[str, float]] = {scene.name: {} for scene in scenes}
+    # One that is resumed may yet turn out to be another sweep.
+    if first and not resume:
+        write_manifest(output_dir, manifest)
+    for scene in scenes:
+        log = TrainLog(output_dir, scene.name, tensorboard=tensorboard)
+        outcome = run_sweep(
+            scene,
+            preset,
+            arms,
+            seeds,
+            output_dir / "checkpoints" / scene.name,
+            names=names,
+            max_parallel=max_parallel,
+            perceptual=perceptual,
+            seconds=seconds[scene.name],
+            log=log if first else None,
+        )
+        found[scene.name] = outcome.scores
+        if first:
+            folder = output_dir / "compare" / scene.name
+            drawn = comparisons(folder, outcome.shown, outcome.images)
+            pictures += [
+                picture._replace(section=f"{scene.name}: {picture.section}") for picture in drawn
+            ]
+            write_sweep(output_dir, found, about, pictures)
+    if first:
+        write_manifest(output_dir, manifest, seconds)
+    return found

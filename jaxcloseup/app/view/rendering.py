@@ -1,0 +1,133 @@
+"""Frames and videos of a stored run, in folders."""
+
+import pathlib
+from collections.abc import Callable, Iterator
+
+import cv2
+import numpy as np
+
+from jaxcloseup.app.run.fine_tuning import fine_tune, tuned_detail
+from jaxcloseup.app.run.kept_detail import detail_finder, detail_path
+from jaxcloseup.app.run.programs import Programs
+from jaxcloseup.app.run.setup import start_labels
+from jaxcloseup.app.store.stored_run import StoredRun, restore
+from jaxcloseup.app.view.camera_paths import (
+    CameraError,
+    Shots,
+    check_pixel,
+    dolly,
+    find_view,
+    resized,
+)
+from jaxcloseup.app.view.frames import render_shots
+from jaxcloseup.artifacts.video import write_video
+from jaxcloseup.labels.rules import label_depth
+from jaxcloseup.photos.scene import Scene
+from jaxcloseup.training.steps import TrainState
+
+
+def dolly_towards(
+    scene: Scene,
+    view: str,
+    pixel: tuple[float, float],
+    *,
+    magnification: float,
+    frames: int,
+    width: int | None,
+    height: int | None,
+) -> Callable[[Programs, TrainState], Shots]:
+    """Return a function that makes a dolly towards the surface at a pixel, for a trained state.
+
+    Args:
+      scene: what was photographed.
+      view: name of the training view from which the dolly begins.
+      pixel: (x, y) in it.
+      magnification: how many times nearer to the surface the dolly ends.
+      frames: number of cameras.
+      width: of frames; None: by `height`, or the view's.
+      height: of frames; None: by `width`, or the view's.
+
+    Raises:
+      CameraError: there is no such view or pixel, frames are too large, and, from the function, the
+        state shows no surface at the pixel.
+    """
+    camera = scene.camera("train", find_view(scene, view))
+    row, column = check_pixel(camera, pixel)
+    resized(camera, width, height)  # refuses what is too large
+
+    def make(programs: Programs, state: TrainState) -> Shots:
+        seen = label_depth(programs.render(state, camera), near=0, far=scene.far)
+        depth = float(seen[row, column])
+        if depth <= 0:
+            x, y = pixel
+            raise CameraError(
+                f"--pixel={x:g},{y:g}: the stage renders no surface at this pixel of {view}: "
+                "choose another pixel"
+            )
+        shots = dolly(camera, pixel, depth, magnification=magnification, frames=frames)
+        return shots._replace(cameras=resized(shots.cameras, width, height))
+
+    return make
+
+
+def render_run(
+    output_dir: pathlib.Path,
+    record: StoredRun,
+    scene: Scene,
+    stage: str,
+    make_shots: Callable[[Programs, TrainState], Shots],
+    *,
+    support: bool,
+    detail: bool,
+    fine_tuned: bool,
+    most_steps: int | None,
+) -> tuple[Shots, list[pathlib.Path]]:
+    """Render cameras of a stored run; return them and the folders of their images.
+
+    Args:
+      output_dir: folder to write.
+      record: the run.
+      scene: its scene.
+      stage: whose state is rendered.
+      make_shots: `(programs, state) -> Shots`, the cameras.
+      support: also render which photographs support each pixel.
+      detail: add the detail that photographs show beyond the field.
+      fine_tuned: first train for exactly these cameras.
+      most_steps: largest number of steps of this training; None: the preset's.
+    """
+    programs, state = restore(record, scene, stage)
+    shots = make_shots(programs, state)
+    sources = None
+    if support or fine_tuned:
+        expected = record.preset.labels.expected_depth
+        start = start_labels(programs, state, record.identity["seed"], expected_depth=expected)
+        sources = start.sources if support else None
+    begin = start.state if fine_tuned else state
+    kept = detail_path(record.folder, stage) if begin is state else None
+    find, added = detail_finder(programs, begin, kept), None
+    if fine_tuned:
+        state = fine_tune(programs, start, shots.cameras, find, most=most_steps)
+    if detail:
+        added, _ = find()
+        # What was fine-tuned for these cameras is not kept, and its detail neither.
+        if state is not begin:
+            added = tuned_detail(programs, state, shots.cameras, added)
+    folders = render_shots(output_dir, programs, state, shots, sources=sources, detail=added)
+    print(f"{len(shots.names)} frames: {', '.join(str(folder) for folder in folders)}")
+    return shots, folders
+
+
+def write_videos(shots: Shots, folders: list[pathlib.Path], *, fps: float) -> None:
+    """Write each folder of images as a video beside it."""
+    for folder in folders:
+        path = write_video(folder, _images(folder, shots), fps=fps)
+        print(f"video: {path}")
+    if path.suffix != ".mp4":
+        print('MP4 videos need imageio-ffmpeg: install jaxcloseup with the extra "video"')
+
+
+def _images(folder: pathlib.Path, shots: Shots) -> Iterator[np.ndarray]:
+    for name in shots.names:
+        image = cv2.imread(str(folder / f"{name}.png"))
+        assert image is not None  # written just now
+        yield image[..., ::-1]
