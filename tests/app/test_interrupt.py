@@ -79,7 +79,7 @@ def test_the_command_is_interrupted(start):
     process = start("-X", "importtime", "-c", f"{begin}; command.main()")
     wait_for(process.stderr, " jax")
     _, err = stop(process)
-    assert "experiments.run: stopped\n" in err
+    assert "jaxcloseup run: stopped\n" in err
 
 
 def test_a_run_is_interrupted_and_resumes(start, capture_folder, tmp_path):

@@ -10,9 +10,9 @@ from absl import flags
 from absl.testing import flagsaver
 
 from jaxcloseup.app.cli import sweep as program
-from jaxcloseup.app.jobs import sweep
 from jaxcloseup.app.run import manifest
 from jaxcloseup.app.run.manifest import about_scene, git_commit, hash_data
+from jaxcloseup.app.sweep import scene_sweeps
 from jaxcloseup.app.sweep.arm_training import SweepOutcome
 from jaxcloseup.captures.load import load_scene
 
@@ -102,9 +102,9 @@ def test_a_sweep_writes_a_manifest(capture_folder, tmp_path, monkeypatch):
         seconds["baseline_0"] = 1.5
         return SweepOutcome({}, {}, {})
 
-    monkeypatch.setattr(sweep, "run_sweep", stub)
-    monkeypatch.setattr(sweep, "write_sweep", lambda *_: None)
-    monkeypatch.setattr(sweep, "print_sweep", lambda *_: None)
+    monkeypatch.setattr(scene_sweeps, "run_sweep", stub)
+    monkeypatch.setattr(scene_sweeps, "write_sweep", lambda *_: None)
+    monkeypatch.setattr("jaxcloseup.app.report.sweep_tables.print_sweep", lambda *_: None)
     given = {"output_dir": str(tmp_path / "out"), "scenes": [str(capture_folder)], "downscale": 1}
     with flagsaver.flagsaver(compilation_cache="", arms=["control"], seeds=2, **given):
         program.main(["sweep"])

@@ -39,14 +39,14 @@ def leave_results(folder, method, scene):
 def run(monkeypatch, tmp_path):
     """Sweep methods with processes that only leave results; returns the commands of these."""
     monkeypatch.setattr(sys, "argv", [sweep.__file__])
-    flags.FLAGS(["sweep"])
+    flags.FLAGS(["sweep", "--seeds=1"])
 
     def call(methods, scenes, *, broken=(), **given):
         commands = []
 
         def start(command):
             commands.append(command)
-            words = dict(word[2:].partition("=")[::2] for word in command[3:])
+            words = dict(word[2:].partition("=")[::2] for word in command[4:])
             done = (words["method"], words["scenes"]) not in broken
             if done:
                 leave_results(
@@ -77,6 +77,7 @@ def rows_of(text, title):
 def test_one_table_has_all_methods(run, tmp_path):
     commands = run(["ngp"], ["table", "room"])
     assert [command[1:3] for command in commands] == [["-m", "jaxcloseup"]] * 2
+    assert all("--seeds=1" in command for command in commands)
     assert f"--output_dir={tmp_path / 'out' / 'ngp' / 'room'}" in commands[1]
     # Another method later; what is finished is not made again.
     (command,) = run(["ngp", "surfels"], ["table"], resume=True)

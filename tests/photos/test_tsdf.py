@@ -1,6 +1,7 @@
 """Fused distances and meshes: planes and a sphere, whose distances are known, and a kept run."""
 
 import dataclasses
+import importlib.util
 import itertools
 import json
 
@@ -11,7 +12,6 @@ import plane
 import pytest
 from absl import flags
 from absl.testing import flagsaver
-from jaxcloseup.app.jobs import mesh as job
 from tiny_runs import HALF
 
 from jaxcloseup.app.cli import mesh as program
@@ -249,6 +249,6 @@ def test_a_mistake_is_one_sentence(run, monkeypatch):
     ):
         with pytest.raises(SystemExit, match=f"jaxcloseup mesh: .*{sentence}"):
             run(**flags_)
-    monkeypatch.setattr(job.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(SystemExit, match='install jaxcloseup with the extra "mesh"'):
         run()
