@@ -84,10 +84,10 @@ def _sweep() -> None:
 
         from jaxcloseup.app import progress
         from jaxcloseup.app.report.sweep_tables import print_sweep
+        from jaxcloseup.app.run.devices import HOSTS_WAIT
         from jaxcloseup.app.run.logs import check_tensorboard
         from jaxcloseup.app.run.loop import TrainingError
         from jaxcloseup.app.run.plan import in_words
-        from jaxcloseup.app.run.programs import HOSTS_WAIT
         from jaxcloseup.app.run.scene_input import load
         from jaxcloseup.app.score.scores import find_perceptual
         from jaxcloseup.app.store.stored_run import RunError

@@ -13,17 +13,19 @@ from jaxcloseup.app.methods.method import Preset
 from jaxcloseup.app.methods.settings import plain_config
 from jaxcloseup.app.report.run_report import report_run
 from jaxcloseup.app.run.logs import TrainLog
+from jaxcloseup.app.run.loop import Training
 from jaxcloseup.app.run.manifest import (
     about_scene,
+    identity_of,
     versions,
     write_dataparser_transforms,
     write_manifest,
 )
 from jaxcloseup.app.run.plan import in_words, plan_run
 from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.run.setup import Training, identity_of, timed, timed_compiling
 from jaxcloseup.app.run.stage_names import STAGES
 from jaxcloseup.app.run.stages import Outcome, run_stages
+from jaxcloseup.app.run.timers import timed, timed_compiling
 from jaxcloseup.app.score.metrics_text import FINER
 from jaxcloseup.app.score.scores import NO_PERCEPTUAL, Perceptual
 from jaxcloseup.app.view.approach import approach

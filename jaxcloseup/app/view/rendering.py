@@ -7,9 +7,10 @@ import cv2
 import numpy as np
 
 from jaxcloseup.app.run.fine_tuning import fine_tune, tuned_detail
-from jaxcloseup.app.run.kept_detail import detail_finder, detail_path
+from jaxcloseup.app.run.kept_detail import detail_getter, detail_path
+from jaxcloseup.app.run.keys import run_keys
+from jaxcloseup.app.run.labels import start_labels
 from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.run.setup import start_labels
 from jaxcloseup.app.store.stored_run import StoredRun, restore
 from jaxcloseup.app.view.camera_paths import (
     CameraError,
@@ -100,11 +101,12 @@ def render_run(
     sources = None
     if support or fine_tuned:
         expected = record.preset.labels.expected_depth
-        start = start_labels(programs, state, record.identity["seed"], expected_depth=expected)
+        keys = run_keys(record.identity["seed"])
+        start = start_labels(programs, state, keys, expected_depth=expected)
         sources = start.sources if support else None
     begin = start.state if fine_tuned else state
     kept = detail_path(record.folder, stage) if begin is state else None
-    find, added = detail_finder(programs, begin, kept), None
+    find, added = detail_getter(programs, begin, kept), None
     if fine_tuned:
         state = fine_tune(programs, start, shots.cameras, find, most=most_steps)
     if detail:
