@@ -89,7 +89,7 @@ def mean_divergence(
       supervision: what to draw from.
       key: consumed.
       num_pixels: pixels of the step.
-      see: `(key, cameras [K], pixels [K, 2]) -> [(edges, weights), ...]`, what each of a field's
+      see: `(cameras [K], pixels [K, 2], key) -> [(edges, weights), ...]`, what each of a field's
         passes sees; all of them are taught.
     """
     key_draw, key_see = jax.random.split(key)
@@ -98,6 +98,6 @@ def mean_divergence(
     drawn = jax.random.randint(key_draw, (count,), 0, len(points.view))
     view, pixels, depth, deviation = (jnp.asarray(x)[drawn] for x in points[1:])
     cameras = jax.tree.map(lambda leaf: leaf[view], points.cameras)
-    passes = see(key_see, cameras, pixels)
+    passes = see(cameras, pixels, key_see)
     each = [depth_divergence(*seen, depth, deviation) for seen in passes]
     return supervision.weight * jnp.asarray(sum(jnp.mean(divergence) for divergence in each))

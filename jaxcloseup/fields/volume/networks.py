@@ -38,6 +38,7 @@ def rays_in_cache(samples: int, width: int) -> int:
       samples: samples per ray.
       width: features of each.
     """
+    # Asked here, so that a field made without a `chunk` fits the device that will render it.
     activations = 2**19 if jax.default_backend() == "cpu" else 2**27
     return max(1, activations // (samples * width))
 

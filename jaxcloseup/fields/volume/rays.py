@@ -148,24 +148,13 @@ def ray_field(
         """`take(Traced)` of pixels `[N, 2]`, chunk by chunk."""
 
         def trace_rays(keyed: tuple[Any, jax.Array, jax.Array, jax.Array]) -> Any:
-            key, origins, directions, pixel = keyed
-            scale = extent.scale
-            rays = Rays(
-                origins=(origins - jnp.array([extent.center])) * scale,
-                directions=directions * scale,
-                length=safe_norm(directions),
-                pixel=pixel * scale,
-            )
-            return take(trace(params, buffers, key, rays))
+            key, *world_rays = keyed
+            return take(trace(params, buffers, key, _to_field(extent, *world_rays)))
 
         return _map_chunks(trace_rays, key, _rays(camera, pixels), chunk)
 
     def render(
-        params: Any,
-        buffers: Any,
-        camera: Camera,
-        pixels: jax.Array | None,
-        key: jax.Array | None,
+        params: Any, buffers: Any, camera: Camera, pixels: Any, key: jax.Array | None
     ) -> Rendering:
         if pixels is None:
             pixels = pixel_grid(camera.height, camera.width)
@@ -173,12 +162,7 @@ def ray_field(
         bound = functools.partial(trace_pixels, params, buffers)
         rendering = bound(camera, pixels, key, lambda traced: traced.rendering)
         if supervision is not None and key is not None:
-
-            def see(
-                key: jax.Array, cameras: Camera, pixels: jax.Array
-            ) -> list[tuple[jax.Array, jax.Array]]:
-                return bound(cameras, pixels, key, lambda traced: traced.light)
-
+            see = functools.partial(bound, take=lambda traced: traced.light)
             key = jax.random.fold_in(key, _SUPERVISED)
             more = mean_divergence(supervision, key, len(pixels), see)
             before = rendering.aux.penalty
@@ -223,6 +207,16 @@ def photometric_loss(
     if aux.penalty is not None:
         loss += mean(aux.penalty)
     return loss, {"psnr": -10 * jnp.log10(fine)}
+
+
+def _to_field(extent: Extent, origins: jax.Array, directions: jax.Array, pixel: jax.Array) -> Rays:
+    """Convert rays `[R, 3]` and widths of pixels `[R]` from world units to field units."""
+    return Rays(
+        origins=(origins - jnp.array([extent.center])) * extent.scale,
+        directions=directions * extent.scale,
+        length=safe_norm(directions),
+        pixel=pixel * extent.scale,
+    )
 
 
 def _rays(camera: Camera, pixels: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -6,6 +6,7 @@ skips empty space by an alpha mask, a first round looks at densities alone, and 
 where the first saw something; both see the same factors.
 """
 
+import functools
 from typing import Any
 
 import jax
@@ -44,19 +45,10 @@ def tensorf_field(
     `"color"`, each of planes `[3, N, N, C]` and lines `[3, N, C]`, a `"basis"` and a `"network"`;
     buffers are `TensorfBuffers`. `supervision` adds a loss on depth, see `ray_field`.
     """
-    size = max(config.sizes)
 
     def init(key: jax.Array, points: jax.Array, rgb: jax.Array) -> tuple[Any, TensorfBuffers]:
         del points, rgb
-        keys = jax.random.split(key, 4)
-        inputs = config.appearance * (1 + 2 * config.octaves)
-        params = {
-            "density": _init_factors(keys[0], size, config.density_components),
-            "color": _init_factors(keys[1], size, config.color_components),
-            "basis": init_mlp(keys[2], (3 * config.color_components, config.appearance)),
-            "network": init_colors(keys[3], (inputs, config.width, config.width), config.octaves),
-        }
-        return params, TensorfBuffers(jnp.asarray(config.sizes[0], jnp.int32))
+        return _init_params(key, config), TensorfBuffers(jnp.asarray(config.sizes[0], jnp.int32))
 
     def density(
         params: Params, buffers: TensorfBuffers, rays: Rays, edges: jax.Array
@@ -90,13 +82,6 @@ def tensorf_field(
         encoded = positional_encoding(features, config.octaves)
         return Samples(absorbed, apply_colors(params["network"], encoded, rays, config.octaves))
 
-    def penalty(params: Params, buffers: TensorfBuffers, histograms: list[Histogram]) -> jax.Array:
-        n = buffers.vertices
-        total = config.sparsity_weight * _mean_size(params["density"], n)
-        for factors in (params["density"], params["color"]):
-            total += config.smoothness_weight * _mean_step(factors, n)
-        return jnp.broadcast_to(total, histograms[0].weights.shape[:1])
-
     def adapt(key: jax.Array, state: Any) -> Any:
         del key
         for i, (old, new) in enumerate(zip(config.sizes, config.sizes[1:], strict=False)):
@@ -109,7 +94,7 @@ def tensorf_field(
         extent,
         init=init,
         rounds=[Round(config.num_coarse, look), Round(config.num_fine, render)],
-        penalty=penalty,
+        penalty=functools.partial(_penalty, config),
         supervision=supervision,
     )
     return field._replace(adapt=adapt)
@@ -144,6 +129,28 @@ def factor_products(factors: Any, vertices: jax.Array, positions: jax.Array) -> 
     line = np.array(_LINES)
     rows, weights = vertex[:, line] + modes * size, share[:, line]
     return planes * weighted_rows(factors["lines"].reshape(-1, components), rows, weights)
+
+
+def _init_params(key: jax.Array, config: TensorfConfig) -> Params:
+    keys, size = jax.random.split(key, 4), max(config.sizes)
+    inputs = config.appearance * (1 + 2 * config.octaves)
+    return {
+        "density": _init_factors(keys[0], size, config.density_components),
+        "color": _init_factors(keys[1], size, config.color_components),
+        "basis": init_mlp(keys[2], (3 * config.color_components, config.appearance)),
+        "network": init_colors(keys[3], (inputs, config.width, config.width), config.octaves),
+    }
+
+
+def _penalty(
+    config: TensorfConfig, params: Params, buffers: TensorfBuffers, histograms: list[Histogram]
+) -> jax.Array:
+    """Sparse densities and smooth factors, the same for all rays (TensoRF, section 4.3)."""
+    vertices = buffers.vertices
+    total = config.sparsity_weight * _mean_size(params["density"], vertices)
+    for factors in (params["density"], params["color"]):
+        total += config.smoothness_weight * _mean_step(factors, vertices)
+    return jnp.broadcast_to(total, histograms[0].weights.shape[:1])
 
 
 def _init_factors(key: jax.Array, size: int, components: int) -> dict[str, jax.Array]:

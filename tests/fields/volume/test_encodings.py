@@ -1,8 +1,106 @@
+"""Positional and hash encodings against slow oracles: values, rows, weights and gradients."""
+
+import functools
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+import reference_volume as reference
 
 from jaxcloseup.fields.volume.encodings import positional_encoding
+from jaxcloseup.fields.volume.hash_grid import (
+    HashGridConfig,
+    grid_rows,
+    hash_features,
+    init_hash_grid,
+)
+
+
+# The first levels hold all their vertices, the last ones share entries by the hash.
+CONFIG = HashGridConfig(levels=4, features=2, log2_entries=9, coarsest=3, finest=40)
+EDGES = np.array([[0, 1, 0.5, 1 / 3, -0.2], [0, 1, 0.25, 2 / 3, 1.2], [0, 1, 0.75, 1, 0.5]])
+
+
+def positions(numbers):
+    """Random ones, ones on corners and faces of cells, and ones outside."""
+    return np.concatenate([numbers.uniform(0, 1, (3, 12)), EDGES], axis=1)
+
+
+@functools.cache
+def case():
+    """A table, positions, and the oracle's features `[L, F, M]` and shares of rows."""
+    numbers = np.random.default_rng(0)
+    table = numbers.normal(size=(sum(CONFIG.entries), CONFIG.features))
+    x = positions(numbers)
+    found = [reference.hash_encoding(table, CONFIG, p) for p in x.T]
+    return table, x, np.stack([f for f, _ in found], -1), [shares for _, shares in found]
+
+
+def test_levels_grow_by_one_factor_up_to_the_finest():
+    paper = HashGridConfig()
+    assert paper.resolutions[0] == 16 and paper.resolutions[-1] == 2048
+    expected = [reference.resolution(level, 16, 16, 2048) for level in range(16)]
+    assert list(paper.resolutions) == expected
+    assert paper.entries[0] == 17**3 and paper.entries[-1] == 2**19
+    assert HashGridConfig(levels=1, coarsest=7).resolutions == (7,)
+
+
+def test_rows_and_weights_are_those_of_the_cells_corners():
+    _, x, _, shares = case()
+    rows, weights = map(np.asarray, jax.jit(functools.partial(grid_rows, CONFIG))(np.float32(x)))
+    assert rows.shape == weights.shape == (8, CONFIG.levels, x.shape[1])
+    for point, expected in enumerate(shares):
+        ours = {}
+        for level in range(CONFIG.levels):
+            for row, weight in zip(*(a[:, level, point] for a in (rows, weights)), strict=True):
+                ours[level, int(row)] = ours.get((level, int(row)), 0) + float(weight)
+        # Rounding may put a point on a face into the cell beside it, with the same features.
+        for at in set(ours) | set(expected):
+            assert ours.get(at, 0) == pytest.approx(expected.get(at, 0), abs=1e-5)
+
+
+def test_features_match_the_oracle():
+    table, x, expected, _ = case()
+    ours = jax.jit(hash_features, static_argnums=1)(np.float32(table), CONFIG, np.float32(x))
+    np.testing.assert_allclose(ours, expected, atol=1e-5)
+
+
+def test_the_tables_gradient_is_the_sum_of_shares():
+    table, x, _, shares = case()
+    cotangent = np.random.default_rng(1).normal(size=(CONFIG.levels, CONFIG.features, x.shape[1]))
+    expected = np.zeros_like(table)
+    for point, of_point in enumerate(shares):
+        for (level, row), share in of_point.items():
+            expected[row] += share * cotangent[level, :, point]
+
+    def total(table):
+        return jnp.sum(np.float32(cotangent) * hash_features(table, CONFIG, np.float32(x)))
+
+    ours = jax.jit(jax.grad(total))(np.float32(table))
+    np.testing.assert_allclose(ours, expected, atol=1e-5)
+
+
+def test_the_gradient_of_positions_is_the_finite_difference():
+    table, _, _, _ = case()
+    numbers = np.random.default_rng(2)
+    with jax.enable_x64(True):
+        x, along = (numbers.uniform(0.1, 0.9, (3, 6)) for _ in range(2))
+        cotangent = numbers.normal(size=(CONFIG.levels, CONFIG.features, 6))
+
+        @jax.jit
+        def total(step):
+            features = hash_features(jnp.asarray(table), CONFIG, x + step * along)
+            return jnp.sum(cotangent * features)
+
+        slope = jax.jit(jax.grad(total))(0.0)
+        np.testing.assert_allclose(slope, (total(1e-7) - total(-1e-7)) / 2e-7, rtol=1e-5)
+
+
+def test_initial_features_are_small_and_even(key):
+    table = np.asarray(init_hash_grid(key, CONFIG))
+    assert np.abs(table).max() <= 1e-4
+    np.testing.assert_allclose(table.std(), 1e-4 / 3**0.5, rtol=0.05)
 
 
 @pytest.mark.parametrize("shape", [(3, 7), (2, 1)])
