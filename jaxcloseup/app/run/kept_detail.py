@@ -4,6 +4,7 @@ Everything is made from the state and its training photographs, so a run keeps i
 where they have changed.
 """
 
+import dataclasses
 import functools
 import hashlib
 import pathlib
@@ -20,7 +21,7 @@ from jaxcloseup.app.run.manifest import hash_data
 from jaxcloseup.app.run.programs import Programs, describe_photographs
 from jaxcloseup.app.run.residuals import render_residuals, reproduced
 from jaxcloseup.detail.add import Detail, Detailed, add_to_rendering, label_with_detail
-from jaxcloseup.detail.weights import known_weights
+from jaxcloseup.detail.weights import DetailWeights, known_weights
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.io.cache import Stored, cached
@@ -40,7 +41,7 @@ def detailed(programs: Programs, detail: Detail, camera: Camera, rendering: Rend
 
 
 def detailed_views(programs: Programs, state: TrainState, detail: Detail, cameras: Camera) -> Views:
-    """Renders of stacked cameras `[Q]` with detail; pixels weigh as much as it is trusted."""
+    """Render stacked cameras `[Q]` with detail; pixels weigh as much as it is trusted."""
     return label_with_detail(
         detail,
         lambda camera: programs.render(state, camera),
@@ -63,7 +64,7 @@ def detail_getter(
 def find_detail(
     programs: Programs, state: TrainState, path: pathlib.Path | None = None
 ) -> tuple[Detail, dict[str, Any]]:
-    """Detail of a state: what a file keeps of it, or else made now and kept there.
+    """Return the detail of a state from the file that keeps it, or make it and keep it there.
 
     Args:
       programs: the run's.
@@ -88,7 +89,7 @@ def find_detail(
 
 
 def detail_path(folder: pathlib.Path, stage: str) -> pathlib.Path:
-    """Where a run's folder keeps the detail of a stage."""
+    """Return the path at which a run's folder keeps the detail of a stage."""
     return folder / "detail" / f"{stage}.npz"
 
 
@@ -103,12 +104,12 @@ def make_detail(programs: Programs, state: TrainState) -> tuple[Detail, dict[str
     return detail, {"divisor": divisor, "sizes": list(map(list, pyramid.sizes))}
 
 
-def _weights(scene):
+def _weights(scene: Scene) -> DetailWeights:
     # A built-in scene is judged without its own held-out views.
     return known_weights(scene.name if scene.surface else None)
 
 
-def _sources(views, shown, depths):
+def _sources(views: Views, shown: Pyramid, depths: jax.Array) -> GatherSources:
     trust = views.weight * reproduced(shown)
     return jax.jit(gather_sources)(views.cameras, depths, trust)
 
@@ -116,7 +117,7 @@ def _sources(views, shown, depths):
 def refresh_detail(
     programs: Programs, state: TrainState, detail: Detail, views: Sequence[int]
 ) -> Detail:
-    """Detail of a state that went on from another one, of some photographs alone.
+    """Return the detail of a state that was trained on from another, of some photographs alone.
 
     Args:
       programs: the run's.
@@ -126,12 +127,12 @@ def refresh_detail(
     """
     pyramid, _ = programs.pyramid()
     shown, depths = render_residuals(programs, state, pyramid, views)
-    own = jax.tree.map(lambda leaf: leaf[np.asarray(views)], programs.scene.train)
-    return detail.replace(shown=shown, sources=_sources(own, shown, depths))
+    chosen = jax.tree.map(lambda leaf: leaf[np.asarray(views)], programs.scene.train)
+    return dataclasses.replace(detail, shown=shown, sources=_sources(chosen, shown, depths))
 
 
-def _hash(programs, state):
-    """What the detail depends on: the state that is rendered, the photographs, this version."""
+def _hash(programs: Programs, state: TrainState) -> str:
+    """Return a hash of what detail depends on: the state, the photographs, this version."""
     made_by = f"{jaxcloseup.__version__} {_RECIPE} {hash_data(programs.scene)}"
     digest = hashlib.sha256(made_by.encode())
     for leaf in jax.tree.leaves((state.params, state.buffers)):

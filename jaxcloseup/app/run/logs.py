@@ -48,7 +48,8 @@ class TrainLog:
         self._folder = folder / "tb" / scene if tensorboard else None
         self._events: _EventFile | None = None
         self._stage: str | None = None
-        self._step, self._seconds, self._start = 0, 0.0, 0.0
+        self._step = 0
+        self._seconds = self._start = 0.0
 
     def begin(self, stage: str, history: Sequence[Mapping[str, Any]]) -> None:
         """Start a stage, or resume it after the chunks of `history`.
@@ -58,10 +59,10 @@ class TrainLog:
         """
         old = self._read()
         stages: dict[str, list[Mapping[str, Any]]] = {}
-        for line in filter(None, map(_parse, old.splitlines())):
-            stages.setdefault(line["stage"], []).append(line)
+        for read in filter(None, map(_parse, old.splitlines())):
+            stages.setdefault(read["stage"], []).append(read)
         logged = {line["step"]: line for line in stages.get(stage, ())}
-        rates = dict.fromkeys(_RATES)
+        rates: dict[str, float | None] = dict.fromkeys(_RATES)
         stages[stage] = [
             {"stage": stage, **entry}
             | {key: logged.get(entry["step"], rates)[key] for key in rates}
@@ -70,12 +71,12 @@ class TrainLog:
         new = b"".join(_format(line) for lines in stages.values() for line in lines)
         if new != old:  # rewriting an unchanged file would break `tail -f`
             write_file(self._file, new)
-        last = stages[stage][-1] if history else {"step": 0, "seconds": 0.0}
+        last: Mapping[str, Any] = stages[stage][-1] if history else {"step": 0, "seconds": 0.0}
         self._step, self._seconds = last["step"], last["seconds"] or 0.0
         self._start = time.perf_counter() - self._seconds
         self._open(stage)
-        for line in stages[stage]:
-            self._send(line)
+        for sent in stages[stage]:
+            self._send(sent)
 
     def write(self, entry: Mapping[str, Any]) -> None:
         """Log the newest chunk of the stage's history."""
@@ -108,7 +109,7 @@ class TrainLog:
             }
             self._events.write(self._step, numbers, images)
 
-    def _read(self):
+    def _read(self) -> bytes:
         try:
             return read_bytes(self._file) if self._file.exists() else b""
         except OSError as error:
@@ -116,12 +117,12 @@ class TrainLog:
                 f"{self._file} cannot be read ({error.strerror}): remove it to log anew"
             ) from error
 
-    def _open(self, stage):
+    def _open(self, stage: str) -> None:
         self._stage = stage
         if self._folder is not None:
             self._events = _EventFile(self._folder / stage)
 
-    def _send(self, line):
+    def _send(self, line: Mapping[str, Any]) -> None:
         if self._events is not None:
             numbers = {f"train/{key}": value for key, value in line.items() if key != "step"}
             ago = self._seconds - (line["seconds"] or 0.0)
@@ -136,7 +137,7 @@ class _EventFile:
     `EventsWriter`, because `SummaryWriter` queues events and a killed run loses the queue.
     """
 
-    def __init__(self, folder):
+    def __init__(self, folder: pathlib.Path) -> None:
         from tensorboardX.event_file_writer import EventsWriter
 
         folder.mkdir(parents=True, exist_ok=True)
@@ -145,9 +146,16 @@ class _EventFile:
         weakref.finalize(self, self._writer.close)
         self._add(step=0, session_log={"status": "START"})
 
-    def write(self, step, numbers, images=None, *, ago=0.0):
+    def write(
+        self,
+        step: int,
+        numbers: Mapping[str, Any],
+        images: Mapping[str, Image] | None = None,
+        *,
+        ago: float = 0.0,
+    ) -> None:
         """Write the numbers and images of a step that ended `ago` seconds ago; skip the rest."""
-        values = [
+        values: list[dict[str, Any]] = [
             {"tag": tag, "simple_value": number}
             for tag, number in numbers.items()
             if isinstance(number, int | float)
@@ -158,23 +166,24 @@ class _EventFile:
             values.append({"tag": tag, "image": {**size, "encoded_image_string": png}})
         self._add(ago, step=step, summary={"value": values})
 
-    def _add(self, ago=0.0, **fields):
+    def _add(self, ago: float = 0.0, **fields: Any) -> None:
         from tensorboardX.proto.event_pb2 import Event
 
         self._writer.write_event(Event(wall_time=time.time() - ago, **fields))
         self._writer.flush()
 
 
-def _parse(text):
+def _parse(text: bytes) -> dict[str, Any] | None:
     """Parse a line of the log; None for a truncated or damaged one."""
     try:
         line = json.loads(text)
-        kinds = {"stage": str, "step": int, **dict.fromkeys(_RATES, float | int | None)}
+        kinds: dict[str, Any] = {"stage": str, "step": int}
+        kinds |= dict.fromkeys(_RATES, float | int | None)
         whole = all(isinstance(line[name], kind) for name, kind in kinds.items())
     except (ValueError, KeyError, TypeError, RecursionError):
         return None
     return line if whole else None
 
 
-def _format(line):
+def _format(line: Mapping[str, Any]) -> bytes:
     return json.dumps(strict(line), allow_nan=False).encode() + b"\n"

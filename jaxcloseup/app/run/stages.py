@@ -139,7 +139,8 @@ def run_stages(
     elif "closeup" in to_run:
         run.scorer.score("closeup", run.state)
     get_detail = run.get_detail(run.stage, run.state)
-    detail, render = None, run.render
+    detail: dict[str, Any] | None = None
+    render: Render = run.render
     if "detail" in to_run:
         detail, render = add_detail_stage(run, get_detail)
     if "test_time" in to_run:
@@ -254,9 +255,9 @@ def audit_all(run: Run) -> dict[str, Any]:
 
     if exact is not None:
         assert scene.surface is not None
-        exact_sources = jax.jit(label_sources)(scene.train, exact)
+        exact_sources, surface = jax.jit(label_sources)(scene.train, exact), scene.surface
         ways = {
-            "exact_depth": (exact_sources, lambda camera: scene.surface(camera).depth),
+            "exact_depth": (exact_sources, lambda camera: surface(camera).depth),
             "trained_depth": (start.sources, lambda camera: label_depth(render(camera))),
         }
         labels = {
