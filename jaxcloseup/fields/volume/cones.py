@@ -1,4 +1,4 @@
-"""Pixels' cones cut into frustums, and encodings of all that lies in one.
+"""Cut the cones of pixels into frustums, and encode the content of a frustum.
 
 A cone has radius `radius` t at z-depth t. Along a ray with unit camera-z, a frustum reaches from
 one edge to the next. Arrays have coordinates or features first; intervals are `[R, S]`.
@@ -22,7 +22,7 @@ _SIX = np.array([0, 2, 4, 3, 5, 1])
 
 
 class Moments(NamedTuple):
-    """What is uniform in a frustum, along its ray and across: mean and variances `[R, S]`."""
+    """Moments of a uniform density in a frustum, along its ray and across, each `[R, S]`."""
 
     mean: jax.Array
     along: jax.Array
@@ -83,7 +83,7 @@ def frustum_samples(
     """Points in each frustum that have its moments, and their own scale (Zip-NeRF, eq. 1 to 3).
 
     Fewer points than the paper's six are cheaper. Depth and place across then go together in one
-    frustum, though not in the mean over turns, and a single point has no variance along the ray.
+    frustum, though not on average over turns, and a single point has no variance along the ray.
 
     Args:
       key: consumed, turns each frustum's points about its ray; None does not.

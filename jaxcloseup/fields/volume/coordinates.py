@@ -59,10 +59,10 @@ def contract(positions: jax.Array) -> jax.Array:
 
 
 def contraction_scale(positions: jax.Array) -> jax.Array:
-    """By how much `contract` scales lengths at positions `[3, ...]`: `[...]`, a geometric mean.
+    """Return the factor `[...]` by which `contract` scales lengths at positions `[3, ...]`.
 
-    The cube root of the determinant of the contraction's Jacobian, whose singular values are
-    1 / |x|^2 along x and (2 |x| - 1) / |x|^2 across it.
+    It is a geometric mean: the cube root of the determinant of the contraction's Jacobian, whose
+    singular values are 1 / |x|^2 along x and (2 |x| - 1) / |x|^2 across it.
     """
     norm = jnp.maximum(safe_norm(positions, axis=0), 1)
     return jnp.cbrt(jnp.square(2 * norm - 1)) / jnp.square(norm)

@@ -90,7 +90,7 @@ def mean_divergence(
       key: consumed.
       num_pixels: pixels of the step.
       see: `(cameras [K], pixels [K, 2], key) -> [(edges, weights), ...]`, what each of a field's
-        passes sees; all of them are taught.
+        passes sees; all of them are supervised.
     """
     key_draw, key_see = jax.random.split(key)
     points = supervision.sightings

@@ -1,7 +1,7 @@
 """The renderer of intervals: rounds that cut rays ever finer where the round before saw something.
 
 Each round asks a field for the densities of its intervals, the last one also for colors. A round
-without colors is a *proposal*: the last round's weights teach it, through a penalty. Distances
+without colors is a *proposal*: the last round's weights supervise it, through a penalty. Distances
 along rays are z-depths, or *spaced* in [0, 1], where the first round's intervals are even. Rays are
 `[R]`, intervals `[R, S]` with edges `[R, S + 1]`.
 """
@@ -22,7 +22,7 @@ from jaxcloseup.fields.volume.samplers import interval_quantiles, resample
 
 
 class Histogram(NamedTuple):
-    """What a round saw: `weights [R, S]` of intervals with spaced `edges [R, S + 1]`."""
+    """The result of a round: `weights [R, S]` of intervals with spaced `edges [R, S + 1]`."""
 
     edges: jax.Array
     weights: jax.Array

@@ -100,7 +100,7 @@ class Traced(NamedTuple):
 
     Attributes:
       rendering: `[R]`, with a `VolumeAux`.
-      light: of each pass that photographs teach, first to last: edges `[R, S + 1]` of its
+      light: of each pass that photographs supervise, first to last: edges `[R, S + 1]` of its
         intervals, ascending z-depths, and weights `[R, S]`, the shares of light from there.
     """
 

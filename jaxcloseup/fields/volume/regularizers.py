@@ -1,4 +1,4 @@
-"""What volumetric fields add to the loss of a ray: penalties on where its light comes from.
+"""Penalties on the distribution of light along a ray, which volumetric fields add to its loss.
 
 A round of samples is a histogram: `weights [..., S]` in intervals with `edges [..., S + 1]`, spaced
 in [0, 1]. Intervals `[..., S]` against others `[..., P]` are compared all with all: S and P are
@@ -16,9 +16,9 @@ _SMALL = 1e-7
 def proposal_penalty(
     edges: jax.Array, weights: jax.Array, proposed_edges: jax.Array, proposed: jax.Array
 ) -> jax.Array:
-    """How much light the last round found where a proposal says there is less (mip-NeRF 360, 13).
+    """Return the last round's weights beyond what a proposal allows (mip-NeRF 360, eq. 13).
 
-    Teaches the proposal alone: no gradient flows to `weights`.
+    It trains the proposal alone: no gradient flows to `weights`.
 
     Args:
       edges: `[..., S + 1]` of the last round.
@@ -41,7 +41,7 @@ def proposal_penalty(
 
 
 def distortion(edges: jax.Array, weights: jax.Array) -> jax.Array:
-    """How far apart the light of a ray comes from, `[...]` (mip-NeRF 360, eq. 15)."""
+    """Return the mean distance between parts of a ray's light, `[...]` (mip-NeRF 360, eq. 15)."""
     middles = 0.5 * (edges[..., 1:] + edges[..., :-1])
     apart = jnp.abs(middles[..., :, None] - middles[..., None, :])
     between = jnp.sum(weights * jnp.sum(weights[..., None, :] * apart, axis=-1), axis=-1)
@@ -55,11 +55,11 @@ def antialiased_proposal_penalty(
     proposed: jax.Array,
     pulse: float,
 ) -> jax.Array:
-    """How much light the blurred last round has where a proposal says there is less (Zip-NeRF, 10).
+    """Return the blurred last round's weights beyond what a proposal allows (Zip-NeRF, eq. 10).
 
     Unlike `proposal_penalty` it is smooth in the edges: the last round's density of light is
-    blurred by a rectangular pulse, and integrated over each of the proposal's intervals. Teaches
-    the proposal alone.
+    blurred by a rectangular pulse, and integrated over each of the proposal's intervals. It
+    trains the proposal alone.
 
     Args:
       edges: `[..., S + 1]` of the last round.
