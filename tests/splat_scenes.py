@@ -7,9 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import reference_splats as reference
+from tiny_training import run_train_steps
 
 from jaxcloseup.fields.splats import RasterizeConfig, Surfels, render_surfels
 from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.training.config import TrainConfig
+from jaxcloseup.training.state import init_state
 
 
 COUNT, HEIGHT, WIDTH, NEAR = 16, 24, 32, 0.2
@@ -18,6 +21,7 @@ IDENTITY = np.eye(4)[:3]
 BACKGROUND = np.array([0.2, 0.4, 0.6])
 CONFIG = RasterizeConfig(capacity=1024, near=NEAR, tile=8, chunk=4, block=4)
 ANTIALIASED = dataclasses.replace(CONFIG, antialias=True)
+KERNEL = dataclasses.replace(CONFIG, compositor="kernel")
 OUTPUTS = ("rgb", "alpha", "depth", "normal", "median_depth", "distortion")
 
 
@@ -53,6 +57,12 @@ VOLUMES = {
 SPLATS = SCENES | VOLUMES
 
 
+def pixel_centers(height=HEIGHT, width=WIDTH):
+    """Pixel centers `[H W, 2]` of an image, row by row."""
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    return np.stack([x.ravel(), y.ravel()], axis=-1)
+
+
 def to_surfels(scene, dtype=jnp.float32):
     return Surfels(**{name: jnp.asarray(value, dtype) for name, value in scene.items()})
 
@@ -73,6 +83,23 @@ def _render(surfels, camera, alive, config):
     image = render_surfels(surfels, alive, camera, config, background=background)
     aux = {name: values for name, values in image.aux._asdict().items() if values is not None}
     return dict(rgb=image.rgb, alpha=image.alpha, depth=image.depth, **aux)
+
+
+def trainer(field, optimizer):
+    """Return `start(points)`, a state of gray splats, and `run(state, views, count)`."""
+    bound = {"field": field, "optimizer": optimizer}
+    config = TrainConfig(num_rays=None, num_label_rays=None)
+    compiled = jax.jit(functools.partial(run_train_steps, **bound, config=config))
+
+    def start(points):
+        points = jnp.asarray(points, jnp.float32)
+        return init_state(jax.random.key(0), points, jnp.full_like(points, 0.5), **bound)
+
+    def run(state, views, count):
+        with jax.numpy_dtype_promotion("standard"):  # optax mixes integers and floats
+            return compiled(state, views, count=count)
+
+    return start, run
 
 
 def oracle(scene, camtoworld=IDENTITY, intrinsics=INTRINSICS, size=(HEIGHT, WIDTH), **options):

@@ -1,7 +1,7 @@
 """The one contract between renderers and everything above them.
 
-A radiance field is a bundle of pure functions. `pseudo`, `train` and the experiments know this file
-and no concrete field, so a NeRF, a splatter or a user's own renderer can be fine-tuned alike.
+A radiance field is a bundle of pure functions. Labels, training and the programs know this file and
+no concrete field, so they fine-tune a NeRF, a splatter or a renderer of yours alike.
 """
 
 from collections.abc import Callable
@@ -11,7 +11,7 @@ import jax
 
 
 class Rendering(NamedTuple):
-    """What a field renders; `[...]` is the pixels' shape, or `[H, W]` for a whole image.
+    """Images or pixels of a field; `[...]` is the pixels' shape, or `[H, W]` for a whole image.
 
     Attributes:
       rgb: `[..., 3]` colors, background included.
@@ -20,9 +20,9 @@ class Rendering(NamedTuple):
       aux: any pytree, private to its field.
       normal: `[..., 3]` normals in the world's frame, towards the camera, of any length, from
         fields that have them; None from others.
-      overflow: `[]` int32, how much did not fit into the field's static capacity; None from fields
-        that have none. Where it is not 0 the image is wrong: render it again with a field that has
-        more room.
+      overflow: `[]` int32 number of items beyond the field's static capacity; None from fields
+        without one. Where it is not 0 the image is wrong: render it again with a field of more
+        capacity.
     """
 
     rgb: jax.Array

@@ -93,7 +93,7 @@ def apply_image_offset(surfels: OffsetSurfels, camera: Camera) -> OffsetSurfels:
     The offset is 0, so the surfels stay in place, but the loss has a gradient with respect to it:
     the view-space gradient of Kerbl et al. (section 5.2), which no array of the renderer holds.
     """
-    # The offset's gradient alone is wanted, not a second path to the means.
+    # Only the offset's gradient matters here, not a second path to the means.
     offset = jax.lax.stop_gradient(surfels.means) - camera.position[None]
     depth = matmul(offset, camera.rotation)[:, 2:]
     half_image = jnp.array([[camera.width / 2, camera.height / 2]], depth.dtype)
@@ -148,12 +148,14 @@ def refine(
       its row.
     """
     scale = jnp.max(jnp.exp(surfels.log_scales), axis=-1) / extent
+    # Per view that saw the surfel: surfels out of sight must not look converged.
     mean_gradient = gradients.total / jnp.maximum(gradients.views, 1)
     opaque = alive & (jax.nn.sigmoid(surfels.opacity_logits) >= config.min_opacity)
-    wanted = opaque & (mean_gradient >= config.gradient)
+    growing = opaque & (mean_gradient >= config.gradient)
+    # As published: a clone is an exact copy, which later gradients pull away from its original.
     # A huge surfel with a large gradient is split, which makes it smaller.
-    keep = opaque & (wanted | ~(remove_huge & (scale > config.huge)))
-    source, added, parent = _place_copies(wanted, keep, mean_gradient)
+    keep = opaque & (growing | ~(remove_huge & (scale > config.huge)))
+    source, added, parent = _place_copies(growing, keep, mean_gradient)
 
     # Both halves of a split surfel move: the copy in its new row, and the surfel that was there.
     split = (parent | added) & (scale[source] > config.small)
@@ -170,16 +172,16 @@ def refine(
 
 
 def _place_copies(
-    wanted: jax.Array, keep: jax.Array, mean_gradient: jax.Array
+    growing: jax.Array, keep: jax.Array, mean_gradient: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return which row each row copies, which rows are copies, and which are copied, `[N]`.
 
     Rows that are not kept are free. When they run out, the largest gradients come first.
     """
-    count = wanted.shape[0]
-    strongest = jnp.argsort(jnp.where(wanted, -mean_gradient, 1), stable=True)
+    count = growing.shape[0]
+    strongest = jnp.argsort(jnp.where(growing, -mean_gradient, 1), stable=True)
     room = jnp.argsort(keep, stable=True)
-    number = jnp.minimum(jnp.sum(wanted), jnp.sum(~keep))
+    number = jnp.minimum(jnp.sum(growing), jnp.sum(~keep))
     granted = jnp.arange(count) < number
     place = jnp.where(granted, room, count)  # `count` is out of bounds, so the update is dropped
     source = jnp.arange(count).at[place].set(strongest, mode="drop")
@@ -190,6 +192,7 @@ def _place_copies(
 
 def reset_opacities(surfels: OffsetSurfels, config: AdaptiveConfig) -> OffsetSurfels:
     """Return surfels whose opacities are at most `config.reset_opacity`."""
+    # Needless surfels fade between two resets (Kerbl et al., section 5.2); others recover.
     most = jnp.log(config.reset_opacity / (1 - config.reset_opacity))
     return surfels.replace(opacity_logits=jnp.minimum(surfels.opacity_logits, most))
 
@@ -212,6 +215,7 @@ def _refine(key: jax.Array, state: Any, config: AdaptiveConfig, extent: float) -
 
 def _reset(state: Any, config: AdaptiveConfig) -> Any:
     """Return a state whose opacities are reset, with Adam's moments of the opacities."""
+    # Old moments would at once carry the opacities back up.
     gradients, (moments, *others) = state.opt_state
     mu, nu = (
         moment.replace(opacity_logits=jnp.zeros_like(moment.opacity_logits))

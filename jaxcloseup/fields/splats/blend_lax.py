@@ -267,14 +267,14 @@ def forward(
         weights, walk = _pass_chunk(walk, seen, products, splats.place[..., None])
         # Without the barrier XLA would compute the weights anew for every channel.
         weights = lax.optimization_barrier(weights)
-        found = channels(splats.column, features, seen, walk.reference[:, None])
+        values = channels(splats.column, features, seen, walk.reference[:, None])
         # One chunk's sum first, then the total: the order is fixed by the chunk's size alone.
         sums = jax.tree.map(
             lambda total, channel: (
                 total + sum(weights[k] * channel[:, k] for k in range(plan.chunk))
             ),
             sums,
-            found,
+            values,
         )
         finished = jnp.max(product, axis=-1) < TRANSMITTANCE_MIN
         done = finished | (position + plan.chunk >= here.counts)

@@ -65,6 +65,7 @@ def may_show(
         x, y, z = (row[2] for row in quaternion_rows(*columns.quaternions))
         normal = x, y, z
         distance, facing = jnp.sqrt(dot(offset, offset)), jnp.abs(dot(offset, normal))
+        # How far on the disc's plane one pixel moves the point that a ray meets.
         # A plane seen from its edge has no bound: it is kept.
         displaced = (1 + distance / jnp.maximum(facing, 1e-30)) * jnp.abs(center[:, 2])
         per_pixel = jnp.sqrt(jnp.sum(camera.intrinsics[:2] ** -2.0))
@@ -148,6 +149,7 @@ def _map_parts_backward(
     function: _Function, residuals: tuple[Any, ...], cotangents: Any
 ) -> tuple[Any, Any, None]:
     items, trained, fixed, shown = residuals
+    # Each part is projected again, so memory is that of one part.
     count, parts = shown.size, _parts(shown)
 
     def of_trained(items: Any, trained: Any) -> Any:

@@ -105,18 +105,18 @@ def sampling_intervals(means: jax.Array, cameras: Camera, *, near: float) -> jax
       near: z-depth before which a photograph shows nothing.
     """
 
-    def least(found: jax.Array, camera: Camera) -> tuple[jax.Array, None]:
+    def least(finest: jax.Array, camera: Camera) -> tuple[jax.Array, None]:
         pixels, depth = points_to_pixels(camera, means)
         margin = jnp.array([[camera.width, camera.height]], pixels.dtype) * _SEEN_BEYOND
         wide = jnp.array([1 + 2 * _SEEN_BEYOND], pixels.dtype)[None]
         inside = in_bounds((pixels + margin) / wide, camera.height, camera.width)
         interval = depth / mean_focal(camera.intrinsics)
-        return jnp.where(inside & (depth > near), jnp.minimum(found, interval), found), None
+        return jnp.where(inside & (depth > near), jnp.minimum(finest, interval), finest), None
 
     nowhere = jnp.full(means.shape[0], jnp.inf, means.dtype)
-    found, _ = lax.scan(least, nowhere, cameras)
-    seen = jnp.isfinite(found)
-    return jnp.where(seen, found, jnp.max(jnp.where(seen, found, 0)))
+    finest, _ = lax.scan(least, nowhere, cameras)
+    seen = jnp.isfinite(finest)
+    return jnp.where(seen, finest, jnp.max(jnp.where(seen, finest, 0)))
 
 
 def smoothed(surfels: Surfels, interval: jax.Array | None) -> Surfels:

@@ -85,6 +85,7 @@ def relocate(
         ),
         log_scales=surfels.log_scales + jnp.where(copies > 1, jnp.log(smaller), 0)[:, None],
     )
+    # Copies take every parameter of their donor, after the donor has become one of them.
     index = jnp.where(receiver, source, jnp.arange(count))
     return (
         jax.tree.map(lambda leaf: leaf[index], shared),
@@ -96,16 +97,17 @@ def relocate(
 def _newborn(alive: jax.Array, growth: float) -> jax.Array:
     """Return the free rows `[N]` that come to life."""
     number = jnp.sum(alive, dtype=jnp.int32)
-    wanted = (number.astype(jnp.float32) * growth).astype(jnp.int32)
+    target = (number.astype(jnp.float32) * growth).astype(jnp.int32)
     # Grow by at least one when counts are tiny.
-    wanted = jnp.maximum(wanted, number + int(growth > 1))
-    added = jnp.minimum(wanted, alive.shape[0]) - number
+    target = jnp.maximum(target, number + int(growth > 1))
+    added = jnp.minimum(target, alive.shape[0]) - number
     return ~alive & (jnp.cumsum(~alive, dtype=jnp.int32) <= added)
 
 
 def _draw_donors(key: jax.Array, weight: jax.Array, donor: jax.Array) -> jax.Array:
     """Return `N` random indices of donors, drawn with probability proportional to `weight[N]`."""
     count = donor.shape[0]
+    # The inverse of the cumulative distribution, with one sort-free search for each draw.
     cumulative = jnp.cumsum(weight)
     draws = jax.random.uniform(key, (count,)) * cumulative[-1]
     source = jnp.searchsorted(cumulative, draws, side="right")

@@ -74,6 +74,7 @@ def blend(
     See `rasterize`.
     """
     plan = plan_raster(config, height=height, width=width)
+    # Which splats a tile lists has no derivative: outside of their lists they draw nothing.
     kept = lax.stop_gradient(table)
     lists = tile_lists(
         lax.stop_gradient(box),

@@ -162,6 +162,7 @@ class _SplatField:
         image = render_surfels(surfels, buffers.alive, camera, config.raster, background=background)
         # The penalty is computed here, for `loss` knows no camera.
         penalty = buffers.regularize * penalty_of(image, camera, config)
+        # Priors act on the parameters, not on what the filter makes of them.
         prior = prior_of(params, buffers.alive, config, self.extent)
         return image._replace(
             depth=jnp.where(buffers.expected > 0, image.depth, image.aux.median_depth),
@@ -216,12 +217,14 @@ def _bound_scales(
     if center is not None:
         distance = safe_norm(surfels.means - center[None], keepdims=True)
         reach = jnp.maximum(distance, extent)
+    # Beyond the extent the bound is an angle, so that a distant background may be large.
     largest = jnp.log(config.max_scale * reach)
     return surfels.replace(log_scales=jnp.minimum(surfels.log_scales, largest))
 
 
 def _limit_degree(surfels: Surfels, degree: jax.Array) -> Surfels:
     """Return surfels without spherical harmonics above a degree `[]`."""
+    # Degree l has 2 l + 1 functions. Coefficients above the degree keep their values, unseen.
     band = jnp.repeat(jnp.arange(4), jnp.array([1, 3, 5, 7]), total_repeat_length=16)
     drawn = (band[: surfels.sh.shape[1]] <= degree)[None, :, None]
     return surfels.replace(sh=jnp.where(drawn, surfels.sh, 0))

@@ -37,6 +37,7 @@ def splat_loss(
         matched = _image_loss(seen, target_rgb, weight, config.ssim_weight)
         # Without a loss on unchanged colors, they would drift away from all photographs.
         image = _UNCHANGED_SHARE * image + (1 - _UNCHANGED_SHARE) * matched
+    # An image without weight has no loss at all, as the contract says.
     prior = jnp.where(total > 0, rendering.aux.prior, 0)
     error = jnp.where(weight[..., None] > 0, jnp.clip(seen, 0, 1) - target_rgb, 0)
     squared = _weighted_mean(jnp.mean(error**2, axis=-1), weight)
@@ -56,6 +57,7 @@ def _image_loss(
     target = jnp.where(weight[..., None] > 0, target_rgb, jax.lax.stop_gradient(seen))
     difference = _weighted_mean(jnp.mean(jnp.abs(seen - target), axis=-1), weight)
     similarity = ssim(seen, target, weight=weight)
+    # SSIM is NaN where no window has any weight.
     dissimilarity = jnp.where(jnp.isnan(similarity), 0, 1 - similarity)
     return (1 - ssim_weight) * difference + ssim_weight * dissimilarity
 
@@ -72,6 +74,7 @@ def _match_colors(
 
 def penalty_of(image: Rendering, camera: Camera, config: SplatConfig) -> jax.Array:
     """Return weighted normal and distortion losses `[H, W]`."""
+    # In units of the mean depth, so that one weight suits every unit of length.
     typical = safe_divide(jnp.sum(image.alpha * image.depth), jnp.sum(image.alpha))
     distortion = scale_free_distortion(image.aux.distortion, jax.lax.stop_gradient(typical))
     # Distortion is unbounded for surfaces very near a virtual camera.

@@ -70,13 +70,14 @@ def surfels_from_points(
     chex.assert_equal_shape([points, rgb])
     key_choice, key_rotation = jax.random.split(key)
     finite = jnp.all(jnp.isfinite(points), axis=-1)
+    # A random choice of finite points, in their order where all fit.
     chosen = jax.random.permutation(key_choice, points.shape[0])
     chosen = chosen[jnp.argsort(~finite[chosen], stable=True)][:capacity]
     if capacity >= points.shape[0]:
         chosen = jnp.sort(chosen)
     alive = finite[chosen]
     points = jnp.where(alive[:, None], points[chosen], 0)
-    gaps = neighbor_distance(points, alive)
+    gaps = neighbor_distance(points, alive)  # as published: discs that just touch
     constant = rgb_to_sh(rgb[chosen])[:, None]
     higher = jnp.zeros((points.shape[0], (sh_degree + 1) ** 2 - 1, 3), points.dtype)
     surfels = Surfels(

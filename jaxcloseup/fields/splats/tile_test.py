@@ -46,6 +46,7 @@ def reaches(
     def column(i: int) -> jax.Array:
         return rows[:, i]
 
+    # Where alpha falls to ALPHA_MIN, in standard deviations, and a little farther.
     opacity = jnp.maximum(column(OPACITY) / ALPHA_MIN, 1)
     cutoff = _WIDER * jnp.sqrt(2 * jnp.log(opacity))
     # Pixel centers of the tile about the anchor, and the one that is nearest to the anchor.
@@ -74,6 +75,7 @@ def reaches(
         least = [a + step * b for a, b in zip(start, along, strict=True)]
         return ~convex | (form(least, least) <= 0)
 
+    # Of the two pairs of edges, those through the tile's nearest point to the anchor.
     disc = meets(x, low[:, 1], 1) | meets(low[:, 0], y, 0)
     low_pass = column(LOW_PASS) * (x * x + y * y) <= cutoff * cutoff
     return disc | low_pass | (column(INVERSE_DEPTH + 1) * near >= 1 / _WIDER)

@@ -71,9 +71,11 @@ def tile_lists(
     extent = jnp.maximum(last - first + 1, 0)
     pairs = extent[:, 0] * extent[:, 1]
 
+    # Pairs of boxes, of which `reaches` may drop some: the room is static, so it must hold these.
     total = jnp.sum(pairs, dtype=jnp.int32)
     too_many = jnp.sum(pairs.astype(jnp.float32)) > LARGEST / 2  # int32 may have wrapped
 
+    # Splats are sorted by depth first: a pair's key is then a tile and a rank, both small integers.
     by_depth = _nearest_first_shown(order, pairs)
     tile_of, rank = _touched_tiles(
         first[by_depth],
@@ -117,7 +119,7 @@ def _nearest_first_shown(order: jax.Array, pairs: jax.Array) -> jax.Array:
         return _nearest_first(order)
     # Of many splats that a window leaves out, those that show come first.
     index = jnp.arange(count, dtype=jnp.int32)
-    after = jnp.max(jnp.where(pairs > 0, index, -1), initial=-1)
+    after = jnp.max(jnp.where(pairs > 0, index, -1), initial=-1)  # the last splat that shows
 
     def sort_few() -> jax.Array:
         return jnp.concatenate([_nearest_first(order[:few]), index[few:]])
@@ -172,6 +174,7 @@ def _touched_tiles(
 
         return lax.cond(place < ends[-1], some, none)
 
+    # One block of pairs after the other: the rank at a block's end is where the next one begins.
     starts = size * jnp.arange(steps, dtype=jnp.int32)
     _, (tile_of, ranks) = lax.scan(find, jnp.int32(0), (ended, starts))
     return tile_of.reshape(-1)[:capacity], ranks.reshape(-1)[:capacity]
@@ -190,6 +193,7 @@ def _sorted_pairs(
         ordered, ranks = _sort_pairs(tile_of[:room], rank[:room], tiles + 1, len(by_depth))
         return starts_of(ordered, tiles), jnp.pad(by_depth[ranks], (0, capacity - room))
 
+    # The first room that holds all pairs; the last one holds what fits.
     smallest = jnp.argmax(jnp.stack([total <= room for room in rooms[:-1]] + [jnp.array(True)]))
     return lax.switch(smallest, [functools.partial(sort, room) for room in rooms])
 

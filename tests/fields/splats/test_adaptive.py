@@ -8,8 +8,7 @@ import numpy as np
 import plane
 import pytest
 from reference_splats import rotation_of
-from splat_scenes import COUNT, HEIGHT, WIDTH, random_scene, to_camera, to_surfels
-from tiny_training import run_train_steps
+from splat_scenes import COUNT, HEIGHT, WIDTH, random_scene, to_camera, to_surfels, trainer
 
 from jaxcloseup.fields.splats import RasterizeConfig, SurfelConfig
 from jaxcloseup.fields.splats.adaptive import (
@@ -23,8 +22,7 @@ from jaxcloseup.fields.splats.adaptive import (
 from jaxcloseup.fields.splats.splat_field import surfel_field
 from jaxcloseup.fields.splats.splat_optimizer import surfel_optimizer
 from jaxcloseup.geometry.cameras import points_to_pixels
-from jaxcloseup.training.config import TrainConfig
-from jaxcloseup.training.state import init_state
+from jaxcloseup.photos.views import camera_at
 
 
 CONFIG = AdaptiveConfig(gradient=1.0, small=0.01, min_opacity=0.05, huge=0.1)
@@ -136,17 +134,12 @@ def test_training_records_image_gradients_and_adds_surfels():
     field, optimizer = surfel_field(config, extent=EXTENT), surfel_optimizer(config, extent=EXTENT)
     views, _ = plane.make_views([plane.camera_above(0.0, 0.0, 2.0)])
     points = np.random.default_rng(0).uniform([-1, -1, 0], [1, 1, 0], (80, 3)).astype(np.float32)
-    state = init_state(
-        jax.random.key(0), points, np.full_like(points, 0.5), field=field, optimizer=optimizer
-    )
-    bound = {"field": field, "optimizer": optimizer, "config": TrainConfig(None, None)}
-    run = jax.jit(functools.partial(run_train_steps, **bound))
-    with jax.numpy_dtype_promotion("standard"):  # optax mixes integers and floats
-        one, _ = run(state, views, count=1)
-        grown, _ = run(state, views, count=21)
-        faded, _ = run(state, views, count=45)
-
-    camera = jax.tree.map(lambda leaf: leaf[0], views.cameras)
+    start, run = trainer(field, optimizer)
+    state = start(points)
+    one, _ = run(state, views, 1)
+    grown, _ = run(state, views, 21)
+    faded, _ = run(state, views, 45)
+    camera = camera_at(views.cameras, 0)
 
     @jax.jit
     def loss(image_offset):

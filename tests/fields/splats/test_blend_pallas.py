@@ -1,6 +1,5 @@
 """The Pallas kernels, interpreted: against the NumPy splatter, and against the loops of jax.lax."""
 
-import dataclasses
 import functools
 import logging
 
@@ -11,6 +10,7 @@ import pytest
 from splat_scenes import (
     CONFIG,
     COUNT,
+    KERNEL,
     NEAR,
     OUTPUTS,
     SCENES,
@@ -26,9 +26,6 @@ from jaxcloseup.fields.splats import blend_pallas
 from jaxcloseup.fields.splats.config import RasterizeConfig, RasterPlan
 from jaxcloseup.fields.splats.layout import PAYLOAD
 from jaxcloseup.fields.splats.tiling import tile_lists
-
-
-KERNEL = dataclasses.replace(CONFIG, compositor="kernel")
 
 
 @pytest.mark.parametrize("name", SPLATS)

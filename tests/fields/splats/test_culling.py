@@ -10,6 +10,7 @@ from splat_scenes import (
     IDENTITY,
     INTRINSICS,
     NEAR,
+    pixel_centers,
     random_scene,
     to_camera,
     to_surfels,
@@ -47,10 +48,8 @@ def test_whatever_shows_is_kept(kwargs, share, antialias):
     kept = {}
     for name in WINDOWS:
         intrinsics, (height, width) = window(name)
-        x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
         options = {"near": NEAR, "antialias": antialias}
-        known = scene, IDENTITY, intrinsics, pixels
+        known = scene, IDENTITY, intrinsics, pixel_centers(height, width)
         if scene["log_scales"].shape[1] == 3:
             alpha, _ = reference.project(*known, size=(width, height), **options)
         else:

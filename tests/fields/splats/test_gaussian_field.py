@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import plane
 import pytest
-from tiny_training import run_train_steps
+from splat_scenes import trainer
 
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.fields.splats import McmcConfig, RasterizeConfig, sampling_intervals
@@ -15,8 +15,6 @@ from jaxcloseup.fields.splats.config import GaussianConfig
 from jaxcloseup.fields.splats.splat_field import surfel_field
 from jaxcloseup.fields.splats.splat_optimizer import surfel_optimizer
 from jaxcloseup.photos.views import camera_at
-from jaxcloseup.training.config import TrainConfig
-from jaxcloseup.training.state import init_state
 
 
 EVERY, STEPS = 10, 35  # relocations come at 20 and 30
@@ -34,50 +32,41 @@ VIEWS, DEPTHS = plane.make_views(
 )
 FIELD = surfel_field(CONFIG, extent=2.0, photographs=VIEWS.cameras)
 OPTIMIZER = surfel_optimizer(CONFIG, extent=2.0)
-BOUND = {
-    "field": FIELD,
-    "optimizer": OPTIMIZER,
-    "config": TrainConfig(num_rays=None, num_label_rays=None),
-}
-run = jax.jit(functools.partial(run_train_steps, **BOUND))
+start, run = trainer(FIELD, OPTIMIZER)
 
 
 @pytest.fixture(scope="module")
 def trained():
     """The states before the first step, after `STEPS` and after twice as many, and losses."""
     points = np.random.default_rng(0).uniform([-1.6, -1.4, -0.1], [1.6, 1.4, 0.1], (250, 3))
-    points = jnp.asarray(points, jnp.float32)
-    bound = {"field": FIELD, "optimizer": OPTIMIZER}
-    start = init_state(jax.random.key(0), points, jnp.full_like(points, 0.5), **bound)
-    with jax.numpy_dtype_promotion("standard"):  # optax mixes integers and floats
-        _, first = run(start, VIEWS, count=1)
-        middle, _ = run(start, VIEWS, count=STEPS)
-        end, last = run(middle, VIEWS, count=STEPS)
-    return start, middle, end, (first["loss"], last["loss"])
+    begun = start(points)
+    _, first = run(begun, VIEWS, 1)
+    middle, _ = run(begun, VIEWS, STEPS)
+    end, last = run(middle, VIEWS, STEPS)
+    return begun, middle, end, (first["loss"], last["loss"])
 
 
 def test_training_lowers_the_loss(trained):
-    start, _, end, (first, last) = trained
+    begun, _, end, (first, last) = trained
     assert last < 0.5 * first
-    assert start.params.log_scales.shape == (340, 3)
+    assert begun.params.log_scales.shape == (340, 3)
     assert end.buffers.alive.sum() == int(int(250 * 1.1) * 1.1)
 
 
 def test_a_saved_state_continues_to_the_same_bits(trained, tmp_path):
-    start, middle, end, _ = trained
+    begun, middle, end, _ = trained
     Checkpoints(tmp_path, {}).save("baseline", STEPS, middle, {})
-    _, kept, _ = Checkpoints(tmp_path, {}).load("baseline", start)
-    with jax.numpy_dtype_promotion("standard"):
-        again, _ = run(kept, VIEWS, count=STEPS)
+    _, kept, _ = Checkpoints(tmp_path, {}).load("baseline", begun)
+    again, _ = run(kept, VIEWS, STEPS)
     jax.tree.map(np.testing.assert_array_equal, again.params, end.params)
     jax.tree.map(np.testing.assert_array_equal, again.buffers, end.buffers)
 
 
 def test_sampling_intervals_follow_relocations(trained):
     """They are renewed when density control is due, and kept between."""
-    start, middle, _, _ = trained
+    begun, middle, _, _ = trained
     now = functools.partial(sampling_intervals, cameras=VIEWS.cameras, near=0.2)
-    np.testing.assert_allclose(start.buffers.interval, now(start.params.means), rtol=1e-6)
+    np.testing.assert_allclose(begun.buffers.interval, now(begun.params.means), rtol=1e-6)
     adapt = jax.jit(FIELD.adapt)
     moved = adapt(jax.random.key(1), middle.replace(step=jnp.int32(EVERY * 2)))
     assert np.any(moved.buffers.alive != middle.buffers.alive)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference_splats as reference
-from splat_scenes import IDENTITY, NEAR, random_scene, to_surfels
+from splat_scenes import IDENTITY, NEAR, pixel_centers, random_scene, to_surfels
 from splat_scenes import to_camera as make_camera
 
 from jaxcloseup.fields.splats.projection import project_discs, surfel_columns, to_camera
@@ -39,8 +39,7 @@ def project(surfels, camera, antialias=False):
 @pytest.mark.parametrize("seed", [0, 1])
 def test_no_visible_pixel_is_outside_its_box(kwargs, seed):
     scene = random_scene(seed, count=DISCS, **kwargs)
-    x, y = np.meshgrid(np.arange(SIZE[1]) + 0.5, np.arange(SIZE[0]) + 0.5)
-    pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
+    pixels = pixel_centers(*SIZE)
     alpha, _ = reference.intersect(scene, IDENTITY, INTRINSICS, pixels, near=NEAR)
     box, opacity, *_ = project(to_surfels(scene), make_camera(intrinsics=INTRINSICS, size=SIZE))
     box = np.asarray(box, np.float64)[:, None]
@@ -98,12 +97,11 @@ def test_homographies_agree_with_rays():
 
 def test_the_low_pass_of_discs_behind_the_camera_is_out_of_sight():
     """An anchor at a pixel's center would draw them in the middle of images with odd sides."""
-    height, width = size = (47, 63)
+    size = 47, 63
     scene = random_scene(5, depth=(-1.0, -0.5), log_scale=(0.0, 1.0), count=DISCS)
     camera = make_camera(intrinsics=INTRINSICS, size=size)
     _, opacity, anchor, _, low_pass = map(np.asarray, project(to_surfels(scene), camera))
-    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
+    pixels = pixel_centers(*size)
     rho = low_pass * np.sum((pixels[:, None] - anchor) ** 2, axis=-1).min(axis=0)
     assert np.sum(opacity > 0) > DISCS // 10 and np.all(rho > 100)
 
@@ -111,8 +109,7 @@ def test_the_low_pass_of_discs_behind_the_camera_is_out_of_sight():
 @pytest.mark.parametrize("log_scale", [(-6.0, -3.0), (-4.0, -0.5)], ids=["small", "large"])
 def test_antialiased_discs_are_convolved_with_the_pixel(log_scale):
     scene = random_scene(6, depth=(1.0, 3.0), log_scale=log_scale, count=DISCS)
-    x, y = np.meshgrid(np.arange(SIZE[1]) + 0.5, np.arange(SIZE[0]) + 0.5)
-    pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
+    pixels = pixel_centers(*SIZE)
     expected, _ = reference.intersect(
         scene, IDENTITY, INTRINSICS, pixels, near=NEAR, antialias=True
     )

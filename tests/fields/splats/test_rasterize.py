@@ -1,6 +1,7 @@
 """Images and derivatives of splats against a NumPy splatter, and their invariances."""
 
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -37,23 +38,32 @@ VECTORS = ("rgb", "normal")
 
 @pytest.mark.parametrize(
     ("name", "antialias"),
-    [*((name, False) for name in SPLATS), *((name, True) for name in VOLUMES)],
+    [
+        *((name, False) for name in SPLATS),
+        *((name, True) for name in ("in front", "far and small", *VOLUMES)),
+    ],
 )
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_images_agree_with_the_oracle(name, antialias, precision):
-    """Rays that meet discs, and ellipses of volumes with either filter."""
+    """Rays that meet discs, and ellipses of volumes, with either filter."""
     expected = oracle(SPLATS[name], antialias=antialias)
     config = ANTIALIASED if antialias else CONFIG
     with jax.enable_x64(precision == "float64"):
         splats, camera = to_surfels(SPLATS[name], precision), to_camera(dtype=precision)
         images = render(splats, camera, config=config)
     assert images["overflow"] == 0
-    assert expected["alpha"].max() > 0.2
+    assert expected["alpha"].max() > 0.1
     single = 1e-5 if name in VOLUMES else 2e-5
     for output in expected:
         tolerance = single if precision == "float32" else 1e-9
         assert images[output].dtype == precision
         np.testing.assert_allclose(images[output], expected[output], atol=tolerance, rtol=0)
+
+
+def images_of(values, dtype=jnp.float32):
+    """Cotangents of all outputs: `values(shape, output)`."""
+    shapes = {name: (HEIGHT, WIDTH, 3) if name in VECTORS else (HEIGHT, WIDTH) for name in OUTPUTS}
+    return {name: jnp.asarray(values(shape, name), dtype) for name, shape in shapes.items()}
 
 
 def pose(twist):
@@ -116,8 +126,9 @@ def test_derivatives_agree_with_finite_differences(name, precision, antialias):
     scene, differences = jacobian(name, antialias)
     config = ANTIALIASED if antialias else CONFIG
     rng = np.random.default_rng(3)
-    weights = {name: rng.normal(size=(HEIGHT, WIDTH)) for name in OUTPUTS}
-    weights |= {name: rng.normal(size=(HEIGHT, WIDTH, 3)) for name in VECTORS}
+    with jax.enable_x64(True):
+        weights = images_of(lambda shape, _: rng.normal(size=shape), "float64")
+    weights = jax.tree.map(np.asarray, weights)
     outputs = differences["pose"][0].keys()
     for output in outputs:
         with jax.enable_x64(precision == "float64"):
@@ -144,10 +155,7 @@ def test_float32_keeps_the_digits_of_small_splats():
     """Gradients of splats about a pixel wide are small differences of large sums."""
     scene = random_scene(10, depth=(1.0, 2.0), log_scale=(-3.5, -2.2))
     rng = np.random.default_rng(0)
-    cotangents = {
-        name: rng.normal(size=(HEIGHT, WIDTH, 3) if name in VECTORS else (HEIGHT, WIDTH))
-        for name in OUTPUTS
-    }
+    cotangents = images_of(lambda shape, _: rng.normal(size=shape))
     found = []
     for precision in ("float32", "float64"):
         with jax.enable_x64(precision == "float64"):
@@ -159,28 +167,30 @@ def test_float32_keeps_the_digits_of_small_splats():
         np.testing.assert_allclose(single, double, atol=1e-4 * np.abs(double).max(), rtol=0)
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
-def test_tile_sizes_do_not_change_the_image(precision):
-    scene = random_scene(5, depth=(0.1, 2.0), log_scale=(-4.0, 0.0))
+@pytest.mark.parametrize(
+    ("scene", "precision"),
+    [
+        (random_scene(5, depth=(0.1, 2.0), log_scale=(-4.0, 0.0)), "float32"),
+        (random_scene(5, depth=(0.1, 2.0), log_scale=(-4.0, 0.0)), "float64"),
+        (SCENES["in front"], "float32"),
+        (SCENES["far and small"], "float32"),
+    ],
+    ids=["cut by the near plane", "cut, float64", "in front", "far and small"],
+)
+def test_tile_sizes_do_not_change_the_image(scene, precision):
+    sizes = (8, 4, 4), (16, 3, 1), (32, 8, 2), (None, None, None)
     with jax.enable_x64(precision == "float64"):
+        surfels, camera = to_surfels(scene, precision), to_camera(dtype=precision)
         images = [
-            render(
-                to_surfels(scene, precision),
-                to_camera(dtype=precision),
-                config=RasterizeConfig(
-                    capacity=1024, near=NEAR, tile=tile, chunk=chunk, block=block
-                ),
-            )
-            for tile, chunk, block in ((8, 4, 4), (16, 3, 1), (32, 8, 2), (None, None, None))
+            render(surfels, camera, config=RasterizeConfig(1024, NEAR, False, *each))
+            for each in sizes
         ]
-    for other in images[1:]:
-        for name in OUTPUTS:
-            # Depth and distortion are not of order 1, so float32 rounds them more coarsely.
-            if precision == "float64":
-                atol, rtol = 1e-12, 0
-            else:
-                atol, rtol = 1e-6, 0 if name in ("alpha", *VECTORS) else 5e-5
-            np.testing.assert_allclose(other[name], images[0][name], atol=atol, rtol=rtol)
+    cut = scene["means"][:, 2].min() < 0.5
+    for other, name in itertools.product(images[1:], OUTPUTS):
+        # Depth and distortion of cut discs are large, so float32 rounds them more coarsely.
+        rtol = 5e-5 if cut and name not in ("alpha", *VECTORS) else 0
+        atol, rtol = (1e-12, 0) if precision == "float64" else (1e-6, rtol)
+        np.testing.assert_allclose(other[name], images[0][name], atol=atol, rtol=rtol)
 
 
 def test_sizes_left_open_suit_the_image():
@@ -200,32 +210,36 @@ def test_sizes_left_open_suit_the_image():
         assert {name: getattr(plan, name) for name in sizes} == sizes
 
 
-@pytest.mark.parametrize("name", ["in front", "far and small"])
-def test_tiles_and_crops_agree_to_a_millionth(name):
-    """Float32 keeps this precision in all outputs when the near plane cuts no disc."""
-    surfels = to_surfels(SCENES[name])
-    whole = render(surfels, to_camera())
-    for tile, chunk, block in ((16, 3, 1), (32, 8, 2)):
-        config = RasterizeConfig(capacity=1024, near=NEAR, tile=tile, chunk=chunk, block=block)
-        other = render(surfels, to_camera(), config=config)
-        for output in OUTPUTS:
-            np.testing.assert_allclose(other[output], whole[output], atol=1e-6, rtol=0)
-    for top in (0, 12):
-        for left in (0, 16):
-            camera = to_camera(intrinsics=INTRINSICS - np.array([0, 0, left, top]), size=(12, 16))
-            crop = render(surfels, camera)
-            for output in OUTPUTS:
-                expected = whole[output][top : top + 12, left : left + 16]
-                np.testing.assert_allclose(crop[output], expected, atol=1e-6, rtol=0)
+CUT = random_scene(6, depth=(0.1, 2.0), log_scale=(-4.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("scene", "precision", "tolerance"),
+    [
+        (SCENES["in front"], "float32", 1e-6),
+        (SCENES["far and small"], "float32", 1e-6),
+        (CUT, "float32", 4e-6),
+        (CUT, "float64", 1e-12),
+    ],
+    ids=["in front", "far and small", "cut by the near plane", "cut, float64"],
+)
+def test_crops_agree_with_the_image(scene, precision, tolerance):
+    """They differ by the rounding of the shifted principal point only."""
+    with jax.enable_x64(precision == "float64"):
+        surfels = to_surfels(scene, precision)
+        whole = render(surfels, to_camera(dtype=precision))
+        for top, left in itertools.product((0, 12), (0, 16)):
+            shifted = INTRINSICS - np.array([0, 0, left, top])
+            crop = render(surfels, to_camera(intrinsics=shifted, size=(12, 16), dtype=precision))
+            for name in OUTPUTS:
+                expected = whole[name][top : top + 12, left : left + 16]
+                np.testing.assert_allclose(crop[name], expected, atol=tolerance, rtol=0)
 
 
 def test_bits_do_not_depend_on_the_run_or_the_order():
     scene = SCENES["in front"]
     order = np.random.default_rng(0).permutation(COUNT)
-    cotangents = {
-        name: jnp.ones((HEIGHT, WIDTH, 3) if name in VECTORS else (HEIGHT, WIDTH))
-        for name in OUTPUTS
-    }
+    cotangents = images_of(lambda shape, _: np.ones(shape))
     results = []
     for index in (np.arange(COUNT), np.arange(COUNT), order):
         surfels = jax.tree.map(lambda leaf, index=index: leaf[index], to_surfels(scene))
@@ -234,23 +248,6 @@ def test_bits_do_not_depend_on_the_run_or_the_order():
         results.append((render(surfels, to_camera()), unsorted))
     for result in results[1:]:
         jax.tree.map(np.testing.assert_array_equal, result, results[0])
-
-
-@pytest.mark.parametrize(("precision", "tolerance"), [("float32", 4e-6), ("float64", 1e-12)])
-def test_crops_agree_with_the_image(precision, tolerance):
-    """They differ by the rounding of the shifted principal point only."""
-    scene = random_scene(6, depth=(0.1, 2.0), log_scale=(-4.0, 0.0))
-    with jax.enable_x64(precision == "float64"):
-        surfels = to_surfels(scene, precision)
-        whole = render(surfels, to_camera(dtype=precision))
-        for top in (0, 12):
-            for left in (0, 16):
-                shifted = INTRINSICS - np.array([0, 0, left, top])
-                camera = to_camera(intrinsics=shifted, size=(12, 16), dtype=precision)
-                crop = render(surfels, camera)
-                for name in OUTPUTS:
-                    expected = whole[name][top : top + 12, left : left + 16]
-                    np.testing.assert_allclose(crop[name], expected, atol=tolerance, rtol=0)
 
 
 def test_a_rigid_motion_of_scene_and_camera_changes_nothing():
@@ -291,11 +288,8 @@ def test_discs_behind_are_invisible_and_both_sides_are_visible():
 def test_cameras_can_be_batched():
     twists = jnp.array([[0.0] * 6, [0.05, -0.1, 0.2, 0.1, 0.0, -0.2]])
     surfels, intrinsics = to_surfels(SCENES["in front"]), jnp.asarray(INTRINSICS, jnp.float32)
-    keys = jax.random.split(jax.random.key(0), len(OUTPUTS))
-    cotangents = {
-        name: jax.random.normal(key, (HEIGHT, WIDTH, 3) if name in VECTORS else (HEIGHT, WIDTH))
-        for name, key in zip(OUTPUTS, keys, strict=True)
-    }
+    rng = np.random.default_rng(0)
+    cotangents = images_of(lambda shape, _: rng.normal(size=shape))
     batched = jax.vmap(pullback, in_axes=(None, 0, None, None))
     batched = jax.jit(batched)(surfels, twists, intrinsics, cotangents)
     for i in range(2):

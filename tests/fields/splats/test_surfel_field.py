@@ -1,7 +1,6 @@
 """Surfels as a field: loss, schedules, training that finds a surface, and overflow."""
 
 import dataclasses
-import functools
 
 import chex
 import jax
@@ -9,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import plane
 import pytest
-from splat_scenes import random_scene, to_camera, to_surfels
-from tiny_training import run_train_steps
+from splat_scenes import random_scene, to_camera, to_surfels, trainer
 
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.fields.splats import RasterizeConfig, SurfelConfig
@@ -24,8 +22,7 @@ from jaxcloseup.fields.splats.splat_optimizer import surfel_optimizer
 from jaxcloseup.fields.splats.surfels import random_points
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.metrics.image_metrics import psnr
-from jaxcloseup.training.config import TrainConfig
-from jaxcloseup.training.state import init_state
+from jaxcloseup.photos.views import camera_at
 
 
 STEPS = 200
@@ -45,6 +42,7 @@ CONFIG = SurfelConfig(
 EXTENT = 2.0
 FIELD = surfel_field(CONFIG, extent=EXTENT)
 OPTIMIZER = surfel_optimizer(CONFIG, extent=EXTENT)
+start, run = trainer(FIELD, OPTIMIZER)
 
 
 @pytest.fixture(scope="module")
@@ -54,26 +52,11 @@ def capture():
 
 
 @pytest.fixture(scope="module")
-def run():
-    bound = {
-        "field": FIELD,
-        "optimizer": OPTIMIZER,
-        "config": TrainConfig(num_rays=None, num_label_rays=None),
-    }
-    return jax.jit(functools.partial(run_train_steps, **bound))
-
-
-@pytest.fixture(scope="module")
-def trained(capture, run):
-    views, _ = capture
+def trained(capture):
     rng = np.random.default_rng(0)
-    points = rng.uniform([-1.6, -1.4, -0.15], [1.6, 1.4, 0.15], (250, 3))
-    points = jnp.asarray(points, jnp.float32)
-    gray = jnp.full_like(points, 0.5)
-    state = init_state(jax.random.key(0), points, gray, field=FIELD, optimizer=OPTIMIZER)
-    with jax.numpy_dtype_promotion("standard"):  # optax mixes integers and floats
-        first, _ = run(state, views, count=STEPS // 2)
-        last, metrics = run(first, views, count=STEPS // 2)
+    state = start(rng.uniform([-1.6, -1.4, -0.15], [1.6, 1.4, 0.15], (250, 3)))
+    first, _ = run(state, capture[0], STEPS // 2)
+    last, metrics = run(first, capture[0], STEPS // 2)
     return state, first, last, metrics
 
 
@@ -88,19 +71,19 @@ def judge(rgb, image, target, weight):
 
 def test_training_finds_the_plane(trained, capture):
     views, depths = capture
-    start, _, state, metrics = trained
+    begun, _, state, metrics = trained
     assert metrics["overflow"] == 0
     errors = []
     for i in range(len(views.rgb)):
-        camera = jax.tree.map(lambda leaf, i=i: leaf[i], views.cameras)
+        camera = camera_at(views.cameras, i)
         image = render(state.params, state.buffers, camera)
         assert psnr(image.rgb, views.rgb[i]) > 26
-        before = render(start.params, start.buffers, camera).depth
+        before = render(begun.params, begun.buffers, camera).depth
         errors.append([np.abs(d - depths[i]) / depths[i] for d in (before, image.depth)])
         # Normals start at random; this short training turns them half of the way.
         upwards = [
             np.mean(render(s.params, s.buffers, camera).aux.surfels.normal[..., 2])
-            for s in (start, state)
+            for s in (begun, state)
         ]
         assert upwards[1] > upwards[0] + 0.1
     before, after = np.median(np.stack(errors, 1).reshape(2, -1), axis=1)
@@ -109,7 +92,7 @@ def test_training_finds_the_plane(trained, capture):
 
 def test_an_image_may_change_its_colors_by_an_affine_map(trained, capture):
     """A photograph in other light costs 0.3 times its loss without the affine map."""
-    state, camera = trained[2], jax.tree.map(lambda leaf: leaf[0], capture[0].cameras)
+    state, camera = trained[2], camera_at(capture[0].cameras, 0)
     image = render(state.params, state.buffers, camera)
     change = jnp.array([[0.8, 0.1, 0.0], [0.0, 0.7, 0.1], [0.1, 0.0, 0.9]])
     target = jnp.matmul(image.rgb, change[None], precision="highest") + 0.05
@@ -131,25 +114,24 @@ def test_an_image_may_change_its_colors_by_an_affine_map(trained, capture):
 
 
 def test_schedules_follow_the_step(trained):
-    start, middle, end, _ = trained
-    for state, degree, regularize in ((start, 0, 0), (middle, 1, 1), (end, 1, 1)):
+    begun, middle, end, _ = trained
+    for state, degree, regularize in ((begun, 0, 0), (middle, 1, 1), (end, 1, 1)):
         assert state.buffers.degree == degree
         assert state.buffers.regularize == regularize
-    assert start.buffers.alive.sum() == 250
+    assert begun.buffers.alive.sum() == 250
     # Relocations come at 50, 75, 100 and 125, before `stop` at 150.
     assert middle.buffers.alive.sum() == int(int(int(250 * 1.1) * 1.1) * 1.1)
     assert end.buffers.alive.sum() == int(int(middle.buffers.alive.sum()) * 1.1)
-    assert start.step == 0
+    assert begun.step == 0
     assert end.step == STEPS
 
 
-def test_a_saved_state_continues_to_the_same_bits(trained, capture, run, tmp_path):
+def test_a_saved_state_continues_to_the_same_bits(trained, capture, tmp_path):
     """The steps after the checkpoint include relocations and growth."""
-    start, middle, end, _ = trained
+    begun, middle, end, _ = trained
     Checkpoints(tmp_path, {}).save("baseline", STEPS // 2, middle, {})
-    _, kept, _ = Checkpoints(tmp_path, {}).load("baseline", start)
-    with jax.numpy_dtype_promotion("standard"):
-        again, _ = run(kept, capture[0], count=STEPS // 2)
+    _, kept, _ = Checkpoints(tmp_path, {}).load("baseline", begun)
+    again, _ = run(kept, capture[0], STEPS // 2)
     for now, before in zip(jax.tree.leaves(again), jax.tree.leaves(end), strict=True):
         if jax.dtypes.issubdtype(now.dtype, jax.dtypes.prng_key):
             now, before = jax.random.key_data(now), jax.random.key_data(before)
@@ -224,7 +206,7 @@ def test_late_steps_are_smaller():
 @pytest.fixture(scope="module")
 def image(trained, capture):
     state, views = trained[2], capture[0]
-    camera = jax.tree.map(lambda leaf: leaf[0], views.cameras)
+    camera = camera_at(views.cameras, 0)
     return render(state.params, state.buffers, camera)
 
 
@@ -252,7 +234,7 @@ def test_without_weight_the_loss_is_zero_and_not_nan(image, capture, kind):
 
 def test_degree_zero_ignores_higher_harmonics(trained, capture):
     state = trained[2]
-    camera = jax.tree.map(lambda leaf: leaf[0], capture[0].cameras)
+    camera = camera_at(capture[0].cameras, 0)
     bands = state.params.replace(sh=state.params.sh.at[:, 1:].add(0.5))
     low = state.buffers.replace(degree=jnp.int32(0))
     plain, banded = (render(params, low, camera).rgb for params in (state.params, bands))
@@ -262,7 +244,7 @@ def test_degree_zero_ignores_higher_harmonics(trained, capture):
 
 def test_depth_is_the_median_or_expected_depth(trained, capture):
     state = trained[2]
-    camera = jax.tree.map(lambda leaf: leaf[0], capture[0].cameras)
+    camera = camera_at(capture[0].cameras, 0)
     image = render(state.params, state.buffers, camera)
     buffers = with_expected_depth(state.buffers, True)
     chex.assert_trees_all_equal_shapes_and_dtypes(buffers, state.buffers)
@@ -315,7 +297,7 @@ def test_without_density_control_only_the_schedule_changes(trained):
 
 def test_a_field_with_more_capacity_renders_what_overflowed(trained, capture):
     """A caller grows the capacity until everything fits, with the same parameters and buffers."""
-    state, camera = trained[0], jax.tree.map(lambda leaf: leaf[0], capture[0].cameras)
+    state, camera = trained[0], camera_at(capture[0].cameras, 0)
 
     def render_with(capacity):
         raster = dataclasses.replace(CONFIG.raster, capacity=capacity)
