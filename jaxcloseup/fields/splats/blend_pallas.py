@@ -7,7 +7,6 @@ splat, always in the same order.
 """
 
 import functools
-import logging
 from typing import Any
 
 import jax
@@ -110,31 +109,6 @@ def backward(
         median_bar,
     )
     return _add_pairs(pairs_bar, lists, table.shape[0], interpret=plan.interpret)
-
-
-@functools.cache
-def kernels_compile(tile: int) -> bool:
-    """Return whether this GPU runs the kernels for tiles of a size; log once why not."""
-    plan = RasterPlan(capacity=1, near=1.0, tile=tile)
-
-    def example() -> tuple[jax.Array, TileLists]:
-        one = jnp.zeros(1, jnp.int32)
-        lists = TileLists(one, one, one, origins=jnp.zeros((1, 2), jnp.int32), overflow=one)
-        return jnp.zeros((1, PAYLOAD + 1), jnp.float32), lists
-
-    def both(table: jax.Array, lists: TileLists) -> jax.Array:
-        sums, median, trace = forward(plan, table, lists)
-        return backward(plan, table, lists, trace, (sums, median))
-
-    try:
-        jax.jit(both).lower(*jax.eval_shape(example)).compile()
-    except Exception as error:  # whatever stops the compiler
-        reason = str(error).splitlines() or [type(error).__name__]
-        logging.getLogger(__name__).warning(
-            "splats are blended by jax.lax, for this GPU cannot run the kernels: %s", reason[0]
-        )
-        return False
-    return True
 
 
 def _in_turn(lists: TileLists, order: jax.Array) -> tuple[jax.Array, ...]:

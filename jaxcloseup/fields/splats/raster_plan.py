@@ -5,10 +5,16 @@ Nothing else in splatting depends on the platform. To add a compositor, write a 
 name to `config.COMPOSITORS`, and say in `_compositor` where "auto" means it.
 """
 
-import jax
+import functools
+import logging
 
-from jaxcloseup.fields.splats.blend_pallas import kernels_compile
+import jax
+import jax.numpy as jnp
+
+from jaxcloseup.fields.splats import blend_pallas
 from jaxcloseup.fields.splats.config import RasterizeConfig, RasterPlan
+from jaxcloseup.fields.splats.layout import PAYLOAD
+from jaxcloseup.fields.splats.tiling import TileLists
 
 
 _SMALL = 2**17  # pixels of an image that is best cut into small tiles
@@ -46,3 +52,28 @@ def _compositor(name: str, platform: str, tile: int) -> str:
     if name != "auto":
         return name
     return "kernel" if platform == "gpu" and kernels_compile(tile) else "loops"
+
+
+@functools.cache
+def kernels_compile(tile: int) -> bool:
+    """Return whether this GPU runs the kernels for tiles of a size; log once why not."""
+    plan = RasterPlan(capacity=1, near=1.0, tile=tile)
+
+    def example() -> tuple[jax.Array, TileLists]:
+        one = jnp.zeros(1, jnp.int32)
+        lists = TileLists(one, one, one, origins=jnp.zeros((1, 2), jnp.int32), overflow=one)
+        return jnp.zeros((1, PAYLOAD + 1), jnp.float32), lists
+
+    def both(table: jax.Array, lists: TileLists) -> jax.Array:
+        sums, median, trace = blend_pallas.forward(plan, table, lists)
+        return blend_pallas.backward(plan, table, lists, trace, (sums, median))
+
+    try:
+        jax.jit(both).lower(*jax.eval_shape(example)).compile()
+    except Exception as error:  # whatever stops the compiler
+        reason = str(error).splitlines() or [type(error).__name__]
+        logging.getLogger(__name__).warning(
+            "splats are blended by jax.lax, for this GPU cannot run the kernels: %s", reason[0]
+        )
+        return False
+    return True

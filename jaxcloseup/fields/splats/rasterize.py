@@ -7,14 +7,13 @@ A splat is a planar homography, a reference pixel and a payload, see `Footprints
 import functools
 from typing import NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 from jax import lax
 
 from jaxcloseup.fields.splats.blending import blend_tiles
 from jaxcloseup.fields.splats.config import RasterizeConfig
-from jaxcloseup.fields.splats.layout import MOMENTS, Footprints, pack
+from jaxcloseup.fields.splats.layout import MOMENTS
 from jaxcloseup.fields.splats.raster_plan import plan_raster
 from jaxcloseup.fields.splats.tile_test import reaches
 from jaxcloseup.fields.splats.tiling import tile_lists
@@ -42,24 +41,6 @@ class SplatImage(NamedTuple):
     overflow: jax.Array
 
 
-def rasterize(
-    footprints: Footprints, config: RasterizeConfig, *, height: int, width: int
-) -> SplatImage:
-    """Blend splats front to back into an image of `height` x `width` pixels.
-
-    Differentiable in anchor, homography, opacity and payload. Deterministic; of two splats with the
-    same `order`, the one with the lower index is in front.
-    """
-    count = footprints.opacity.shape[0]
-    chex.assert_shape(footprints.payload, (None, count))
-    chex.assert_shape(footprints.anchor, (2, count))
-    chex.assert_shape(footprints.homography, (3, 3, count))
-    chex.assert_shape([footprints.opacity, footprints.low_pass, footprints.order], (count,))
-    chex.assert_shape(footprints.inverse_depth, (2, count))
-    table, box, order = pack(footprints), footprints.box.T, footprints.order
-    return blend(table, box, order, config, height=height, width=width)
-
-
 def blend(
     table: jax.Array,
     box: jax.Array,
@@ -69,9 +50,18 @@ def blend(
     height: int,
     width: int,
 ) -> SplatImage:
-    """Blend splats that are a table `[N, C]` from `pack`, boxes `[N, 4]` and `order[N]`.
+    """Blend splats front to back into an image of `height` x `width` pixels.
 
-    See `rasterize`.
+    Differentiable in the table. Deterministic; of two splats with the same order, the one with the
+    lower index is in front.
+
+    Args:
+      table: `[N, C]` from `pack`.
+      box: `[N, 4]` `Footprints.box`, transposed.
+      order: `[N]` `Footprints.order`.
+      config: static.
+      height: in pixels; static.
+      width: in pixels; static.
     """
     plan = plan_raster(config, height=height, width=width)
     # Which splats a tile lists has no derivative: outside of their lists they draw nothing.

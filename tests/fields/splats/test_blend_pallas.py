@@ -22,7 +22,7 @@ from splat_scenes import (
     to_surfels,
 )
 
-from jaxcloseup.fields.splats import blend_pallas
+from jaxcloseup.fields.splats import blend_pallas, raster_plan
 from jaxcloseup.fields.splats.config import RasterizeConfig, RasterPlan
 from jaxcloseup.fields.splats.layout import PAYLOAD
 from jaxcloseup.fields.splats.tiling import tile_lists
@@ -97,13 +97,13 @@ def test_kernels_become_programs_of_a_gpu():
 
 @pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated")
 def test_a_gpu_that_cannot_run_them_falls_back_to_loops_and_says_so(caplog):
-    blend_pallas.kernels_compile.cache_clear()
+    raster_plan.kernels_compile.cache_clear()
     # There is no GPU to compile for.
     config = RasterizeConfig(capacity=1024, near=NEAR, chunk=4, block=3, platform="gpu")
     surfels = to_surfels(SCENES["in front"])
     with caplog.at_level(logging.WARNING):
         found = [render(surfels, to_camera(), config=config)["rgb"] for _ in range(2)]
-    blend_pallas.kernels_compile.cache_clear()
+    raster_plan.kernels_compile.cache_clear()
     said = [record.getMessage() for record in caplog.records if "blended" in record.getMessage()]
     assert len(said) == 1 and "\n" not in said[0]
     np.testing.assert_allclose(found[0], oracle(SCENES["in front"])["rgb"], atol=2e-5)
