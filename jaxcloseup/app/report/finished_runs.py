@@ -120,7 +120,7 @@ def _is_number(value: Any) -> bool:
 def _check_alike(first: Finished, run: Finished) -> None:
     """Raise a RunError if two runs cannot be compared."""
     (size, finer), (other, other_finer) = (
-        (one.results["resolution"], one.results.get("finer_resolution")) for one in (first, run)
+        (each.results["resolution"], each.results.get("finer_resolution")) for each in (first, run)
     )
     if size == other and finer and other_finer:
         size, other = finer, other_finer

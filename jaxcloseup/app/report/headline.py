@@ -1,6 +1,6 @@
 """The result of a run: one sentence, a small table for each kind of view, and all scores."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 from jaxcloseup.app.report.table import Table, print_tables
@@ -109,13 +109,12 @@ def score_tables(
             continue
         finer = {stage: stages[stage].get(split + FINER, {}) for stage in scores}
         columns = [(COLUMNS["psnr"], "psnr", scores)]
-        if finer_size and _known(finer, ["psnr"]):
+        if finer_size and _known(finer.values(), ["psnr"]):
             columns.append((f"at {finer_size[0]} x {finer_size[1]}", "psnr", finer))
         columns.append((COLUMNS["ssim"], "ssim", scores))
         for keys in (_LAST, _DEPTH):
-            columns += [
-                (_SHORT.get(key, COLUMNS[key]), key, scores) for key in _known(scores, keys)[:1]
-            ]
+            known = _known(scores.values(), keys)[:1]
+            columns += [(_SHORT.get(key, COLUMNS[key]), key, scores) for key in known]
         body = [
             [name, *(_cell(key, values[stage].get(key)) for _, key, values in columns)]
             for stage, name in (names or {stage: stage for stage in stages}).items()
@@ -127,8 +126,8 @@ def score_tables(
 
 def all_scores(stages: Mapping[str, Splits]) -> Table:
     """Return all scores: a row for each split and stage."""
-    found = [scores for splits in stages.values() for scores in splits.values()]
-    keys = _known(dict(enumerate(found)), COLUMNS)
+    scores = [scores for splits in stages.values() for scores in splits.values()]
+    keys = _known(scores, COLUMNS)
     body = [
         [title, stage, *(format_metric(key, splits[split].get(key)) for key in keys)]
         for split, title in SPLIT_TITLES.items()
@@ -144,9 +143,9 @@ def print_results(results: Mapping[str, Any]) -> None:
     print_tables(run_tables(results), conclusion(results))
 
 
-def _known(scores: Mapping[Any, Mapping[str, Any]], keys: Iterable[str]) -> list[str]:
+def _known(scores: Collection[Mapping[str, Any]], keys: Iterable[str]) -> list[str]:
     """Return the metrics that any of the scores has."""
-    return [key for key in keys if any(one.get(key) is not None for one in scores.values())]
+    return [key for key in keys if any(values.get(key) is not None for values in scores)]
 
 
 def _cell(key: str, value: float | None) -> str:

@@ -42,28 +42,27 @@ def read_method(folder: pathlib.Path) -> dict[str, Any]:
     return {"arms": arms, **cost}
 
 
-def write_methods(folder: pathlib.Path, found: Mapping[str, Mapping[str, Record]]) -> None:
+def write_methods(folder: pathlib.Path, methods: Mapping[str, Mapping[str, Record]]) -> None:
     """Write `methods.json`, and `methods.md` with tables for each scene and their mean.
 
     Args:
       folder: folder to write to.
-      found: the records of `read_method` by method and scene.
+      methods: the records of `read_method` by method and scene.
     """
-    write_json(folder / "methods.json", found)
-    scenes = list(dict.fromkeys(scene for by_scene in found.values() for scene in by_scene))
+    write_json(folder / "methods.json", methods)
+    scenes = list(dict.fromkeys(scene for by_scene in methods.values() for scene in by_scene))
     parts = [
-        (scene, {name: records[scene] for name, records in found.items() if scene in records})
+        (scene, {name: records[scene] for name, records in methods.items() if scene in records})
         for scene in scenes
     ]
-    complete = {name: records for name, records in found.items() if set(records) == set(scenes)}
+    complete = {name: records for name, records in methods.items() if set(records) == set(scenes)}
     if len(scenes) > 1 and complete:
         means: dict[str, Record] = {
             name: _mean_of(list(records.values())) for name, records in complete.items()
         }
         parts.insert(0, (f"mean of {', '.join(scenes)}", means))
     text = "\n".join(
-        f"## {title}\n\n{markdown(_scores(methods))}\n{_ladder(methods)}"
-        for title, methods in parts
+        f"## {title}\n\n{markdown(_scores(shown))}\n{_ladder(shown)}" for title, shown in parts
     )
     write_file(folder / "methods.md", text.encode())
 
@@ -89,7 +88,9 @@ def _scores(methods: Mapping[str, Record]) -> Table:
 def _ladder(methods: Mapping[str, Record]) -> str:
     """Return a table of PSNR by magnification, in Markdown; empty without a zoom ladder."""
     arm = _last_trained(_arms(methods))
-    rungs = rungs_of({split for one in methods.values() for split in one["arms"].get(arm, {})})
+    rungs = rungs_of(
+        {split for record in methods.values() for split in record["arms"].get(arm, {})}
+    )
     if not rungs:
         return ""
     body = [

@@ -101,7 +101,7 @@ def _showcase(programs: Programs, outcome: Outcome) -> list[Exhibit]:
     return exhibits(
         targets[split],
         outcome.images[stage, split],
-        {name: one["psnr"] for name, one in views.items() if one["psnr"] is not None},
+        {name: view["psnr"] for name, view in views.items() if view["psnr"] is not None},
         render_depth=lambda camera: label_depth(programs.render(outcome.start.state, camera)),
         sources=outcome.start.sources,
         photographs=_loaded_photographs(programs, outcome),

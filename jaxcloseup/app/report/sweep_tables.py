@@ -80,8 +80,8 @@ def paired_bootstrap(
 def rows(scenes: Scenes) -> list[Row]:
     """Return a row for each split and arm."""
     arms = _arms(scenes)
-    found = (_row(scenes, arm, split) for split in SPLIT_TITLES for arm in arms)
-    return [row for row in found if row is not None]
+    every = (_row(scenes, arm, split) for split in SPLIT_TITLES for arm in arms)
+    return [row for row in every if row is not None]
 
 
 def _row(scenes: Scenes, arm: str, split: str) -> Row | None:
@@ -180,13 +180,13 @@ def write_sweep(
       pictures: pictures for the report.
     """
     write_json(folder / "sweep.json", {"scenes": scenes, **about})
-    found = rows(scenes)
-    table, curves = score_table(found), gain_curves(scenes)
+    scored = rows(scenes)
+    table, curves = score_table(scored), gain_curves(scenes)
     write_file(folder / "table.md", markdown(table).encode())
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(field.name for field in dataclasses.fields(Row))
-    writer.writerows(map(dataclasses.astuple, found))
+    writer.writerows(map(dataclasses.astuple, scored))
     write_file(folder / "table.csv", text.getvalue().encode())
     gain_plot = curves and line_plot(
         curves,
@@ -206,22 +206,25 @@ def write_sweep(
     write_file(folder / "report.html", page)
 
 
-def score_table(found: Sequence[Row]) -> Table:
+def score_table(scored: Sequence[Row]) -> Table:
     """Return the table of all rows."""
-    columns = {
-        "views": [SPLIT_TITLES[row.split] for row in found],
-        "arm": [row.arm for row in found],
-        "PSNR (dB)": [format_number(row.psnr) for row in found],
-        "s.d.": [format_number(row.spread) for row in found],
-        "SSIM": [format_number(row.ssim, "{:.4f}") for row in found],
-        "LPIPS": [format_number(row.lpips, "{:.4f}") for row in found],
-        "gain (dB)": [format_number(row.gain, "{:+.3f}") for row in found],
-        "95 %": ["-" if row.low is None else f"{row.low:+.3f} to {row.high:+.3f}" for row in found],
-        "n": [str(row.count) for row in found],
-        "skipped": [str(row.skipped) for row in found],
-    }
-    body = [list(line) for line in zip(*columns.values(), strict=True)]
-    return Table("Scores", list(columns), body, names=2)
+    header = ["views", "arm", "PSNR (dB)", "s.d.", "SSIM", "LPIPS", "gain (dB)", "95 %", "n"]
+    body = [
+        [
+            SPLIT_TITLES[row.split],
+            row.arm,
+            format_number(row.psnr),
+            format_number(row.spread),
+            format_number(row.ssim, "{:.4f}"),
+            format_number(row.lpips, "{:.4f}"),
+            format_number(row.gain, "{:+.3f}"),
+            "-" if row.low is None else f"{row.low:+.3f} to {row.high:+.3f}",
+            str(row.count),
+            str(row.skipped),
+        ]
+        for row in scored
+    ]
+    return Table("Scores", [*header, "skipped"], body, names=2)
 
 
 def _arms(scenes: Scenes) -> list[str]:

@@ -1,4 +1,4 @@
-"""Errors of pseudo-labels: against true close-ups on built-in scenes, against photographs on all.
+"""Measure errors of pseudo-labels against true close-ups, and against left-out photographs.
 
 A label cannot be sharper than its source photograph. On built-in scenes it is therefore compared
 with the true close-up, blurred to the footprint of the source's pixels. On all scenes, training
@@ -64,16 +64,16 @@ def audit_labels(
     """
     sample = jax.jit(sample_virtual_camera)
     error = kept = kept_visible = visible = 0.0
-    closeups = []
+    shots = []
     for camera_key in progress.track(list(jax.random.split(key, count)), "close-ups"):
         camera, index = sample(camera_key, sources, settings)
         depth = render_depth(camera)
-        one = _audit_closeup(camera, depth, index, exact_depths[index], scene, sources, settings)
-        error += float((one.weight * one.error).sum())
-        kept += float(one.weight.sum())
-        kept_visible += float((one.weight * one.visible).sum())
-        visible += float(one.visible.sum())
-        closeups.append(one)
+        shot = _audit_closeup(camera, depth, index, exact_depths[index], scene, sources, settings)
+        error += float((shot.weight * shot.error).sum())
+        kept += float(shot.weight.sum())
+        kept_visible += float((shot.weight * shot.visible).sum())
+        visible += float(shot.visible.sum())
+        shots.append(shot)
     shares = {
         "error": (error, kept, "no label was kept"),
         "kept": (kept_visible, visible, "the source sees nothing"),
@@ -83,10 +83,10 @@ def audit_labels(
     for name, (part, whole, reason) in shares.items():
         result |= {name: part / whole} if whole else {name: None, f"{name}_reason": reason}
     result["curve"] = error_curve(
-        np.concatenate([one.disagreement[one.reached] for one in closeups]),
-        np.concatenate([one.error[one.reached] for one in closeups]),
-        sum(one.reached.size for one in closeups),
-        {"leaked": np.concatenate([(1 - one.visible)[one.reached] for one in closeups])},
+        np.concatenate([shot.disagreement[shot.reached] for shot in shots]),
+        np.concatenate([shot.error[shot.reached] for shot in shots]),
+        sum(shot.reached.size for shot in shots),
+        {"leaked": np.concatenate([(1 - shot.visible)[shot.reached] for shot in shots])},
     )
     return result
 

@@ -1,6 +1,6 @@
 """The zoom ladder: the same points seen from nearer and nearer, on built-in scenes.
 
-Each held-out ordinary view gives a camera for each rung. The camera moves 1, 2, 4, 8 and 16 times
+Each held-out ordinary view has a camera for each rung. The camera moves 1, 2, 4, 8 and 16 times
 nearer to one point of the view without turning, so only the magnification changes along the ladder.
 The rung below 1 has half the view's focal length: moving back might lead out of the scene.
 """
