@@ -5,6 +5,7 @@ import inspect
 import pathlib
 import subprocess
 import sys
+import tomllib
 
 import pytest
 
@@ -59,3 +60,14 @@ def test_geometry_imports_nothing_heavy():
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.split() == []
+
+
+def test_the_wheel_has_every_file_of_the_package_and_no_other_package():
+    config = tomllib.loads((ROOT.parent / "pyproject.toml").read_text(encoding="utf-8"))
+    settings = config["tool"]["setuptools"]
+    assert settings["packages"]["find"]["include"] == ["jaxcloseup*"]
+    data = {path for name in settings["package-data"]["jaxcloseup"] for path in ROOT.glob(name)}
+    for path in ROOT.rglob("*"):
+        if path.is_file() and "__pycache__" not in path.parts:
+            assert path.suffix == ".py" or path in data, path
+            assert path.suffix != ".py" or (path.parent / "__init__.py").is_file(), path
