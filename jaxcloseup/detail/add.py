@@ -22,7 +22,8 @@ from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.geometry.numerics import safe_divide
 from jaxcloseup.labels.rules import label_depth
-from jaxcloseup.photos.gather import Gathered, GatherSettings, GatherSources, gather_parts
+from jaxcloseup.photos.depth_maps import GatherSources
+from jaxcloseup.photos.gather import Gathered, GatherSettings, gather_parts
 from jaxcloseup.photos.pyramids import Pyramid
 from jaxcloseup.photos.views import Views, camera_at
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxcloseup.geometry.cameras import Camera, pixels_to_points, points_to_pixels
 from jaxcloseup.geometry.numerics import safe_divide
 from jaxcloseup.geometry.warp import backward_warp
-from jaxcloseup.photos.gather import GatherSources
+from jaxcloseup.photos.depth_maps import GatherSources
 
 
 OPAQUE = 0.9  # opacity from which a render counts as opaque

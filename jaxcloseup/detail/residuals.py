@@ -15,7 +15,7 @@ from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.geometry.numerics import matmul
 from jaxcloseup.labels.rules import label_depth
 from jaxcloseup.metrics.image_metrics import change_colors, fit_colors
-from jaxcloseup.photos.gather import gather_sources
+from jaxcloseup.photos.depth_maps import gather_sources
 from jaxcloseup.photos.pyramids import Pyramid
 from jaxcloseup.photos.views import Views, camera_at, to_float
 

@@ -16,8 +16,11 @@ __all__, __getattr__, __dir__ = lazy_names(
             "Windows photograph_windows view_windows windows_that_see sample_window "
             "sample_window_pixels cut_window in_quarters"
         ),
-        "gather": "GatherSources GatherSettings Gathered gather_sources gather_parts",
+        "gather": "gather_parts",
+        "gather_sums": "GatherSettings Gathered Reader gather_points",
         "support": "Support find_support count_seen count_seen_points",
-        "tsdf": "DepthMaps Fused depth_maps fuse fuse_grid",
+        "depth_maps": (
+            "DepthMaps Fused GatherSources fuse fuse_grid gather_sources prepare_depth_maps"
+        ),
     },
 )

@@ -1,9 +1,8 @@
-"""Pyramids: images of several views at a fine size, at halves of it, and as a model reads them."""
+"""Pyramids: images of several views at a fine size, at halves of it, and as training reads them."""
 
 import itertools
 import math
 
-import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,7 +33,7 @@ class Pyramid:
     sizes: tuple[tuple[int, int], ...] = struct.field(pytree_node=False)
 
     def coarseness(self, view: int | jax.Array) -> jax.Array:
-        """log2 of how much larger each level's pixels are than the finest ones, `[L]`."""
+        """Return log2 of how much larger each level's pixels are than the finest ones, `[L]`."""
         focal = mean_focal(self.intrinsics[view])
         return jnp.log2(focal[0] / focal)
 
@@ -45,33 +44,33 @@ class Pyramid:
         return tuple(itertools.accumulate(counts[:-1], initial=0))
 
     def pixels_of(self, index: int) -> slice:
-        """The pixels of one level, among the P."""
+        """Return the pixels of one level, among the P."""
         start, (height, width) = self.starts[index], self.sizes[index]
         return slice(start, start + height * width)
 
     def level_near(self, width: int) -> int:
-        """The finest level that is not 1.5 times as wide as `width`; there must be one."""
-        return [own < 1.5 * width for _, own in self.sizes].index(True)
+        """Return the finest level that is not 1.5 times as wide as `width`; there must be one."""
+        return [finer < 1.5 * width for _, finer in self.sizes].index(True)
 
     def level(self, index: int) -> jax.Array:
-        """Images `[V, H, W, C]` of one level."""
+        """Return the images `[V, H, W, C]` of one level."""
         flat = self.values[:, self.pixels_of(index)]
         return flat.reshape(flat.shape[0], *self.sizes[index], flat.shape[-1])
 
     def image(self, view: int, index: int) -> jax.Array:
-        """The image `[H, W, C]` of one view at one level."""
+        """Return the image `[H, W, C]` of one view at one level."""
         flat = self.values[view, self.pixels_of(index)]
         return flat.reshape(*self.sizes[index], flat.shape[-1])
 
     def camera(self, camera: Camera, view: int, index: int) -> Camera:
-        """The camera of one view's image at one level, given any camera with its pose."""
+        """Return the camera of one view's image at one level, given any camera with its pose."""
         height, width = self.sizes[index]
         intrinsics = self.intrinsics[view, index]
         return camera.replace(intrinsics=intrinsics, height=height, width=width)
 
 
 def scene_pyramid(scene: Scene, *, finest: int = 1, budget: int = BUDGET) -> tuple[Pyramid, int]:
-    """The training photographs of a scene, from the finest size that fits to that of training.
+    """Make a pyramid of the training photographs, from the finest size that fits to their own.
 
     Args:
       scene: a scene whose photographs were divided by `metadata["downscale"]` for training.
@@ -93,7 +92,7 @@ def scene_pyramid(scene: Scene, *, finest: int = 1, budget: int = BUDGET) -> tup
 def photograph_pyramid(
     views: Views, coarsest: Views | None = None, *, least: tuple[int, int] | None = None
 ) -> Pyramid:
-    """Photographs, halves of them, and the same photographs as training reads them.
+    """Make a pyramid of photographs, halves of them, and the photographs as training reads them.
 
     The values are `[V, P, 4]` uint8, colors and weight. A half averages 2 x 2 pixels by their
     weights; a last odd row or column is dropped, so that the intrinsics halve exactly. Pixels
@@ -104,13 +103,15 @@ def photograph_pyramid(
       coarsest: the last level, after halves that are at least 1.5 times as wide.
       least: without `coarsest`, smallest height and width of a half; None makes only one level.
     """
-    sizes = [views.rgb.shape[1:3]]
+    height, width = views.rgb.shape[1:3]
+    sizes = [(height, width)]
+    smallest: tuple[float, float] | None = least
     if coarsest is not None:
-        least = 1, 1.5 * coarsest.cameras.width
-    while least is not None and all(np.floor_divide(sizes[-1], 2) >= least):
+        smallest = 1, 1.5 * coarsest.cameras.width
+    while smallest is not None and all(np.floor_divide(sizes[-1], 2) >= smallest):
         sizes.append((sizes[-1][0] // 2, sizes[-1][1] // 2))
     if coarsest is not None:
-        sizes.append(coarsest.rgb.shape[1:3])
+        sizes.append((coarsest.cameras.height, coarsest.cameras.width))
     images, weight = _bytes(views), np.asarray(views.weight)
     values = np.empty((len(images), sum(h * w for h, w in sizes), 4), np.uint8)
     halves = sizes if coarsest is None else sizes[:-1]
@@ -127,53 +128,57 @@ def photograph_pyramid(
     if coarsest is not None:
         last = zip(_bytes(coarsest), np.asarray(coarsest.weight), strict=True)
         values[:, start:] = [_pixels(*level) for level in last]
-        own = np.asarray(coarsest.cameras.intrinsics)[:, None]
-        intrinsics = np.concatenate([intrinsics, own], axis=1)
+        given = np.asarray(coarsest.cameras.intrinsics)[:, None]
+        intrinsics = np.concatenate([intrinsics, given], axis=1)
     return Pyramid(jnp.asarray(values), jnp.asarray(intrinsics), tuple(sizes))
 
 
-def _bytes(views):
+def _bytes(views: Views) -> np.ndarray:
     images = np.asarray(views.rgb)
     if images.dtype != np.uint8:
         images = np.rint(np.clip(images, 0, 1) * 255).astype(np.uint8)
     return images
 
 
-def _pixels(colors, weight):
-    """Colors and weight of one image as bytes `[H * W, 4]`."""
+def _pixels(colors: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Convert colors and weight of one image to bytes `[H * W, 4]`."""
     whole = np.dstack([colors * (weight > 0)[..., None], 255 * weight])
     return np.rint(whole).astype(np.uint8).reshape(-1, 4)
 
 
-def _halve(image, weight):
+def _halve(image: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Average 2 x 2 pixels of an image `[H, W, 3]` by their weights `[H, W]`."""
     height, width = weight.shape[0] // 2, weight.shape[1] // 2
+    image, weight = image[: 2 * height, : 2 * width], weight[: 2 * height, : 2 * width]
+    # The order of these sums is that of OpenCV's INTER_AREA, so that bytes round alike.
+    top_left, top_right, bottom_left, bottom_right = _corners(weight)
+    shares = ((top_left + top_right) + (bottom_left + bottom_right)) * np.float32(0.25)
+    top_left, top_right, bottom_left, bottom_right = _corners(image * weight[..., None])
+    colors = (((top_left + top_right) + bottom_left) + bottom_right) * np.float32(0.25)
+    return colors / np.maximum(shares, 1e-6)[..., None], shares
 
-    def mean(array):
-        array = np.ascontiguousarray(array[: 2 * height, : 2 * width])
-        return cv2.resize(array, (width, height), interpolation=cv2.INTER_AREA)
 
-    shares = mean(weight)
-    colors = mean(image * weight[..., None]) / np.maximum(shares, 1e-6)[..., None]
-    return colors, shares
+def _corners(array: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    return array[::2, ::2], array[::2, 1::2], array[1::2, ::2], array[1::2, 1::2]
 
 
-def fractional_level(wanted: jax.Array, coarseness: jax.Array) -> jax.Array:
-    """The fractional level `[N]` that is `wanted[N]` coarser than the finest of `[L]` levels.
+def fractional_level(coarser: jax.Array, coarseness: jax.Array) -> jax.Array:
+    """Return the fractional level `[N]` that is so much coarser than the finest of `[L]` levels.
 
     Args:
-      wanted: log2 of how much coarser.
-      coarseness: of the levels, from `Pyramid.coarseness`.
+      coarser: `[N]` log2 of how much coarser.
+      coarseness: `[L]` of the levels, from `Pyramid.coarseness`.
     """
-    level = jnp.zeros_like(wanted)
+    level = jnp.zeros_like(coarser)
     for before, after in itertools.pairwise(coarseness):
-        level += jnp.clip((wanted - before) / (after - before), 0, 1)
+        level += jnp.clip((coarser - before) / (after - before), 0, 1)
     return level
 
 
 def read_pyramid(
     pyramid: Pyramid, view: jax.Array | int, ray: jax.Array, level: jax.Array
 ) -> jax.Array:
-    """Values `[N, C]` of one view, linear between pixels and between levels.
+    """Read values `[N, C]` of one view, linearly between pixels and between levels.
 
     Args:
       pyramid: of all views.
@@ -185,7 +190,7 @@ def read_pyramid(
     finer = jnp.floor(jax.lax.stop_gradient(level)).astype(jnp.int32)
     share = (level - finer.astype(level.dtype))[:, None]
 
-    def read(index):
+    def read(index: jax.Array) -> jax.Array:
         index = jnp.minimum(index, len(pyramid.sizes) - 1)
         height, width = sizes[index, 0], sizes[index, 1]
         intrinsics = pyramid.intrinsics[view][index]
@@ -194,7 +199,7 @@ def read_pyramid(
         wx, wy = jnp.moveaxis(pixel - corner, -1, 0)
         x, y = jnp.moveaxis(jnp.clip(corner, -2.0, 2.0**20).astype(jnp.int32), -1, 0)
 
-        def tap(dx, dy):
+        def tap(dx: int, dy: int) -> jax.Array:
             row, column = jnp.clip(y + dy, 0, height - 1), jnp.clip(x + dx, 0, width - 1)
             return to_float(pyramid.values[view, starts[index] + row * width + column])
 

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxcloseup.geometry.cameras import Camera, points_to_pixels
@@ -126,16 +127,16 @@ def keep_photographs(scene: Scene, chosen: Sequence[int]) -> Scene:
         return jax.tree.map(lambda leaf: leaf[rows], views)
 
     def photographs_at(factor: int, split: str = "train") -> tuple[Views, list[tuple[int, int]]]:
+        assert scene.photographs_at is not None
         views, sizes = scene.photographs_at(factor, split)
         return (take(views), [sizes[i] for i in chosen]) if split == "train" else (views, sizes)
 
     train = take(scene.train)
     size = np.array([train.cameras.width, train.cameras.height], np.float32)
+    points = jnp.asarray(scene.points)
     times_seen = np.zeros(len(scene.points), int)
     for view in range(len(rows)):
-        pixels, depth = map(
-            np.asarray, points_to_pixels(camera_at(train.cameras, view), scene.points)
-        )
+        pixels, depth = map(np.asarray, points_to_pixels(camera_at(train.cameras, view), points))
         times_seen += np.all((pixels >= 0) & (pixels < size), axis=-1) & (depth > 0)
     return dataclasses.replace(
         scene,

@@ -21,7 +21,7 @@ class Support(NamedTuple):
         sharp as the render, 4 is four times coarser; infinity where no photograph saw it.
     """
 
-    count: jax.Array
+    count: jax.Array  # type: ignore[assignment]  # hides a method of tuples
     footprint: jax.Array
 
 
@@ -59,17 +59,19 @@ def find_support(
     """
     chex.assert_equal_shape_prefix([pixels, depth], depth.ndim)
     points = pixels_to_points(camera, pixels, depth)
-    own_side = safe_divide(depth, mean_focal(camera.intrinsics))
+    side = safe_divide(depth, mean_focal(camera.intrinsics))
 
-    def add_view(found, view):
+    def add_view(
+        support: Support, view: tuple[Camera, jax.Array, jax.Array]
+    ) -> tuple[Support, None]:
         source, view_depth, weight = view
         _, landed_depth, weight = sample_where_visible(
             source, view_depth, weight, points, tolerance
         )
         saw = (depth > 0) & (weight > 0)
-        footprint = safe_divide(landed_depth / mean_focal(source.intrinsics), own_side)
-        finest = jnp.where(saw, jnp.minimum(found.footprint, footprint), found.footprint)
-        return Support(found.count + saw.astype(jnp.int32), finest), None
+        footprint = safe_divide(landed_depth / mean_focal(source.intrinsics), side)
+        finest = jnp.where(saw, jnp.minimum(support.footprint, footprint), support.footprint)
+        return Support(support.count + saw.astype(jnp.int32), finest), None
 
     none = Support(jnp.zeros(depth.shape, jnp.int32), jnp.full(depth.shape, jnp.inf, depth.dtype))
     return jax.lax.scan(add_view, none, (views.cameras, depths, views.weight))[0]
@@ -84,7 +86,7 @@ def count_seen(
     *,
     tolerance: float = 0.02,
 ) -> jax.Array:
-    """The `count` of `find_support` alone, `[...]` int32."""
+    """Return the `count` of `find_support` alone, `[...]` int32."""
     return find_support(camera, pixels, depth, views, depths, tolerance=tolerance).count
 
 
@@ -93,7 +95,9 @@ def count_seen_points(
 ) -> jax.Array:
     """Count the photographs that saw each point `[..., 3]` of a surface, see `find_support`."""
 
-    def add_view(count, view):
+    def add_view(
+        count: jax.Array, view: tuple[Camera, jax.Array, jax.Array]
+    ) -> tuple[jax.Array, None]:
         source, depth, weight = view
         *_, weight = sample_where_visible(source, depth, weight, points, tolerance)
         return count + (weight > 0).astype(jnp.int32), None

@@ -3,6 +3,7 @@
 A window is a camera with a shifted principal point, so a field renders it as any image.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -46,7 +47,9 @@ class Windows:
 
 
 def photograph_windows(cameras: Camera, pyramid: Pyramid, *, whole_share: float) -> Windows:
-    """Windows of which a share is whole photographs of the coarsest level; other levels are alike.
+    """Make windows of which a share is whole photographs of the coarsest level.
+
+    The other levels are equally likely.
 
     Args:
       cameras: stacked cameras of the coarsest level.
@@ -59,7 +62,7 @@ def photograph_windows(cameras: Camera, pyramid: Pyramid, *, whole_share: float)
 
 
 def view_windows(views: Views, height: int, width: int) -> Windows:
-    """Windows of views that are at least as large, at their own size and at halves, drawn alike."""
+    """Make windows of larger views, at their own size and at halves, all equally likely."""
     pyramid = photograph_pyramid(views, least=(height, width))
     count = len(pyramid.sizes)
     cameras = views.cameras.replace(height=height, width=width)
@@ -77,7 +80,7 @@ def windows_that_see(
     count: int = 4096,
     tolerance: float = 0.05,
 ) -> Windows:
-    """The same photographs, with windows around what other cameras see; consumes `key`.
+    """Restrict windows to places around the surfaces that other cameras see; `key` is consumed.
 
     Pixels of these cameras are drawn uniformly, and for each one of the photographs that see its
     surface; a pixel that none sees draws a place in any photograph.
@@ -99,13 +102,15 @@ def windows_that_see(
     column, row = jnp.floor(pixels).astype(jnp.int32).T
     depth = depths[which, row, column]
 
-    def point(camera, pixel, depth):
+    def point(camera: jax.Array, pixel: jax.Array, depth: jax.Array) -> jax.Array:
         return pixels_to_points(camera_at(cameras, camera), pixel, depth)
 
     points = jax.vmap(point)(which, pixels, jnp.where(depth > 0, depth, 1))
 
-    def look(camera, own_depth, weight):
-        landed, _, weight = sample_where_visible(camera, own_depth, weight, points, tolerance)
+    def look(
+        camera: Camera, view_depth: jax.Array, weight: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        landed, _, weight = sample_where_visible(camera, view_depth, weight, points, tolerance)
         return landed, weight
 
     landed, seen = jax.vmap(look)(views.cameras, view_depths, views.weight)
@@ -116,7 +121,8 @@ def windows_that_see(
     size = jnp.array([views.cameras.width, views.cameras.height], jnp.float32)
     anywhere = jax.random.uniform(key_any, (count, 2))
     place = jnp.where(seen[chosen][:, None] > 0, landed[chosen] / size[None], anywhere)
-    return windows.replace(places=jnp.concatenate([view[:, None].astype(place.dtype), place], 1))
+    places = jnp.concatenate([view[:, None].astype(place.dtype), place], 1)
+    return dataclasses.replace(windows, places=places)
 
 
 def sample_window(key: jax.Array, windows: Windows) -> Batch:
@@ -127,24 +133,26 @@ def sample_window(key: jax.Array, windows: Windows) -> Batch:
     key_view, key_level, key_y, key_x = jax.random.split(key, 4)
     level = jax.random.categorical(key_level, jnp.log(windows.shares))
     sizes = jnp.asarray(windows.pyramid.sizes, jnp.int32)
-    own = jnp.array(windows.size, jnp.int32)
-    room = sizes[level] - own + 1
+    size = jnp.array(windows.size, jnp.int32)
+    room = sizes[level] - size + 1
     if windows.places is None:
         view = jax.random.randint(key_view, (), 0, len(windows))
         corner = jnp.stack(
             [jax.random.randint(key_y, (), 0, room[0]), jax.random.randint(key_x, (), 0, room[1])]
         )
     else:
-        view, center = _draw_place(key_view, windows, ())
+        view, center = _draw_place(key_view, windows.places, ())
         extent = sizes[level].astype(center.dtype)
-        corner = jnp.floor(center * extent - own.astype(center.dtype) / 2).astype(jnp.int32)
+        corner = jnp.floor(center * extent - size.astype(center.dtype) / 2).astype(jnp.int32)
         corner = jnp.clip(corner, 0, room - 1)
     return cut_window(windows, view, level, corner)
 
 
-def _draw_place(key, windows, shape):
-    """A view `[...]`, and y and x `[..., 2]` as shares of its height and width."""
-    place = windows.places[jax.random.randint(key, shape, 0, len(windows.places))]
+def _draw_place(
+    key: jax.Array, places: jax.Array, shape: tuple[int, ...]
+) -> tuple[jax.Array, jax.Array]:
+    """Draw a view `[...]`, and y and x `[..., 2]` as shares of its height and width."""
+    place = places[jax.random.randint(key, shape, 0, len(places))]
     return place[..., 0].astype(jnp.int32), place[..., :0:-1]
 
 
@@ -164,11 +172,11 @@ def sample_window_pixels(key: jax.Array, windows: Windows, count: int) -> Batch:
         y = jax.random.randint(key_y, (count,), 0, height)
         x = jax.random.randint(key_x, (count,), 0, width)
     else:
-        view, center = _draw_place(key_view, windows, (count,))
+        view, center = _draw_place(key_view, windows.places, (count,))
         within = jax.random.uniform(key_y, (count, 2)) - 0.5
         extent = sizes[level].astype(center.dtype)
-        own = jnp.array(windows.size, center.dtype)
-        pixel = jnp.floor(center * extent + within * own[None]).astype(jnp.int32)
+        size = jnp.array(windows.size, center.dtype)
+        pixel = jnp.floor(center * extent + within * size[None]).astype(jnp.int32)
         y, x = jnp.clip(pixel, 0, sizes[level] - 1).T
     values = to_float(pyramid.values[view, starts[level] + y * width + x])
     return Batch(
@@ -184,7 +192,7 @@ def sample_window_pixels(key: jax.Array, windows: Windows, count: int) -> Batch:
 def cut_window(
     windows: Windows, view: jax.Array | int, level: jax.Array | int, corner: jax.Array
 ) -> Batch:
-    """The window of one view at one level whose first pixel is in row and column `corner[2]`."""
+    """Cut the window of a view at a level whose first pixel is in row and column `corner[2]`."""
     pyramid = windows.pyramid
     height, width = windows.size
     sizes, starts = (jnp.asarray(x, jnp.int32) for x in (pyramid.sizes, pyramid.starts))
@@ -197,17 +205,17 @@ def cut_window(
 
 
 def in_quarters(render: Callable[[Camera], Any], camera: Camera) -> Any:
-    """What `render(camera)` gives, from four calls for a quarter of the image each.
+    """Compute `render(camera)` by four calls for a quarter of the image each.
 
     Args:
-      render: gives arrays `[H, W, ...]` of a camera's pixels.
+      render: returns arrays `[H, W, ...]` of a camera's pixels.
       camera: one camera.
     """
     height, width = -(-camera.height // 2), -(-camera.width // 2)
     corners = (0, 0), (width, 0), (0, height), (width, height)
-    parts = [crop_camera(camera, np.array(x), height=height, width=width) for x in corners]
+    parts = [crop_camera(camera, jnp.array(x), height=height, width=width) for x in corners]
 
-    def join(*images):
+    def join(*images: jax.Array) -> jax.Array:
         halves = (np.concatenate(pair, axis=1) for pair in (images[:2], images[2:]))
         return jnp.asarray(np.concatenate(list(halves))[: camera.height, : camera.width])
 

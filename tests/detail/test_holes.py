@@ -7,7 +7,7 @@ import pytest
 
 from jaxcloseup.detail.holes import fill_holes, find_empty
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
-from jaxcloseup.photos.gather import GatherSources
+from jaxcloseup.photos.depth_maps import GatherSources
 
 
 HEIGHT, WIDTH = 24, 40

@@ -10,7 +10,8 @@ import pytest
 import reference
 
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points
-from jaxcloseup.photos.gather import GatherSettings, gather, gather_parts, gather_sources
+from jaxcloseup.photos.depth_maps import gather_sources
+from jaxcloseup.photos.gather import GatherSettings, gather, gather_parts
 from jaxcloseup.photos.pyramids import Pyramid, photograph_pyramid
 from jaxcloseup.photos.views import camera_at
 

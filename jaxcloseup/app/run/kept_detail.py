@@ -25,7 +25,7 @@ from jaxcloseup.detail.weights import DetailWeights, known_weights
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.io.cache import Stored, cached
-from jaxcloseup.photos.gather import GatherSources, gather_sources
+from jaxcloseup.photos.depth_maps import GatherSources, gather_sources
 from jaxcloseup.photos.pyramids import Pyramid
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.views import Views

@@ -13,9 +13,9 @@ from jaxcloseup.artifacts.images import to_uint8
 from jaxcloseup.artifacts.mesh_files import Mesh, surface_mesh
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points
 from jaxcloseup.labels.rules import label_depth
+from jaxcloseup.photos.depth_maps import fuse, fuse_grid, prepare_depth_maps
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.support import count_seen
-from jaxcloseup.photos.tsdf import depth_maps, fuse, fuse_grid
 from jaxcloseup.photos.views import Views, camera_at
 from jaxcloseup.training.state import TrainState
 
@@ -28,7 +28,7 @@ _OUTSIDE = 0.005  # share of points beyond each side of the default region
 BYTES_PER_VOXEL = 24  # memory of fusing distances and of marching cubes
 
 _fuse_grid = jax.jit(fuse_grid, static_argnames="shape")
-_fuse, _depth_maps, _count_seen = jax.jit(fuse), jax.jit(depth_maps), jax.jit(count_seen)
+_fuse, _depth_maps, _count_seen = jax.jit(fuse), jax.jit(prepare_depth_maps), jax.jit(count_seen)
 
 
 class Maps(NamedTuple):

@@ -1,4 +1,6 @@
-"""Fusion of depth maps into truncated signed distances: the surface that many views agree on.
+"""Depth maps: which surfaces photographs see, and the one surface that many views agree on.
+
+Fusion makes truncated signed distances of depth maps.
 
 B. Curless and M. Levoy, "A Volumetric Method for Building Complex Models from Range Images", 1996:
 the weighted mean over views of a point's signed distance to the surface that each sees, positive
@@ -19,12 +21,26 @@ from jaxcloseup.geometry.masks import in_bounds
 from jaxcloseup.geometry.numerics import matmul, safe_divide
 from jaxcloseup.geometry.visibility import sphere_in_view
 from jaxcloseup.geometry.warp import backward_warp
-from jaxcloseup.photos.gather import gather_sources
 from jaxcloseup.photos.views import camera_at, to_float
 
 
 _BLOCK = 32  # voxels along each side of what is projected, or culled, as one
 _GRAZING = 0.05  # cosine below which a surface seen so flatly is placed no more precisely
+
+
+@struct.dataclass
+class GatherSources:
+    """Depth maps that confirm what photographs see, V views.
+
+    Attributes:
+      cameras: stacked cameras of the depth maps.
+      inverse_depth: `[V, H, W]` 1 / z-depth, 0 where undefined.
+      trust: `[V, H, W]` in [0, 1], 0 where the photograph does not count or its depth has an edge.
+    """
+
+    cameras: Camera
+    inverse_depth: jax.Array
+    trust: jax.Array
 
 
 @struct.dataclass
@@ -42,11 +58,11 @@ class DepthMaps:
 
 
 class Fused(NamedTuple):
-    """What views say of points `[...]`.
+    """The surface that views show, seen from points `[...]`.
 
     Attributes:
       distance: `[...]` mean signed distance to the surface in truncation distances, from -1 to 1,
-        positive before the surface; NaN where no view says anything.
+        positive before the surface; NaN where no view shows a surface.
       values: `[..., C]` mean of the values at the surface; 0 where no surface is within reach.
     """
 
@@ -54,7 +70,40 @@ class Fused(NamedTuple):
     values: jax.Array
 
 
-def depth_maps(cameras: Camera, depths: jax.Array, weight: jax.Array) -> DepthMaps:
+def gather_sources(
+    cameras: Camera, depths: jax.Array, weight: jax.Array, *, edge: float = 0.2
+) -> GatherSources:
+    """Prepare depth maps for `gather`, once for many views.
+
+    Inverse depth is linear over a plane, so its second difference, relative to the inverse depth
+    itself, shows the edges of a depth map and nothing else.
+
+    Args:
+      cameras: stacked cameras of the depth maps.
+      depths: `[V, H, W]` z-depths; 0 is undefined.
+      weight: `[V, H, W]` weights of the photographs in [0, 1].
+      edge: relative second difference at which a pixel, and its neighbors, have 1 / 4 of their
+        trust.
+    """
+    chex.assert_equal_shape([depths, weight])
+    inverse = safe_divide(jnp.ones_like(depths), depths)
+    bend = jnp.zeros_like(inverse)
+    for axis in (1, 2):
+        size = inverse.shape[axis]
+        if size > 2:
+            before, here, after = (
+                jax.lax.slice_in_dim(inverse, start, start + size - 2, axis=axis)
+                for start in (0, 1, 2)
+            )
+            inner = tuple(slice(1, -1) if i == axis else slice(None) for i in range(3))
+            bend = bend.at[inner].max(jnp.abs(before + after - 2 * here))
+    trust = weight / (1 + (safe_divide(bend, inverse) / edge) ** 2) ** 2
+    trust = jnp.where(depths > 0, trust, 0)
+    trust = jax.lax.reduce_window(trust, jnp.inf, jax.lax.min, (1, 3, 3), (1, 1, 1), "SAME")
+    return GatherSources(cameras, inverse, trust)
+
+
+def prepare_depth_maps(cameras: Camera, depths: jax.Array, weight: jax.Array) -> DepthMaps:
     """Prepare depth maps for fusion.
 
     In a view, inverse depth is linear over a plane n . x = d: 1 / z = (n_x x' + n_y y' + n_z) / d
@@ -69,7 +118,7 @@ def depth_maps(cameras: Camera, depths: jax.Array, weight: jax.Array) -> DepthMa
     chex.assert_equal_shape([depths, weight])
     sources = gather_sources(cameras, depths, weight)
 
-    def tangents(camera, inverse):
+    def tangents(camera: Camera, inverse: jax.Array) -> tuple[jax.Array, jax.Array]:
         center, focal = camera.intrinsics[2:], camera.intrinsics[:2]
         ray = (pixel_grid(*inverse.shape) - center[None, None]) / focal[None, None]
         down, right = jnp.gradient(inverse)
@@ -78,7 +127,8 @@ def depth_maps(cameras: Camera, depths: jax.Array, weight: jax.Array) -> DepthMa
         plane = safe_divide(jnp.ones_like(inverse), jnp.sqrt(x * x + y * y + z * z))
         length = jnp.sqrt(1 + jnp.sum(ray * ray, axis=-1))
         cosine = jnp.clip(plane * inverse / length, _GRAZING, 1)
-        return jnp.maximum(plane, _GRAZING * length * safe_divide(1.0, inverse)), cosine
+        depth = safe_divide(jnp.ones_like(inverse), inverse)
+        return jnp.maximum(plane, _GRAZING * length * depth), cosine
 
     plane, cosine = jax.vmap(tangents)(cameras, sources.inverse_depth)
     values = jnp.stack([sources.inverse_depth, plane, sources.trust * cosine], axis=-1)
@@ -88,10 +138,11 @@ def depth_maps(cameras: Camera, depths: jax.Array, weight: jax.Array) -> DepthMa
 def fuse(
     points: jax.Array, maps: DepthMaps, truncation: jax.Array | float, values: jax.Array
 ) -> Fused:
-    """Fuse what views say of points.
+    """Fuse the surfaces that views show, at points.
 
     Args:
-      points: `[N, 3]` in world units; neighbors in the list had better be neighbors in the world.
+      points: `[N, 3]` in world units; neighbors in the list should be neighbors in the world,
+        because neighbors in the list are culled together.
       maps: of V views.
       truncation: largest distance that counts, world units.
       values: `[V, H, W, C]`, such as colors, uint8 or float. A point gets the mean over the views
@@ -112,7 +163,7 @@ def fuse_grid(
     maps: DepthMaps,
     truncation: jax.Array | float,
 ) -> jax.Array:
-    """Distances `[X, Y, Z]` of `fuse` at the points of a grid, block by block.
+    """Compute distances `[X, Y, Z]` as `fuse` does, at the points of a grid, block by block.
 
     Args:
       corner: `[3]` the grid's first point; the others are at larger coordinates.
@@ -122,30 +173,32 @@ def fuse_grid(
       truncation: largest distance that counts, world units.
 
     Returns:
-      Distances in truncation distances; NaN where no view says anything. Beside them, memory holds
-      what one block needs.
+      Distances in truncation distances; NaN where no view shows a surface. Apart from them, memory
+      holds only what one block needs.
     """
     blocks = [-(-side // _BLOCK) for side in shape]
     steps = jnp.stack(jnp.meshgrid(*3 * [jnp.arange(_BLOCK)], indexing="ij"), -1).reshape(-1, 3)
     nothing = jnp.zeros((*maps.values.shape[:3], 0), jnp.uint8)
 
-    def one(block):
+    def distances(block: jax.Array) -> jax.Array:
         first = _BLOCK * jnp.stack(jnp.unravel_index(block, blocks))
         points = corner[None] + voxel * (first[None] + steps).astype(corner.dtype)
         return _fuse_block(points, maps, truncation, nothing).distance
 
-    found = jax.lax.map(one, jnp.arange(blocks[0] * blocks[1] * blocks[2]))
+    found = jax.lax.map(distances, jnp.arange(blocks[0] * blocks[1] * blocks[2]))
     found = found.reshape(*blocks, *3 * [_BLOCK]).transpose(0, 3, 1, 4, 2, 5)
     found = found.reshape(*(_BLOCK * count for count in blocks))
     return found[: shape[0], : shape[1], : shape[2]]
 
 
-def _fuse_block(points, maps, truncation, values):
-    """`fuse` of points that are visited together."""
+def _fuse_block(
+    points: jax.Array, maps: DepthMaps, truncation: jax.Array | float, values: jax.Array
+) -> Fused:
+    """Fuse points that are culled together; see `fuse`."""
     center = jnp.mean(points, axis=0)
     radius = jnp.max(jnp.linalg.norm(points - center[None], axis=-1))
 
-    def add(sums, view):
+    def add(sums: _Sums, view: jax.Array) -> tuple[_Sums, None]:
         camera = camera_at(maps.cameras, view)
         visible = sphere_in_view(camera, matmul(center - camera.position, camera.rotation), radius)
         return jax.lax.cond(
@@ -156,29 +209,52 @@ def _fuse_block(points, maps, truncation, values):
 
     none = jnp.zeros(len(points), points.dtype)
     nothing = jnp.zeros((len(points), values.shape[-1]), points.dtype)
-    views = jnp.arange(len(maps.values))
-    (distance, weight, near, read), _ = jax.lax.scan(add, (none, none, none, nothing), views)
+    start = _Sums(none, none, none, nothing)
+    sums, _ = jax.lax.scan(add, start, jnp.arange(len(maps.values)))
     return Fused(
-        safe_divide(distance, weight, fill=jnp.nan),
-        read / jnp.where(near > 0, near, 1)[:, None],
+        safe_divide(sums.distance, sums.weight, fill=jnp.nan),
+        sums.values / jnp.where(sums.near > 0, sums.near, 1)[:, None],
     )
 
 
-def _add_view(sums, points, maps, truncation, values, view):
-    distance, total, near, read = sums
+class _Sums(NamedTuple):
+    """Sums over views at points `[N]`.
+
+    Attributes:
+      distance: `[N]` weighted distances.
+      weight: `[N]` weights of the distances.
+      near: `[N]` weights of the values, which fall with the distance from the surface.
+      values: `[N, C]` weighted values.
+    """
+
+    distance: jax.Array
+    weight: jax.Array
+    near: jax.Array
+    values: jax.Array
+
+
+def _add_view(
+    sums: _Sums,
+    points: jax.Array,
+    maps: DepthMaps,
+    truncation: jax.Array | float,
+    values: jax.Array,
+    view: jax.Array,
+) -> _Sums:
     camera = camera_at(maps.cameras, view)
     landed, depth = points_to_pixels(camera, points)
     inverse, plane, weight = jnp.moveaxis(backward_warp(maps.values[view], landed), -1, 0)
     # With n . x = d for the plane and z for the point: (d - n . x) / |n| = (1 - z / depth) d / |n|.
     ahead = 1 - depth * inverse
-    own = ahead * plane / truncation
+    distance = ahead * plane / truncation
     # The image ends at the centers of its outermost pixels, beyond which nothing is interpolated.
     inside = in_bounds(landed - 0.5, camera.height - 1, camera.width - 1)
     reached = ahead >= -truncation * inverse
     weight = jnp.where(inside & (depth > 0) & reached, weight, 0)
-    own = jnp.clip(own, -1, 1)
-    share = weight * (1 - own * own) ** 2
+    distance = jnp.clip(distance, -1, 1)
+    share = weight * (1 - distance * distance) ** 2
+    near, shown = sums.near, sums.values
     if values.shape[-1]:
-        shown = backward_warp(to_float(values[view]), landed)
-        near, read = near + share, read + share[:, None] * shown
-    return distance + weight * own, total + weight, near, read
+        read = backward_warp(to_float(values[view]), landed)
+        near, shown = near + share, shown + share[:, None] * read
+    return _Sums(sums.distance + weight * distance, sums.weight + weight, near, shown)

@@ -21,8 +21,8 @@ from jaxcloseup.app.view import surface
 from jaxcloseup.artifacts.mesh_files import Mesh, surface_mesh, write_mesh
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_rays
 from jaxcloseup.io.ply import read_vertices
+from jaxcloseup.photos.depth_maps import fuse, fuse_grid, prepare_depth_maps
 from jaxcloseup.photos.scene import Surface
-from jaxcloseup.photos.tsdf import depth_maps, fuse, fuse_grid
 from jaxcloseup.photos.views import camera_at
 
 
@@ -53,7 +53,7 @@ def ray_of(camera, pixels):
 def test_distances_to_a_plane_are_exact_from_any_angle(views):
     shots, depths = views
     points = np.random.default_rng(0).uniform([-2, -2, -0.6], [2, 2, 0.6], (500, 3))
-    maps = depth_maps(shots.cameras, depths, shots.weight)
+    maps = prepare_depth_maps(shots.cameras, depths, shots.weight)
     found = fuse_points(jnp.asarray(points, jnp.float32), maps, 0.4, shots.rgb)
     seen, sure = np.zeros(500, bool), np.ones(500, bool)
     for i in range(len(shots)):
@@ -81,7 +81,7 @@ def test_views_that_disagree_are_weighed_by_the_cosine(views):
     weight = shots.weight.at[0].set(0.5).at[2].set(0)
     # The second view sees a surface that is 0.1 nearer, which is again a plane: z = 0.1.
     depths = depths.at[1].add(-0.1)
-    maps = depth_maps(shots.cameras, depths, weight)
+    maps = prepare_depth_maps(shots.cameras, depths, weight)
     point = np.array([[-0.3, 0.2, 0.05]])
     found = fuse_points(jnp.asarray(point, jnp.float32), maps, 0.4, shots.rgb)
     cosines = []
@@ -119,7 +119,7 @@ def ball():
 
 def test_the_mesh_of_a_sphere_is_closed_and_lies_on_it(ball):
     cameras, depths = ball
-    maps = depth_maps(cameras, depths, jnp.ones_like(depths))
+    maps = prepare_depth_maps(cameras, depths, jnp.ones_like(depths))
     voxel, corner = 0.07, jnp.full(3, -1.22)
     distance = fuse_on_grid(corner, voxel, (35, 36, 37), maps, 4 * voxel)
     assert distance.shape == (35, 36, 37)
