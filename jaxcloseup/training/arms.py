@@ -78,11 +78,8 @@ def run_arms(
       The next states `[A, ...]`, and the means of each arm's metrics, `[A]`.
     """
     of_states, of_views, of_sources, of_settings = arm_axes(states, sources)
-    step_all = jax.vmap(
-        step,
-        in_axes=(of_states, of_views, of_sources, of_settings),
-        out_axes=(of_states, 0),
-    )
+    in_axes = of_states, of_views, of_sources, of_settings
+    step_all = jax.vmap(step, in_axes=in_axes, out_axes=(of_states, 0))
 
     def run(
         states: TrainState,

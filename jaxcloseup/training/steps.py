@@ -24,7 +24,7 @@ from jaxcloseup.training.config import TrainConfig
 from jaxcloseup.training.loss import Loss, rendered_loss
 from jaxcloseup.training.parallel import Spread, in_a_loop
 from jaxcloseup.training.sampling import DrawKeys, sample_batch, sample_closeup, sample_labels
-from jaxcloseup.training.state import Metrics, TrainState, update_state
+from jaxcloseup.training.state import DrawLoss, Metrics, TrainState, update_state
 
 
 def train_step(
@@ -126,6 +126,20 @@ def closeup_step(
       The next state, and metrics with `label_coverage`, the share of labeled virtual pixels; unless
       the rule pools both losses, also the field's metrics of the labeled pixels as `label_<name>`.
     """
+    return update_state(
+        state,
+        _closeup_loss(field, config, sequential=sequential),
+        (views, sources, settings),
+        field=field,
+        optimizer=optimizer,
+        draws=config.num_windows,
+        spread=spread,
+        lr_scale=settings.lr_scale,
+    )
+
+
+def _closeup_loss(field: RadianceField, config: TrainConfig, *, sequential: bool) -> DrawLoss:
+    """Return the loss of one draw of `closeup_step`."""
     rule, whole = LABEL_RULES[config.label_rule], config.num_label_rays is None
     loss_of = _bind_loss(field, sequential=sequential)
     render = _render_pixels(field, sequential=sequential and not whole)
@@ -157,16 +171,7 @@ def closeup_step(
         )
         return value, metrics | {"label_coverage": jnp.mean(label.weight)}
 
-    return update_state(
-        state,
-        loss,
-        (views, sources, settings),
-        field=field,
-        optimizer=optimizer,
-        draws=config.num_windows,
-        spread=spread,
-        lr_scale=settings.lr_scale,
-    )
+    return loss
 
 
 def labeled_step(

@@ -13,7 +13,7 @@ from jaxcloseup.app.cli import sweep as program
 from jaxcloseup.app.run import manifest
 from jaxcloseup.app.run.manifest import about_scene, git_commit, hash_data
 from jaxcloseup.app.sweep import scene_sweeps
-from jaxcloseup.app.sweep.arm_training import SweepOutcome
+from jaxcloseup.app.sweep.arm_scoring import SweepOutcome
 from jaxcloseup.captures.load import load_scene
 
 

@@ -4,13 +4,11 @@ import dataclasses
 import functools
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from jaxcloseup.app import progress
 from jaxcloseup.app.methods.method import Preset
 from jaxcloseup.app.run.fine_tuning import prepare_target_views
 from jaxcloseup.app.run.kept_detail import GetDetail, detail_getter
@@ -20,12 +18,11 @@ from jaxcloseup.app.run.logs import TrainLog
 from jaxcloseup.app.run.loop import Training, TrainingError, train_stage
 from jaxcloseup.app.run.manifest import identity_of
 from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.run.scoring import HeldOut, hold_out
+from jaxcloseup.app.run.scoring import hold_out
 from jaxcloseup.app.run.states import say_which_points_fit, train_baseline
 from jaxcloseup.app.run.step_data import ArmsData, LabeledData
-from jaxcloseup.app.score.metrics_text import SPLIT_TITLES
-from jaxcloseup.app.score.scores import NO_PERCEPTUAL, Perceptual, evaluate
-from jaxcloseup.app.score.targets import Target
+from jaxcloseup.app.score.scores import NO_PERCEPTUAL, Perceptual
+from jaxcloseup.app.sweep.arm_scoring import ArmScorer, SweepOutcome
 from jaxcloseup.app.sweep.arms import Arm, describe, make_arm, why_not
 from jaxcloseup.app.sweep.ceilings import labels_with_better_depth, true_close_ups
 from jaxcloseup.artifacts.checkpoints import Checkpoints
@@ -35,23 +32,6 @@ from jaxcloseup.photos.views import Views
 from jaxcloseup.photos.windows import Windows
 from jaxcloseup.training.arms import arm_state, stack_arms, stack_states
 from jaxcloseup.training.state import TrainState
-
-
-SHOWN = 2  # views of a split
-
-
-class SweepOutcome(NamedTuple):
-    """The results of a sweep on one scene.
-
-    Attributes:
-      scores: for each arm, then seed, `skipped` steps and the metrics of each split in `splits`.
-      shown: the first held-out views of each split.
-      images: the first seed's renders of these, by arm and split, then by name.
-    """
-
-    scores: dict[str, dict[str, Any]]
-    shown: dict[str, Sequence[Target]]
-    images: dict[tuple[str, str], dict[str, np.ndarray]]
 
 
 def run_sweep(
@@ -154,44 +134,6 @@ class Starts:
                 expected_depth=expected_depth,
             )
         return self._starts[seed, expected_depth]
-
-
-class ArmScorer:
-    """Scores arms on the held-out views.
-
-    Attributes:
-      programs: what is compiled.
-      held_out: the views.
-      scores: see `SweepOutcome`.
-    """
-
-    def __init__(
-        self, programs: Programs, held_out: HeldOut, arms: Sequence[Arm], perceptual: Perceptual
-    ) -> None:
-        """Score nothing yet."""
-        self.programs, self.held_out, self._perceptual = programs, held_out, perceptual
-        targets = held_out.targets
-        self._shown = {split: targets[split][:SHOWN] for split in SPLIT_TITLES if split in targets}
-        self.scores: dict[str, dict[str, Any]] = {arm.name: {} for arm in arms}
-        self._images: dict[tuple[str, str], dict[str, np.ndarray]] = {}
-
-    def score(self, arm: str, seed: int, state: TrainState, skipped: int) -> None:
-        """Render and score one arm of one seed."""
-        render, splits = functools.partial(self.programs.render, state), {}
-        with progress.part(f"{arm}_{seed}_evaluation"):
-            for split, targets in self.held_out.all.items():
-                splits[split], seen = evaluate(render, targets, self._perceptual)
-                if seed == 0 and split in self._shown:
-                    self._images[arm, split] = {
-                        view.name: np.asarray(seen[view.name].rgb) for view in self._shown[split]
-                    }
-        self.scores[arm][str(seed)] = {"skipped": skipped, "splits": splits}
-
-    def outcome(self) -> SweepOutcome:
-        """Return all scores, with arms in the order in which the user named them."""
-        order = {arm: i for i, arm in enumerate(self.scores)}
-        pairs = sorted(self._images.items(), key=lambda pair: order[pair[0][0]])
-        return SweepOutcome(self.scores, self._shown, dict(pairs))
 
 
 def train_together(
