@@ -33,7 +33,7 @@ from jaxcloseup.labels.config import pseudo_settings
         ("mask+", "is neither an arm"),
         ("baseline+lr_scale=2", "baseline has no fine-tuning"),
         ("oracle+depth_error=0.5", "oracle takes no other depth"),
-        ("mask+label=residual", "mask has labels of its own"),
+        ("mask+label=residual", "mask has one kind of labels"),
         ("label=residual+depth_error=0.5", r"label=residual has its own depth: add \+label=warp"),
         ("test_time+label=exact", "label must be warp or residual"),
     ],

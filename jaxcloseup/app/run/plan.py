@@ -30,7 +30,7 @@ _WORDS = {
 
 
 def plan_run(preset: Preset, scene: Scene, to_run: Sequence[str]) -> dict[str, float]:
-    """Typical seconds of the parts of a run by name, in order.
+    """Return typical seconds of the parts of a run by name, in order.
 
     Args:
       preset: how the scene is trained.
@@ -66,7 +66,7 @@ def plan_run(preset: Preset, scene: Scene, to_run: Sequence[str]) -> dict[str, f
 
 
 def in_words(part: str) -> str:
-    """What a part of a run does."""
+    """Return in words what a part of a run does."""
     if part.endswith("_evaluation"):
         return f"scoring {part.removesuffix('_evaluation')}"
     if part.endswith("_labels"):

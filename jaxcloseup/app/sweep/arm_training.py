@@ -86,7 +86,7 @@ def run_sweep(
 
 
 def choose_arms(names: Sequence[str], preset: Preset, scene: Scene) -> list[Arm]:
-    """The arms that a scene can have; prints why it cannot have others."""
+    """Return the arms that a scene can have, and print why it cannot have others."""
     arms = [make_arm(name, preset) for name in names]
     for arm in arms:
         if why_not(arm, scene):
@@ -97,7 +97,7 @@ def choose_arms(names: Sequence[str], preset: Preset, scene: Scene) -> list[Arm]
 def order_arms(
     arms: Sequence[Arm], seeds: int
 ) -> tuple[list[tuple[Arm, int]], list[tuple[Arm, int]]]:
-    """Pairs of arm and seed that train together, and those that train in turn."""
+    """Return pairs of arm and seed: first those that train together, then those in turn."""
     pairs = [(arm, seed) for arm in arms for seed in range(seeds)]
     together = [pair for pair in pairs if not pair[0].in_turn and pair[0].kind != "baseline"]
     # Side by side, arms that look from the same places share their forward warps.

@@ -49,7 +49,7 @@ class Arm(NamedTuple):
 
     @property
     def in_turn(self) -> bool:
-        """Whether it trains alone, on views that are labeled before its first step."""
+        """True if it trains alone, on views that are labeled before its first step."""
         by_detail = self.labels.label == "residual"
         return self.kind in ARMS_IN_TURN or self.depth_error is not None or by_detail
 
@@ -62,7 +62,7 @@ class Arm(NamedTuple):
 
 
 def make_arm(name: str, preset: Preset) -> Arm:
-    """An arm by its name: the preset's settings of labels, changed as the name says.
+    """Return an arm by its name: the preset's settings of labels, changed as the name says.
 
     The name is one of `KINDS`, settings with values as in `lr_scale=2+magnification=2:4`, or a kind
     and then settings, joined by plus signs.
@@ -94,17 +94,22 @@ def make_arm(name: str, preset: Preset) -> Arm:
         depth_error is not None or labels.expected_depth != of_kind.labels.expected_depth
     )
     if kind in ARMS_IN_TURN and changes_depth:
-        raise ValueError(f"--arms={name}: {kind} takes no other depth than its own")
+        raise ValueError(
+            f"--arms={name}: {kind} labels from its own depth: leave out expected_depth and depth_error"
+        )
     if labels.label == "residual" and changes_depth:
         raise ValueError(f"--arms={name}: label=residual has its own depth: add +label=warp")
     if labels.label != of_kind.labels.label and kind not in ("diverse", "test_time"):
-        raise ValueError(f"--arms={name}: {kind} has labels of its own: change label of others")
+        raise ValueError(
+            f"--arms={name}: {kind} has its own kind of labels: change label in diverse or test_time"
+        )
     if None not in (labels.expected_depth, depth_error):
         raise ValueError(f"--arms={name}: expected_depth and depth_error do not go together")
     return Arm(name, kind, labels, depth_error)
 
 
 def _depth_error(name: str, texts: list[str]) -> float | None:
+    """Return the share of the depth's error in `depth_error=share`; None without such a text."""
     if not texts:
         return None
     try:
@@ -119,7 +124,7 @@ def _depth_error(name: str, texts: list[str]) -> float | None:
 
 
 def why_not(arm: Arm, scene: Scene) -> str | None:
-    """Why a scene cannot have an arm, or None."""
+    """Return why a scene cannot have an arm, or None."""
     if scene.surface is None and arm.kind in ("oracle", "resolved"):
         return "the true pixels of its close-ups are not known"
     if scene.surface is None and arm.depth_error is not None:
@@ -130,5 +135,5 @@ def why_not(arm: Arm, scene: Scene) -> str | None:
 
 
 def describe(arms: list[Arm]) -> dict[str, Any]:
-    """Arms by name as JSON can hold them, for a sweep's identity."""
+    """Return arms by name as JSON can hold them, for a sweep's identity."""
     return {arm.name: str({**vars(arm.labels), "depth_error": arm.depth_error}) for arm in arms}
