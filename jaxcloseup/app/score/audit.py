@@ -5,6 +5,7 @@ with the true close-up, blurred to the footprint of the source's pixels. On all 
 photographs are left out one by one, labeled from the others, and compared with their labels.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -262,7 +263,7 @@ def _left_out(
         camera = camera_at(views.cameras, index)
         seen = render(camera)
         depth = label_depth(seen)
-        others = views.replace(weight=views.weight.at[index].set(0))
+        others = dataclasses.replace(views, weight=views.weight.at[index].set(0))
         source = jax.jit(best_source)(camera, others, depths, depth=depth)
         pixels = pixel_grid(camera.height, camera.width)
         without = jax.jit(label_sources)(others, depths)
