@@ -11,6 +11,6 @@ __all__, __getattr__, __dir__ = lazy_names(
         "json_fields": "number read_object rigid_transform",
         "load": "load_scene",
         "photo_files": "read_image read_mask",
-        "photo_reading": "Reading",
+        "photo": "Reading",
     },
 )

@@ -12,11 +12,12 @@ import numpy as np
 from jaxcloseup.captures.depth_range import near_far_from_cameras, near_far_from_points
 from jaxcloseup.captures.formats import Listing, read_listing
 from jaxcloseup.captures.json_fields import affine_transform, number
+from jaxcloseup.captures.names import unique_names
+from jaxcloseup.captures.photo import Photo, Reading
 from jaxcloseup.captures.photo_checks import check_sizes, check_weights
 from jaxcloseup.captures.photo_files import pad_images, read_image
-from jaxcloseup.captures.photo_reading import Photo, Reading, read_photos
+from jaxcloseup.captures.photo_reading import read_photos
 from jaxcloseup.captures.scale import LENGTH, check_positions
-from jaxcloseup.captures.splits import unique_names
 from jaxcloseup.captures.triangulation import Triangulated, triangulate
 from jaxcloseup.captures.world_frames import Frame
 from jaxcloseup.geometry.cameras import Camera

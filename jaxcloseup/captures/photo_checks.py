@@ -4,7 +4,7 @@ import pathlib
 import warnings
 from collections.abc import Mapping, Sequence
 
-from jaxcloseup.captures.photo_reading import Photo, Reading
+from jaxcloseup.captures.photo import Photo, Reading
 from jaxcloseup.captures.world_frames import Frame
 from jaxcloseup.photos.scene import ImageSizeWarning, SceneError
 

@@ -10,6 +10,7 @@ import functools
 import pathlib
 from collections.abc import Iterator, Sequence
 
+from jaxcloseup.captures.photo_files import ENDINGS
 from jaxcloseup.captures.world_frames import Frame
 from jaxcloseup.photos.scene import SceneError
 
@@ -18,12 +19,11 @@ FOLDER = "masks"
 # The full name comes first, because it tells the masks of a.jpg and a.png apart.
 _BESIDE = ("{name}", "{stem}.mask")
 _IN_FOLDER = (*_BESIDE, "{stem}")
-_PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 
 
 def is_picture(path: pathlib.Path) -> bool:
     """Whether a file has an image's name; hidden files such as macOS's `._a.jpg` do not."""
-    return path.suffix.lower() in _PICTURES and not path.name.startswith(".")
+    return path.suffix.lower() in ENDINGS and not path.name.startswith(".")
 
 
 def list_photographs(folder: pathlib.Path) -> list[pathlib.Path]:

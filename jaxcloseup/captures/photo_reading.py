@@ -8,14 +8,13 @@ import os
 import pathlib
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from jaxcloseup.captures.distortion import Remap, undistort, undistortion_map
+from jaxcloseup.captures.photo import Photo, Reading, resized_intrinsics
 from jaxcloseup.captures.photo_files import downscale_image, read_file, read_image, read_mask
-from jaxcloseup.captures.scale import check_lens
 from jaxcloseup.captures.world_frames import Frame, frame_intrinsics
 from jaxcloseup.io.cache import Stored, cache_path, cached, content_hash, hash_files
 from jaxcloseup.io.memory import installed_memory
@@ -23,62 +22,10 @@ from jaxcloseup.photos.scene import SceneError
 
 
 _MAX_CONCURRENT = 4  # each needs a few times its own size: 12 megapixels take about 100 MB
-_SOURCES = ("photo_reading.py", "photo_files.py", "distortion.py")
+_SOURCES = ("photo.py", "photo_reading.py", "photo_files.py", "distortion.py")
 _BYTES_PER_PIXEL = 12  # peak of what stays: as read, padded, and weights in float32
 
 _log = logging.getLogger(__name__)
-
-
-class Reading(NamedTuple):
-    """How to read photographs; `load_scene` documents the options.
-
-    Attributes:
-      downscale: positive integer factor by which to shrink photographs, by averaging areas.
-      zoom: further such factor; if not 1, the `test` frames become crops of training photographs
-        that skip this factor.
-      background: gray level in [0, 1] behind transparent pixels.
-      half_pixel: whether the files put pixel centers at integers.
-      alpha_mode: one of `ALPHA_MODES`; transparent pixels show the background or weigh less.
-      invert_masks: whether masks mark ignored pixels in white.
-    """
-
-    downscale: int = 1
-    zoom: int = 1
-    background: float = 1.0
-    half_pixel: bool = False
-    alpha_mode: str = "blend"
-    invert_masks: bool = False
-
-
-class Photo(NamedTuple):
-    """A photograph after downscaling, or a crop of it.
-
-    Attributes:
-      frame: frame that was read.
-      rgb: `[H, W, 3]` uint8 colors.
-      mask: `[H, W]` uint8 weights, 255 where the pixel counts fully.
-      stored_size: (width, height) of the file's image.
-      scaled: (width, height) of the whole photograph at this scale, before trimming; may be
-        fractional.
-      corner: (x, y) of the crop's first pixel in the whole photograph at this scale.
-    """
-
-    frame: Frame
-    rgb: np.ndarray
-    mask: np.ndarray
-    stored_size: tuple[int, int]
-    scaled: tuple[float, float]
-    corner: tuple[int, int] = (0, 0)
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height in pixels."""
-        return self.rgb.shape[1], self.rgb.shape[0]
-
-    def intrinsics(self, half_pixel: bool) -> np.ndarray:
-        """Compute fx, fy, cx, cy `[4]` in pixels; `half_pixel` as in `Reading`."""
-        whole = _resized_intrinsics(self.frame, self.stored_size, self.scaled, half_pixel)
-        return whole - np.array([0, 0, *self.corner])
 
 
 def read_photos(splits: Mapping[str, Sequence[Frame]], reading: Reading) -> dict[str, list[Photo]]:
@@ -123,20 +70,6 @@ def _check_memory(photo: Photo, count: int, reading: Reading) -> None:
             f"{needed / 2**30:.1f} GiB, but this computer has {held / 2**30:.1f}: choose a "
             f"downscale of at least {smallest}."
         )
-
-
-def _resized_intrinsics(
-    frame: Frame, stored: tuple[int, int], wanted: tuple[float, float], half_pixel: bool
-) -> np.ndarray:
-    """Compute fx, fy, cx, cy for the photograph of size `stored` resized to `wanted`.
-
-    Raises:
-      SceneError: no lens of such a photograph has these intrinsics.
-    """
-    size = frame.size or stored
-    intrinsics = frame_intrinsics(frame, *size, half_pixel=half_pixel)
-    check_lens(frame.label, intrinsics, *size)
-    return intrinsics * np.tile(np.divide(wanted, size), 2)
 
 
 def _one_at_a_time(function: Callable[..., Remap]) -> Callable[..., Remap]:
@@ -241,7 +174,7 @@ def _make_photo(
                 f"{width} x {height}: give both the same size."
             )
     if frame.distortion:
-        intrinsics = _resized_intrinsics(frame, stored, stored, reading.half_pixel)
+        intrinsics = resized_intrinsics(frame, stored, stored, reading.half_pixel)
         remap = find_remap(frame.distortion, tuple(intrinsics.tolist()), width, height)
         if not remap.inside.any():
             raise SceneError(

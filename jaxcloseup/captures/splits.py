@@ -1,7 +1,6 @@
 """Split the photographs of a capture into training and held-out ones."""
 
 import collections
-import hashlib
 import pathlib
 import warnings
 from collections.abc import Callable, Sequence
@@ -10,16 +9,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxcloseup.captures.depth_range import depths_in_view
-from jaxcloseup.captures.json_fields import read_json
+from jaxcloseup.captures.json_fields import read_object
 from jaxcloseup.captures.photo_files import read_image
 from jaxcloseup.captures.world_frames import Frame, frame_intrinsics
-from jaxcloseup.io.messages import is_control
 from jaxcloseup.photos.scene import DuplicateFileWarning, SceneError, UnknownKeyWarning
 
 
 TEST_EVERY = 8
 CLOSEST_SHARE = 0.1
-_LONGEST_NAME = 120  # bytes; files of renders add to it, and may have 255
 _LISTS = {"train": "train_filenames", "test": "test_filenames", "test_far": "val_filenames"}
 _SPLIT_FILE_KEYS = {"train", "test", "test_far", "unused"}
 
@@ -67,16 +64,7 @@ def splits_from_file(
     file = folder / "split.json"
     if not file.is_file():
         return None
-    try:
-        fields = read_json(file)
-    except (OSError, ValueError, RecursionError) as error:
-        raise SceneError(
-            f"{file} is not readable as JSON ({error}): correct or remove it."
-        ) from error
-    if not isinstance(fields, dict):
-        raise SceneError(
-            f"{file} is not an object with lists train and test: correct or remove it."
-        )
+    fields = read_object(file, "lists train and test")
     if unknown := sorted(set(fields) - _SPLIT_FILE_KEYS):
         warnings.warn(
             f"{file}: these fields are ignored: {', '.join(unknown)}.",
@@ -151,33 +139,6 @@ def spread(name: str, total: int, count: int | None) -> list[int]:
     if count > total:
         raise SceneError(f"{name} has {total} training photographs: ask for fewer than {count}.")
     return [(2 * i + 1) * total // (2 * count) for i in range(count)]
-
-
-def unique_names(files: Sequence[pathlib.Path]) -> list[str]:
-    """Name each file by its stem; prefix the folder's name, then number, where names clash.
-
-    Names are of printable characters, and longer ones than `_LONGEST_NAME` end in a hash.
-    """
-    stems = collections.Counter(file.stem for file in files)
-    names: dict[str, None] = {}
-    repeats: dict[str, int] = {}  # the last number of each name
-    for file in files:
-        stem = file.stem
-        name = base = _name(stem if stems[stem] == 1 else f"{file.parent.name}_{stem}")
-        while name in names:
-            repeats[base] = repeats.get(base, 1) + 1
-            name = f"{base}_{repeats[base]}"
-        names[name] = None
-    return list(names)
-
-
-def _name(text: str) -> str:
-    plain = "".join("_" if is_control(character) else character for character in text)
-    data = plain.encode()
-    if len(data) <= _LONGEST_NAME:
-        return plain
-    digest = hashlib.sha256(data).hexdigest()[:8]
-    return f"{data[: _LONGEST_NAME - 9].decode(errors='ignore')}_{digest}"
 
 
 def warn_duplicates(folder: pathlib.Path, splits: dict[str, list[Frame]]) -> None:

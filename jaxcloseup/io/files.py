@@ -18,7 +18,7 @@ LARGEST = 2**30  # bytes
 
 
 def cache_folder() -> pathlib.Path:
-    """The user's folder for files that a program can make again."""
+    """Return the user's folder for files that a program can make again."""
     # Unlike `Path.home`, `expanduser` does not fail for a user without a home folder.
     return pathlib.Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
 
@@ -57,12 +57,12 @@ def read_object(path: str | pathlib.Path) -> dict[str, Any]:
       ValueError: it holds no object; the message says what is wrong.
     """
     try:
-        found = json.loads(read_bytes(path))
+        value = json.loads(read_bytes(path))
     except RecursionError:
         raise ValueError("it is nested too deep") from None
-    if not isinstance(found, dict):
+    if not isinstance(value, dict):
         raise ValueError("it is not an object")
-    return found
+    return value
 
 
 def write_file(path: str | pathlib.Path, data: bytes) -> None:
@@ -117,7 +117,7 @@ def append_file(path: str | pathlib.Path, data: bytes) -> None:
         raise _unwritable(path, error) from error
 
 
-def _unwritable(path, error):
+def _unwritable(path: pathlib.Path, error: OSError) -> OSError:
     return OSError(
         f"{path} cannot be written ({error.strerror}): choose another output folder or make room "
         "in this one."

@@ -1,4 +1,4 @@
-"""How much memory there is, and what becomes of memory that is freed."""
+"""Read how much memory is installed, and keep or return freed memory."""
 
 import contextlib
 import ctypes
@@ -7,7 +7,7 @@ import pathlib
 
 
 def installed_memory() -> int:
-    """Memory of this computer, or of the container, in bytes."""
+    """Return the memory of this computer, or of its container, in bytes."""
     held = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     with contextlib.suppress(OSError, ValueError):  # the file says "max" without a limit
         held = min(held, int(pathlib.Path("/sys/fs/cgroup/memory.max").read_text()))
@@ -24,7 +24,8 @@ def reuse_freed_memory() -> None:
     XLA's buffers are large and live for a part of a step. By default glibc gives them back to the
     system, which must find and zero their pages again in the next step.
     """
-    with _glibc() as library:
+    with _other_libraries():
+        library = ctypes.CDLL(None)
         library.mallopt(_ARENA_MAX, 1)  # threads free what others allocated
         library.mallopt(_MMAP_MAX, 0)
         library.mallopt(_TRIM_THRESHOLD, 2**31 - 1)
@@ -32,11 +33,10 @@ def reuse_freed_memory() -> None:
 
 def give_back_memory() -> None:
     """Return freed memory to the system, such as hundreds of MiB that a compilation took."""
-    with _glibc() as library:
-        library.malloc_trim(0)
+    with _other_libraries():
+        ctypes.CDLL(None).malloc_trim(0)
 
 
-@contextlib.contextmanager
-def _glibc():
-    with contextlib.suppress(OSError, TypeError, AttributeError):  # another C library
-        yield ctypes.CDLL(None)
+def _other_libraries() -> contextlib.suppress:
+    """Ignore that a C library other than glibc cannot be loaded or lacks these functions."""
+    return contextlib.suppress(OSError, TypeError, AttributeError)

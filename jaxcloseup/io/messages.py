@@ -17,12 +17,12 @@ def printable(text: str) -> str:
 
 
 def is_control(character: str) -> bool:
-    """Whether a character controls, formats or breaks lines, or is half of another."""
+    """Return whether a character controls, formats or breaks lines, or is half of another."""
     return unicodedata.category(character) in ("Cc", "Cf", "Cs", "Zl", "Zp")
 
 
 def reason(error: Exception) -> str:
-    """The beginning of what another library says of an error, on one line."""
+    """Return the beginning of another library's error message, on one line."""
     text = " ".join(str(error).split()) or type(error).__name__
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 

@@ -20,7 +20,7 @@ from tiny_capture import (
 )
 
 from jaxcloseup.captures.load import SceneError, load_scene
-from jaxcloseup.captures.splits import unique_names
+from jaxcloseup.captures.names import unique_names
 from jaxcloseup.photos.scene import UnknownKeyWarning
 
 

@@ -1,40 +1,37 @@
-"""What becomes of freed memory, in a process of its own: the setting is the whole process's."""
+"""Freed memory is kept or given back by calls of the C library, where it is glibc."""
 
-import os
-import platform
-import subprocess
-import sys
+import types
 
 import pytest
 
-
-PROGRAM = """
-import resource
-import numpy as np
-from jaxcloseup.memory import give_back_memory, reuse_freed_memory
-
-def faults():
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    np.ones(2**23)  # 64 MiB, freed at once
-    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before  # pages found anew
-
-found = [faults()]
-reuse_freed_memory()
-faults()
-found.append(faults())
-give_back_memory()
-print(*found, faults())
-"""
+from jaxcloseup.io import memory
 
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="needs glibc")
-def test_freed_memory_is_used_again_until_it_is_given_back():
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM],
-        env={**os.environ, "NUMPY_MADVISE_HUGEPAGE": "0"},
-        capture_output=True,
-        text=True,
-        check=True,
+def test_glibc_keeps_freed_memory_until_it_is_given_back(monkeypatch):
+    calls = []
+    library = types.SimpleNamespace(
+        mallopt=lambda parameter, value: calls.append((parameter, value)),
+        malloc_trim=lambda pad: calls.append(pad),
     )
-    usual, kept, given_back = map(int, done.stdout.split())
-    assert kept < usual / 10 and given_back > usual / 2
+    monkeypatch.setattr(memory.ctypes, "CDLL", lambda name: library)
+    memory.reuse_freed_memory()
+    # The names of parameters in glibc's malloc.h: M_ARENA_MAX, M_MMAP_MAX, M_TRIM_THRESHOLD.
+    assert dict(calls) == {-8: 1, -4: 0, -1: 2**31 - 1}
+    memory.give_back_memory()
+    assert calls[-1] == 0
+
+
+@pytest.mark.parametrize("library", [object(), None])
+def test_other_c_libraries_change_nothing(monkeypatch, library):
+    def load(name):
+        if library is None:
+            raise OSError("no library")
+        return library
+
+    monkeypatch.setattr(memory.ctypes, "CDLL", load)
+    memory.reuse_freed_memory()
+    memory.give_back_memory()
+
+
+def test_installed_memory_is_known():
+    assert memory.installed_memory() > 2**26

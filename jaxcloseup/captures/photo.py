@@ -1,0 +1,74 @@
+"""`Photo`: a decoded photograph with its mask and camera, and how it is read."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxcloseup.captures.scale import check_lens
+from jaxcloseup.captures.world_frames import Frame, frame_intrinsics
+
+
+class Reading(NamedTuple):
+    """How to read photographs; `load_scene` documents the options.
+
+    Attributes:
+      downscale: positive integer factor by which to shrink photographs, by averaging areas.
+      zoom: further such factor; if not 1, the `test` frames become crops of training photographs
+        that skip this factor.
+      background: gray level in [0, 1] behind transparent pixels.
+      half_pixel: whether the files put pixel centers at integers.
+      alpha_mode: one of `ALPHA_MODES`; transparent pixels show the background or weigh less.
+      invert_masks: whether masks mark ignored pixels in white.
+    """
+
+    downscale: int = 1
+    zoom: int = 1
+    background: float = 1.0
+    half_pixel: bool = False
+    alpha_mode: str = "blend"
+    invert_masks: bool = False
+
+
+class Photo(NamedTuple):
+    """A photograph after downscaling, or a crop of it.
+
+    Attributes:
+      frame: frame that was read.
+      rgb: `[H, W, 3]` uint8 colors.
+      mask: `[H, W]` uint8 weights, 255 where the pixel counts fully.
+      stored_size: (width, height) of the file's image.
+      scaled: (width, height) of the whole photograph at this scale, before trimming; may be
+        fractional.
+      corner: (x, y) of the crop's first pixel in the whole photograph at this scale.
+    """
+
+    frame: Frame
+    rgb: np.ndarray
+    mask: np.ndarray
+    stored_size: tuple[int, int]
+    scaled: tuple[float, float]
+    corner: tuple[int, int] = (0, 0)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        return self.rgb.shape[1], self.rgb.shape[0]
+
+    def intrinsics(self, half_pixel: bool) -> np.ndarray:
+        """Compute fx, fy, cx, cy `[4]` in pixels; `half_pixel` as in `Reading`."""
+        whole = resized_intrinsics(self.frame, self.stored_size, self.scaled, half_pixel)
+        return whole - np.array([0, 0, *self.corner])
+
+
+def resized_intrinsics(
+    frame: Frame, stored: tuple[int, int], new: tuple[float, float], half_pixel: bool
+) -> np.ndarray:
+    """Compute fx, fy, cx, cy for the photograph of size `stored` resized to `new`.
+
+    Raises:
+      SceneError: no lens of such a photograph has these intrinsics.
+    """
+    size = frame.size or stored
+    intrinsics = frame_intrinsics(frame, *size, half_pixel=half_pixel)
+    check_lens(frame.label, intrinsics, *size)
+    return intrinsics * np.tile(np.divide(new, size), 2)
