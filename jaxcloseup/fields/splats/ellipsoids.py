@@ -67,11 +67,7 @@ def project_ellipsoids(
     opacity_now, middle, first, below, second = lax.stop_gradient(
         (opacity, center, first, below, second)
     )
-    cutoff = jnp.sqrt(2 * jnp.log(jnp.maximum(opacity_now / ALPHA_MIN, 1)))
-    # The margin keeps pixels that only just reach the cutoff in spite of rounding.
-    half = [1.001 * cutoff * size + 0.01 for size in (first, jnp.hypot(below, second))]
-    box = [at - to for at, to in zip(middle, half, strict=True)]
-    box += [at + to for at, to in zip(middle, half, strict=True)]
+    box = _box(opacity_now, middle, [first, jnp.hypot(below, second)])
     drawn = ahead & (opacity_now >= ALPHA_MIN)
     return Footprints(
         anchor=jnp.stack(center),
@@ -83,6 +79,17 @@ def project_ellipsoids(
         order=jnp.maximum(lax.stop_gradient(depth), near),
         box=jnp.where(drawn[None], jnp.stack(box), -1),
     )
+
+
+def _box(
+    opacity: jax.Array, center: list[jax.Array], deviations: list[jax.Array]
+) -> list[jax.Array]:
+    """Return bounds x0, y0, x1, y1 `[N]` of ellipses by their standard deviations in x and y."""
+    cutoff = jnp.sqrt(2 * jnp.log(jnp.maximum(opacity / ALPHA_MIN, 1)))
+    # The margin keeps pixels that only just reach the cutoff in spite of rounding.
+    half = [1.001 * cutoff * deviation + 0.01 for deviation in deviations]
+    box = [at - to for at, to in zip(center, half, strict=True)]
+    return box + [at + to for at, to in zip(center, half, strict=True)]
 
 
 def _image_axes(

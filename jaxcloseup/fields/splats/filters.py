@@ -32,7 +32,10 @@ Factor = tuple[jax.Array, jax.Array, jax.Array]  # l11, l21, l22 `[N]` of Choles
 def pixel_spread(homography: Rows, depth: jax.Array, known: jax.Array) -> Factor:
     """Return the Cholesky factor of I + s^2 J J^T of each disc; the identity if not known.
 
-    J is the derivative of (u, v) by the pixel at the disc's center, and s^2 a pixel's variance.
+    J is the derivative of (u, v) by the pixel at the disc's center, and s^2 a pixel's variance. A
+    disc with that covariance, whose opacity falls as its area grows, is convolved with the pixel:
+    an image of fewer pixels is the mean of one of more (the elliptical weighted average of Zwicker
+    et al. 2001, as the 2-D filter of Mip-Splatting).
 
     Args:
       homography: about the center.

@@ -126,19 +126,13 @@ def project_discs(
 ) -> Footprints:
     """Return homographies and boxes of discs; invisible discs get opacity 0 and an empty box.
 
-    With `antialias`, each disc is convolved with the pixel, so that an image of fewer pixels is the
-    mean of one of more (the elliptical weighted average of Zwicker et al. 2001, as the 2-D filter
-    of Mip-Splatting): where J is the derivative of (u, v) by the pixel at the center, and s^2 a
-    pixel's variance, rho becomes (u, v) (I + s^2 J J^T)^-1 (u, v)^T, and the opacity falls as the
-    disc's area grows. Without it, small discs are drawn larger than they are, as published.
-
     Args:
       discs: `N` discs in the frame of `camera`.
       opacity: `[N]` in [0, 1].
       payload: `[F, N]` values to blend.
       camera: one camera; only its intrinsics and image size are used.
       near: positive z-depth; nothing nearer is drawn, and a disc may reach through it.
-      antialias: see above.
+      antialias: convolve discs with the pixel, see `pixel_spread`; else draw small discs larger.
 
     Raises:
       ValueError: `near` is not positive.
@@ -168,11 +162,7 @@ def project_discs(
     nearest, farthest = (jnp.maximum(limit, near) for limit in (mu[2] - reach, mu[2] + reach))
     box = disc_box(mu, vectors, cutoff, camera, near)
     if not antialias:
-        # The low-pass draws a circle about the center, which may be larger than the disc.
-        half = 1.001 * cutoff / jnp.sqrt(LOW_PASS) + 0.01
-        square = center[0] - half, center[1] - half, center[0] + half, center[1] + half
-        sides = zip([jnp.minimum] * 2 + [jnp.maximum] * 2, box, square, strict=True)
-        box = [jnp.where(ahead, farther(a, b), a) for farther, a, b in sides]
+        box = _with_low_pass(box, center, cutoff, ahead)
     return Footprints(
         anchor=jnp.stack(anchor),
         homography=jnp.stack([jnp.stack(row) for row in homography]),
@@ -184,6 +174,16 @@ def project_discs(
         order=jnp.maximum(mu[2], near),
         box=jnp.where(drawn[None], jnp.stack(box), -1),
     )
+
+
+def _with_low_pass(
+    box: list[jax.Array], center: list[jax.Array], cutoff: jax.Array, ahead: jax.Array
+) -> list[jax.Array]:
+    """Return boxes that also hold the low-pass: a circle about the center of discs ahead `[N]`."""
+    half = 1.001 * cutoff / jnp.sqrt(LOW_PASS) + 0.01
+    square = center[0] - half, center[1] - half, center[0] + half, center[1] + half
+    sides = zip([jnp.minimum] * 2 + [jnp.maximum] * 2, box, square, strict=True)
+    return [jnp.where(ahead, farther(a, b), a) for farther, a, b in sides]
 
 
 def _anchors(

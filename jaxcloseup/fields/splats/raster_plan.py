@@ -24,7 +24,7 @@ _CACHED_PAIRS = 2**14  # pairs whose data fit into a core's cache
 def plan_raster(config: RasterizeConfig, *, height: int, width: int) -> RasterPlan:
     """Settle what a configuration leaves open by what is fastest for an image on its platform.
 
-    Small tiles evaluate fewer splats in vain, but more pairs have to be sorted; docs/speed.md
+    Small tiles evaluate fewer splats in vain, but more pairs have to be sorted; docs/log/speed.md
     has the times on a CPU. Small tiles that are chosen here get three times the `capacity`, since
     splats touch two to three times as many. A GPU evaluates thousands of tiles at once: its sizes
     are a guess.
