@@ -1,4 +1,4 @@
-"""Strict numerics for every test, and where the shared reference data lies, if it is here."""
+"""Strict numerics for every test, shared caches, and fixtures of captures and stored runs."""
 
 import gc
 import os
@@ -26,10 +26,10 @@ _CACHE = "JAXCLOSEUP_TEST_CACHE"
 
 
 def pytest_configure(config):
-    """Keep compiled programs for all processes of this run: many tests need the same ones.
+    """Share compiled programs among all processes of this run, since many tests need the same.
 
-    What else is kept between runs must not come from the user's cache, nor go there. A folder in
-    the environment variable JAXCLOSEUP_TEST_CACHE keeps the programs for later runs too.
+    Other caches neither read nor write the user's folder. A folder in the environment variable
+    JAXCLOSEUP_TEST_CACHE keeps the programs for later runs too.
     """
     if not hasattr(config, "workerinput"):
         os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp()
@@ -47,7 +47,7 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_unconfigure(config):
-    """Remove them."""
+    """Remove the caches of this run."""
     if not hasattr(config, "workerinput"):
         shutil.rmtree(os.environ.pop("XDG_CACHE_HOME"))
 
@@ -58,7 +58,7 @@ MAPS = pathlib.Path("/proc/self/maps")
 
 @pytest.fixture(scope="module", autouse=True)
 def few_programs():
-    """Forget what is compiled before memory maps run out: XLA would wait for one forever."""
+    """Drop compiled programs before memory maps run out: XLA would wait for one forever."""
     yield
     if MAPS.exists() and MAPS.read_bytes().count(b"\n") > MOST_MAPS:
         jax.clear_caches()
@@ -90,5 +90,5 @@ def capture_folder(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def kept(capture_folder, tmp_path_factory):
-    """A run of surfels on it, as it is left on disk."""
+    """The folder of a run of surfels on the plane."""
     return keep_run(tmp_path_factory.mktemp("kept"), capture_folder)

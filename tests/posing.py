@@ -1,4 +1,4 @@
-"""Photographs with known poses to make poses of, and how far found poses are from these."""
+"""Render photographs with known poses, run the program on them, and measure errors of poses."""
 
 import json
 
@@ -22,7 +22,7 @@ FOCAL_IN_EXIF = 31  # in mm of a frame 36 mm x 24 mm
 
 
 def photograph(name, poses):
-    """Photographs `[V, H, W, 3]` of a built-in scene in flat light, which need no baking."""
+    """Render photographs `[V, H, W, 3]` of a drawn scene in flat light, which needs no baking."""
     world = assembly.build_world(SCENES[name](), lambda *scene: np.ones((len(scene[3]), 4)))
     cameras = loading._cameras(poses, WIDTH, HEIGHT)
     with jax.numpy_dtype_promotion("standard"):
@@ -34,7 +34,7 @@ def photograph(name, poses):
 
 
 def walk_around(name, count):
-    """Poses `[V, 3, 4]` of a camera that moves around a built-in scene."""
+    """Return poses `[V, 3, 4]` of a camera that moves around a drawn scene."""
     rig, poses = SCENES[name]().rig, []
     center, distance = np.array(rig.target), np.mean(rig.distance)
     for turn in np.linspace(-1, 1, count):
@@ -46,25 +46,25 @@ def walk_around(name, count):
     return np.stack(poses)
 
 
-def errors(found, true):
-    """Positions' errors over the extent, and rotations' errors in degrees, after a similarity.
+def errors(solved, true):
+    """Return errors of positions over the extent, and of rotations in degrees, after alignment.
 
-    The similarity's rotation fits the positions and the cameras' axes at once (Umeyama 1991), since
-    positions alone, of cameras that stand near a line, leave a turn about it open.
+    The alignment is a similarity whose rotation fits positions and axes at once (Umeyama 1991),
+    because the positions of cameras near a line leave a turn about that line open.
 
     Args:
-      found: `[V, 3, 4]` poses.
+      solved: `[V, 3, 4]` poses.
       true: `[V, 3, 4]` poses.
     """
-    found, true = np.asarray(found, np.float64), np.asarray(true, np.float64)
-    a, b = (poses[:, :, 3] - poses[:, :, 3].mean(0) for poses in (found, true))
-    axes = np.einsum("vij,vkj->ik", true[:, :, :3], found[:, :, :3]) / len(true) / 3
+    solved, true = np.asarray(solved, np.float64), np.asarray(true, np.float64)
+    a, b = (poses[:, :, 3] - poses[:, :, 3].mean(0) for poses in (solved, true))
+    axes = np.einsum("vij,vkj->ik", true[:, :, :3], solved[:, :, :3]) / len(true) / 3
     u, _, v = np.linalg.svd(b.T @ a / np.linalg.norm(a) / np.linalg.norm(b) + axes)
     rotation = u * np.array([1, 1, np.linalg.det(u @ v)]) @ v
     turned = a @ rotation.T
     scale = (turned * b).sum() / (turned**2).sum()
     away = np.linalg.norm(scale * turned - b, axis=1)
-    relative = true[:, :, :3].swapaxes(1, 2) @ (rotation @ found[:, :, :3])
+    relative = true[:, :, :3].swapaxes(1, 2) @ (rotation @ solved[:, :, :3])
     cosine = (np.trace(relative, axis1=1, axis2=2) - 1) / 2
     extent = np.linalg.norm(np.ptp(true[:, :, 3], axis=0))
     return away / extent, np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
@@ -78,13 +78,13 @@ def run_process(**given):
 
 
 def poses_by_name(folder):
-    """Poses of a capture as `run` loads it, by name without ending."""
+    """Load a capture; return the scene, and its poses by name without ending."""
     scene = load_scene(folder)
-    found = {}
+    named = {}
     for split, names in scene.names.items():
         poses = np.asarray(getattr(scene, split).cameras.camtoworld)
-        found |= dict(zip(names, poses, strict=True))
-    return scene, found
+        named |= dict(zip(names, poses, strict=True))
+    return scene, named
 
 
 def summary_of(folder):

@@ -11,14 +11,14 @@ LENS = {"fx": 41.0, "fy": 43.0, "cx": 22.3, "cy": 18.6}
 
 
 def colors(directions):
-    """Colors `[..., 3]` in levels of 0 to 255; neighboring pixels differ by about 30."""
+    """Return colors `[..., 3]` from 0 to 255; neighboring pixels differ by about 30."""
     x, y, z = np.moveaxis(directions / np.linalg.norm(directions, axis=-1, keepdims=True), -1, 0)
     waves = [np.sin(19 * x + 3 * z), np.sin(17 * y + 5 * x), np.sin(13 * (x + y + z))]
     return 127.5 + 120 * np.stack(waves, -1)
 
 
 def turned(angle):
-    """An OpenGL pose, rotated about y and translated."""
+    """Return an OpenGL pose, rotated about y and translated."""
     cos, sin = np.cos(angle), np.sin(angle)
     return np.array([[cos, 0, sin, angle], [0, 1, 0, 2], [-sin, 0, cos, 0], [0, 0, 0, 1]])
 
@@ -31,7 +31,7 @@ def photograph(pose, lens=LENS, size=SIZE, first=0.5):
 
 
 def seen(cameras, index, offsets=((0.0, 0.0),)):
-    """Mean colors `[H, W, 3]` along a loaded camera's rays through pixel centers plus offsets."""
+    """Return mean colors `[H, W, 3]` along a camera's rays through pixel centers plus offsets."""
     pose = np.asarray(cameras.camtoworld, np.float64)[index]
     fx, fy, cx, cy = np.asarray(cameras.intrinsics, np.float64)[index]
     column, row = np.meshgrid(np.arange(cameras.width) + 0.5, np.arange(cameras.height) + 0.5)

@@ -1,4 +1,4 @@
-"""Small random splat scenes, and one renderer that all tests share so that it compiles once."""
+"""Draw small random splat scenes, and render them by one function that compiles once."""
 
 import dataclasses
 import functools
@@ -26,7 +26,7 @@ OUTPUTS = ("rgb", "alpha", "depth", "normal", "median_depth", "distortion")
 
 
 def random_scene(seed, *, depth=(1.0, 3.0), log_scale=(-4.0, -0.7), count=COUNT, num_scales=2):
-    """Splats in front of the identity pose: float64 arrays by name, exact in float32."""
+    """Draw splats in front of the identity pose: float64 arrays by name, exact in float32."""
     rng = np.random.default_rng(seed)
     z = rng.uniform(*depth, count)
     xy = rng.uniform(-0.5, 0.5, (count, 2)) * np.maximum(np.abs(z), 0.5)[:, None]
@@ -72,7 +72,7 @@ def to_camera(camtoworld=IDENTITY, intrinsics=INTRINSICS, size=(HEIGHT, WIDTH), 
 
 
 def render(surfels, camera, alive=None, config=CONFIG):
-    """All images of `render_surfels` over `BACKGROUND`, by name; volumes have no normals."""
+    """Return all images of `render_surfels` over `BACKGROUND` by name; volumes have no normals."""
     alive = jnp.ones(surfels.means.shape[0], bool) if alive is None else alive
     return _render(surfels, camera, alive, config)
 

@@ -60,7 +60,7 @@ OPENGL = np.diag([1.0, -1, -1])
 
 
 def write_plane(folder):
-    """The plane as photographs in the paper's layout."""
+    """Write photographs of the plane in the paper's layout."""
     splits = {
         "train": [plane.camera_above(x, 0.1 * x, 4.0, tilt=0.1 * x) for x in (-1, -0.5, 0, 0.5, 1)],
         "test": [plane.camera_above(0.2, 0.1, 1.5, tilt=0.3)],
@@ -85,7 +85,7 @@ def write_plane(folder):
 
 
 def keep_run(folder, capture_folder):
-    """A folder as a run leaves it, cut off after its closeup; its state is the plane as surfels."""
+    """Write the folder of a run that was interrupted after its closeup; surfels cover the plane."""
     with jax.numpy_dtype_promotion("standard"):
         scene = load_scene(str(capture_folder))
         side = np.linspace(-HALF, HALF, 24)
@@ -131,7 +131,7 @@ def path_file(folder, **changes):
 
 
 def copy_of(kept, folder, name, change):
-    """A run without states whose file `name` is changed."""
+    """Write a run without states whose file `name` is changed."""
     (folder / "checkpoints" / "closeup" / "3").mkdir(parents=True)
     for file in ("manifest.json", "checkpoints/run.json"):
         fields = json.loads((kept / file).read_text())

@@ -1,7 +1,7 @@
-"""Everything worth knowing about a GPU, in one command; fills `gpu.json` as it goes.
+"""Measure a GPU in one command; write `gpu.json` after each part.
 
 `python -m experiments.bench --suite=gpu` needs no network and about ten minutes. A part that fails
-is recorded with its error, and the next one runs. Figures of a CPU are no guide to a GPU's.
+is recorded with its error, and the next one runs. Figures of a CPU say nothing about a GPU.
 """
 
 import dataclasses
@@ -16,11 +16,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 import jaxcloseup
-from experiments.benchmarks import nerf, splats, sweep
-from experiments.benchmarks.timing import interleaved_medians
+from experiments.benchmarks import gpu_splats, nerf, sweep
+from experiments.benchmarks.timing import REPEATS, interleaved_medians
 from jaxcloseup.app.methods import surfels
 from jaxcloseup.app.methods.method import Preset
 from jaxcloseup.app.methods.nerf import QUICK as NERF_QUICK
@@ -37,17 +36,12 @@ from jaxcloseup.app.run.states import initial_state
 from jaxcloseup.app.run.step_data import TrainData
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.captures.load import load_scene
-from jaxcloseup.fields.splats import RasterizeConfig
 from jaxcloseup.fields.volume.config import NerfConfig
-
-
-REPEATS = 5
-FAIL = 2e-3  # of the largest value, by which two compositors may differ in an image or a derivative
 
 
 @dataclasses.dataclass(frozen=True)
 class Size:
-    """How large everything is.
+    """Sizes of all parts.
 
     Attributes:
       cases: numbers of splats, and the heights and widths of their images; smallest first.
@@ -64,7 +58,7 @@ class Size:
       most_seconds: after which no other part begins.
     """
 
-    cases: tuple[tuple[int, tuple[int, int]], ...] = (
+    cases: tuple[gpu_splats.Case, ...] = (
         (20_000, (270, 480)),
         (100_000, (540, 960)),
         (500_000, (1080, 1920)),
@@ -83,16 +77,16 @@ class Size:
 
 
 def run(size: Size | None = None, path: pathlib.Path | None = None) -> dict[str, Any]:
-    """Run all parts; returns what `path` (by default `gpu.json` in this folder) then holds."""
+    """Run all parts; write their results to `path`, by default `gpu.json`, and return them."""
     size, path = size or Size(), path or pathlib.Path("gpu.json")
     parts: dict[str, Callable[[Size], Any]] = {
         "ceilings": ceilings,
-        "correctness": correctness,
-        "splats": splat_rates,
+        "correctness": lambda size: gpu_splats.correctness(size.cases[0]),
+        "splats": lambda size: gpu_splats.splat_rates(size.cases, ceilings(size)),
         "nerf": nerf_rates,
         "training": training,
         "sweep": sweep_rates,
-        "peer": peer,
+        "peer": lambda size: gpu_splats.peer(size.cases[-1]),
     }
     start, found = time.perf_counter(), {"about": about()}
     for name, part in parts.items():
@@ -112,7 +106,7 @@ def run(size: Size | None = None, path: pathlib.Path | None = None) -> dict[str,
 
 
 def about() -> dict[str, Any]:
-    """Versions and devices."""
+    """Return versions and devices."""
     return {
         "jaxcloseup": jaxcloseup.__version__,
         "jax": jax.__version__,
@@ -123,12 +117,12 @@ def about() -> dict[str, Any]:
 
 
 def peak_bytes() -> int | None:
-    """Most memory of the first device that was in use so far, where it says."""
+    """Return the peak memory of the first device so far, or None if unknown."""
     return (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
 
 
 def ceilings(size: Size) -> dict[str, float]:
-    """Operations and bytes a second: of matrix products, of sums, and of copies."""
+    """Measure operations and bytes a second of matrix products, of sums and of copies."""
     many, steps = size.numbers, 256
     calls, work = {}, {}
     for dtype in nerf.DTYPES:
@@ -151,105 +145,8 @@ def ceilings(size: Size) -> dict[str, float]:
     return {f"{name}_per_s": work[name] / seconds[name] for name in calls}
 
 
-def _config(surfels_, camera) -> tuple[RasterizeConfig, int]:
-    """Room for all pairs, and their number."""
-    config = splats.config_for(surfels_, camera)
-    return config, splats.count_pairs(surfels_, camera, config)[0]
-
-
-def _by(config, compositor: str) -> RasterizeConfig:
-    return dataclasses.replace(config, compositor=compositor)
-
-
-def _compositors() -> tuple[str, ...]:
-    # Other devices interpret the kernels, which says nothing about a GPU.
-    return ("loops", "kernel") if jax.default_backend() == "gpu" else ("loops",)
-
-
-@functools.partial(jax.jit, static_argnames="config")
-def _pull(surfels_, camera, config):
-    """Images, and the derivative of their sum."""
-    seen, pullback = jax.vjp(lambda s: splats.render_all(s, camera, config), surfels_)
-    return seen, pullback(jax.tree.map(jnp.ones_like, seen))[0]
-
-
-def correctness(size: Size) -> dict[str, Any]:
-    """Images and derivatives of each compositor here, against loops on the CPU."""
-    example = splats.discs_on_a_wall(*size.cases[0])
-    camera, (config, _) = example[1], _config(*example)
-
-    cpu = jax.local_devices(backend="cpu")[0]
-    with jax.default_device(cpu):
-        on_cpu = jax.device_put(example[0], cpu)
-        expected = jax.device_get(_pull(on_cpu, camera, _by(config, "loops")))
-    found = {}
-    for compositor in _compositors():
-        seen = jax.device_get(_pull(*example, _by(config, compositor)))
-        found[compositor] = max(
-            float(np.max(np.abs(a - b)) / max(np.max(np.abs(a)), 1e-6))
-            for a, b in zip(jax.tree.leaves(expected), jax.tree.leaves(seen), strict=True)
-        )
-    return {"largest_difference": found, "agree": all(v < FAIL for v in found.values())}
-
-
-def splat_rates(size: Size) -> list[dict[str, Any]]:
-    """Both passes of each compositor in each case."""
-    known, rows = ceilings(size), []
-    for count, image in size.cases:
-        surfels_, camera = splats.discs_on_a_wall(count, image)
-        config, pairs = _config(surfels_, camera)
-        for compositor in _compositors():
-            row = {
-                "splats": count,
-                "image": list(image),
-                "compositor": compositor,
-                "pairs": pairs,
-            }
-            try:
-                row |= _passes(surfels_, camera, _by(config, compositor), pairs, known)
-            except Exception as error:  # such as too little memory
-                row["error"] = f"{type(error).__name__}: {error}"[:500]
-            rows.append(row)
-            print(json.dumps(row), flush=True)
-    return rows
-
-
-def _passes(surfels_, camera, config, pairs, known):
-    begun = time.perf_counter()
-    render = jax.jit(functools.partial(splats.render_all, config=config))
-    forward = render.lower(surfels_, camera).compile()
-    both = _pull.lower(surfels_, camera, config).compile()
-    compiled = time.perf_counter() - begun
-    seconds = interleaved_medians(
-        {"forward": lambda: forward(surfels_, camera), "both": lambda: both(surfels_, camera)},
-        REPEATS,
-    )
-    evaluations = pairs * config.tile**2
-    operations = {"forward": splats.FORWARD_OPERATIONS}
-    operations["both"] = splats.FORWARD_OPERATIONS + splats.BACKWARD_OPERATIONS
-    # A pair reads its splat's row of 21 numbers; the derivative reads it again and writes as many.
-    row_bytes = {"forward": 4 * 21, "both": 12 * 21}
-    return {
-        "compile_s": compiled,
-        "temporary_bytes": both.memory_analysis().temp_size_in_bytes,
-        **{f"{name}_ms": 1e3 * value for name, value in seconds.items()},
-        **{
-            f"{name}_share_of_arithmetic": evaluations
-            * operations[name]
-            / (value * known["elementwise_float32_per_s"])
-            for name, value in seconds.items()
-        },
-        **{
-            f"{name}_share_of_bandwidth": pairs
-            * row_bytes[name]
-            / (value * known["copied_bytes_per_s"])
-            for name, value in seconds.items()
-        },
-    }
-
-
 def nerf_rates(size: Size) -> dict[str, Any]:
-    """A training step of a NeRF in each precision, as a share of the matrix products' rate."""
+    """Time a training step of a NeRF in each precision, as a share of the rate of products."""
     known, rows = ceilings(size), {}
     for dtype in nerf.DTYPES:
         config = dataclasses.replace(size.nerf, compute_dtype=dtype)
@@ -268,7 +165,7 @@ def nerf_rates(size: Size) -> dict[str, Any]:
 
 
 def training(size: Size) -> dict[str, Any]:
-    """Surfels trained on a scene, all stages, for as many steps as the time allows."""
+    """Train surfels on a scene, all stages, for as many steps as the time allows."""
     preset = size.preset
     begun = time.perf_counter()
     scene = load_scene(size.scene, downscale=preset.downscale)
@@ -298,10 +195,10 @@ def training(size: Size) -> dict[str, Any]:
         whole = Training(programs, checkpoints, save_every=10**9)
         outcome = run_stages(whole, 0, output, to_run=size.stages)
     start = start_labels(programs, outcome.start.state, run_keys(0))
-    wanted = jax.tree.map(lambda leaf: leaf[:1], scene.test.cameras)
+    target = jax.tree.map(lambda leaf: leaf[:1], scene.test.cameras)
     begun = time.perf_counter()
-    tuned = fine_tune(programs, start, wanted, detail_getter(programs, start.state))
-    jax.block_until_ready(programs.render(tuned, jax.tree.map(lambda leaf: leaf[0], wanted)))
+    tuned = fine_tune(programs, start, target, detail_getter(programs, start.state))
+    jax.block_until_ready(programs.render(tuned, jax.tree.map(lambda leaf: leaf[0], target)))
     return {
         "image": [scene.train.cameras.height, scene.train.cameras.width],
         "loading_s": loaded,
@@ -309,7 +206,7 @@ def training(size: Size) -> dict[str, Any]:
         "early_step_ms": 1e3 * step,
         "steps": [preset.baseline_steps, preset.closeup_steps],
         "stages_s": whole.seconds,
-        "wanted_view_s": time.perf_counter() - begun,
+        "target_view_s": time.perf_counter() - begun,
         "state_bytes": sum(leaf.nbytes for leaf in jax.tree.leaves(start.state.params)),
         "room": programs.growth,
         "psnr": {
@@ -320,7 +217,7 @@ def training(size: Size) -> dict[str, Any]:
 
 
 def sweep_rates(size: Size) -> dict[str, Any]:
-    """A step of eight arms against eight steps alone."""
+    """Time a step of eight arms against eight steps alone."""
     rows = {}
     for preset in size.arms:
         alone, together = sweep.step_seconds(preset, size.scene, warmup=size.warmup)
@@ -330,37 +227,3 @@ def sweep_rates(size: Size) -> dict[str, Any]:
             "over_eight_alone": together / (8 * alone),
         }
     return rows
-
-
-def peer(size: Size) -> dict[str, Any]:
-    """The same splats in gsplat, where it is installed."""
-    try:
-        import gsplat
-        import torch
-    except ImportError as error:
-        return {"gsplat": f"not installed: {error}"}
-    count, (height, width) = size.cases[-1]
-    surfels_, camera = splats.discs_on_a_wall(count, (height, width))
-    tensor = lambda array: torch.tensor(np.asarray(array), device="cuda")  # noqa: E731
-    scales = np.concatenate([np.exp(surfels_.log_scales), np.full((count, 1), 1e-9)], axis=1)
-    world = np.concatenate([camera.camtoworld, [[0, 0, 0, 1]]]).astype(np.float32)
-    fx, fy, cx, cy = np.asarray(camera.intrinsics)
-    intrinsics = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float32)
-    rgb = 0.5 + 0.2820948 * np.asarray(surfels_.sh[:, 0])
-    given = [
-        tensor(value).requires_grad_()
-        for value in (
-            *(surfels_.means, surfels_.quaternions, scales.astype(np.float32)),
-            *(jax.nn.sigmoid(surfels_.opacity_logits), rgb),
-        )
-    ]
-    pose = tensor(np.linalg.inv(world))[None], tensor(intrinsics)[None]
-
-    def both():
-        image = gsplat.rasterization_2dgs(*given, *pose, width, height)[0]
-        (image**2).mean().backward()
-        torch.cuda.synchronize()
-        return 0
-
-    seconds = interleaved_medians({"both": both}, REPEATS)["both"]
-    return {"gsplat": gsplat.__version__, "splats": count, "both_ms": 1e3 * seconds}

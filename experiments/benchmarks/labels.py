@@ -37,7 +37,7 @@ MASKS = {
 
 
 def run() -> None:
-    """Print error and shares kept and leaked by scene and mask, and write pictures of labels."""
+    """Print error, kept and leaked shares by scene and mask, and write pictures of labels."""
     print(f"labels from exact depth at 1/{DOWNSCALE} of the full size")
     print(f"{'scene':>8}  {'mask':<22}  {'error':>6}  {'kept':>6}  {'leaked':>6}")
     for name in DRAWN_SCENES:

@@ -1,4 +1,4 @@
-"""Training steps and images of a NeRF, timed against the matrix products that they consist of.
+"""Time training steps and images of a NeRF against the matrix products that they consist of.
 
 The ceiling is one product of 65536 x 256 x 256, the size for 1024 rays. The pieces are the same
 arithmetic in parts that stay in the cache, as in the NeRF.

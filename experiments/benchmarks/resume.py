@@ -1,7 +1,8 @@
-"""Five short runs, killed fifty times (-9) and resumed each time, against an uninterrupted run.
+"""Kill five short runs fifty times (-9), resume them, and compare them with an uninterrupted run.
 
-Kills come at random within the stages of a run, the first checkpoint, the gate, an evaluation and
-the report among them. All metrics and the history of every stage must be the same to the last bit.
+Kills come at random moments of all stages of a run, and always in the first checkpoint, the gate,
+an evaluation and the report. All metrics and the history of every stage must be the same to the
+last bit.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Surfels rendered and differentiated, timed against a plain scan and against their arithmetic.
+"""Time rendered and differentiated surfels against a plain scan and against their arithmetic.
 
 The discs lie at points that the photographs of `table` see, as at the start of training. The plain
 scan uses the same projection and the same tile lists: all tiles step through their lists together,
@@ -117,7 +117,7 @@ def _report(surfels, camera, rate):
 
 
 def config_for(surfels, camera):
-    """The configuration for an image, with as much room as it needs."""
+    """Return the configuration for an image, with as much room as it needs."""
     plan = plan_raster(RasterizeConfig(), height=camera.height, width=camera.width)
     guess = RasterizeConfig(capacity=plan.capacity, tile=plan.tile)
     touched, _ = count_pairs(surfels, camera, guess, exact=False)
@@ -143,7 +143,7 @@ def _discs_on_table(scene, count, size):
 
 
 def discs_on_a_wall(count, size):
-    """Discs on a wavy surface that fills the view evenly: the scan's best case."""
+    """Return discs on a wavy surface, the best case of a scan, and a camera that they fill."""
     keys = jax.random.split(jax.random.key(0), 6)
     a, b = jax.random.uniform(keys[0], (2, count), minval=-1)
     z = 3.5 + 0.8 * jnp.sin(3 * a) * jnp.cos(2 * b) + 0.25 * jax.random.normal(keys[1], (count,))
@@ -184,7 +184,7 @@ def _footprints(surfels, camera, config):
 
 
 def _lists(footprints, camera, config, *, exact=True):
-    """Lists of the splats that draw in each tile, or else of those whose boxes touch it."""
+    """Return lists of the splats that draw in each tile, or whose boxes touch it."""
     table = pack(footprints)
     return tile_lists(
         lax.stop_gradient(footprints.box.T),

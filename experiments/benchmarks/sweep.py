@@ -1,4 +1,4 @@
-"""One step of a sweep with eight arms against eight steps of a single run, for each method."""
+"""Time one step of a sweep with eight arms against eight steps of a single run, by method."""
 
 import jax
 
@@ -36,7 +36,7 @@ def run() -> None:
 def step_seconds(
     preset: Preset, scene: str = "table", *, warmup: int = WARMUP
 ) -> tuple[float, float]:
-    """Seconds of a step alone, and of a step of all arms together, on a scene by its name."""
+    """Return the seconds of a step alone, and of a step of all arms together, on a scene."""
     scene = load_scene(scene, downscale=preset.downscale)
     programs = Programs(preset, scene)
     state = initial_state(programs, run_keys(0))

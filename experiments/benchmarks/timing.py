@@ -7,8 +7,11 @@ from collections.abc import Callable, Mapping
 import jax
 
 
+REPEATS = 5
+
+
 def interleaved_medians(
-    calls: Mapping[str, Callable[[], object]], repeats: int = 5
+    calls: Mapping[str, Callable[[], object]], repeats: int = REPEATS
 ) -> dict[str, float]:
     """Return the median wall seconds of each call.
 

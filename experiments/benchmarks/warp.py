@@ -1,4 +1,4 @@
-"""Forward warp of 50 views of 960 x 540 into one virtual close-up.
+"""Time the forward warp of 50 views of 960 x 540 into one virtual close-up.
 
 The suite compares it with a plain NumPy loop, which for each view projects all points, keeps the
 nearest at each pixel, and merges the views. It also prints the time to copy the depth maps, which

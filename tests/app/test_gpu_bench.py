@@ -6,7 +6,7 @@ import json
 import constant_color
 import jax
 
-from experiments.benchmarks import gpu
+from experiments.benchmarks import gpu, gpu_splats
 from experiments.benchmarks.nerf import SMALL
 from jaxcloseup.app.methods.registry import METHODS
 
@@ -26,10 +26,10 @@ TOY = gpu.Size(
 
 
 def test_every_part_finishes_and_fills_its_fields(tmp_path, capture_folder, monkeypatch):
-    def broken(size):
+    def broken(case):
         raise RuntimeError("no such library")
 
-    monkeypatch.setattr(gpu, "peer", broken)
+    monkeypatch.setattr(gpu_splats, "peer", broken)
     monkeypatch.setitem(METHODS, "constant_color", constant_color.METHOD)
     with jax.numpy_dtype_promotion("standard"):
         size = dataclasses.replace(TOY, scene=str(capture_folder))
@@ -47,7 +47,7 @@ def test_every_part_finishes_and_fills_its_fields(tmp_path, capture_folder, monk
     for name in ("forward", "both"):
         assert row[f"{name}_ms"] > 0 and row[f"{name}_share_of_arithmetic"] > 0
     assert set(parts["nerf"]) == {"float32", "bfloat16"}
-    assert parts["training"]["wanted_view_s"] > 0
+    assert parts["training"]["target_view_s"] > 0
     assert set(parts["training"]["psnr"]) == {"baseline", "control"}
     assert parts["sweep"]["constant_color"]["over_eight_alone"] > 0
 
