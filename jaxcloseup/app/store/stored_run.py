@@ -208,7 +208,7 @@ def read_fields(path: pathlib.Path, kinds: Mapping[str, type]) -> dict[str, Any]
 
 def _check_fields(path: pathlib.Path, fields: Mapping[str, Any], kinds: Mapping[str, type]) -> None:
     for name, kind in kinds.items():
-        value = fields.get(name)
+        value: Any = fields.get(name)
         fits = isinstance(value, kind) and not isinstance(value, bool)
         if not fits or (kind is int and not 0 <= value < 2**63):
             raise RunError(
