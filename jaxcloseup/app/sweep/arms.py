@@ -95,13 +95,13 @@ def make_arm(name: str, preset: Preset) -> Arm:
     )
     if kind in ARMS_IN_TURN and changes_depth:
         raise ValueError(
-            f"--arms={name}: {kind} labels from its own depth: leave out expected_depth and depth_error"
+            f"--arms={name}: {kind} takes no other depth: leave out expected_depth and depth_error"
         )
     if labels.label == "residual" and changes_depth:
         raise ValueError(f"--arms={name}: label=residual has its own depth: add +label=warp")
     if labels.label != of_kind.labels.label and kind not in ("diverse", "test_time"):
         raise ValueError(
-            f"--arms={name}: {kind} has its own kind of labels: change label in diverse or test_time"
+            f"--arms={name}: {kind} has one kind of labels: change label of diverse or test_time"
         )
     if None not in (labels.expected_depth, depth_error):
         raise ValueError(f"--arms={name}: expected_depth and depth_error do not go together")
