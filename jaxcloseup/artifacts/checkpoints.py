@@ -136,7 +136,7 @@ class Checkpoints:
         )
         return step, state, progress
 
-    def _manager(self, stage):
+    def _manager(self, stage: str) -> ocp.CheckpointManager:
         if stage not in self._managers:
             folder = self.folder / stage
             folder.mkdir(parents=True, exist_ok=True)
@@ -160,7 +160,7 @@ class Checkpoints:
         return self._managers[stage]
 
 
-def _check_files(folder):
+def _check_files(folder: pathlib.Path) -> None:
     """Raise unless a folder holds ordinary files alone: Orbax would wait for a pipe."""
     for path in folder.rglob("*"):
         try:
@@ -173,7 +173,7 @@ def _check_files(folder):
             ) from error
 
 
-def _difference(name, kept, identity):
+def _difference(name: str, kept: Mapping[str, Any], identity: Mapping[str, Any]) -> str:
     """Describe the first difference, down to the innermost field."""
     old, new = kept.get(name), identity.get(name)
     while isinstance(old, dict) and isinstance(new, dict):
@@ -183,19 +183,19 @@ def _difference(name, kept, identity):
     return f"whose {name} is {old} instead of {new}"
 
 
-def _is_key(leaf):
+def _is_key(leaf: Any) -> bool:
     return jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
-def _plain(state):
+def _plain(state: Any) -> Any:
     """Copy the state to NumPy arrays, which belong to no device, and unwrap its random keys."""
     return jax.device_get(
         jax.tree.map(lambda leaf: jax.random.key_data(leaf) if _is_key(leaf) else leaf, state)
     )
 
 
-def _checked(plain, marked):
-    """The progress without its checksum; a ValueError if the state is not what was saved."""
+def _checked(plain: Any, marked: Any) -> dict[str, Any]:
+    """Return the progress without its checksum; raise ValueError if the state was changed."""
     if not isinstance(marked, dict):
         raise ValueError("its progress is not an object")
     progress = {name: value for name, value in marked.items() if name != _CHECKSUM}
@@ -207,15 +207,15 @@ def _checked(plain, marked):
     return progress
 
 
-def _checksum(plain, progress):
-    """CRC-32 of the arrays' bytes and the progress: fast, and no change of few bytes escapes it."""
+def _checksum(plain: Any, progress: Mapping[str, Any]) -> int:
+    """Return the CRC-32 of the arrays and the progress, which any change of few bytes alters."""
     value = zlib.crc32(json.dumps(progress, sort_keys=True).encode())
     for leaf in jax.tree.leaves(plain):
-        value = zlib.crc32(np.ascontiguousarray(leaf).reshape(-1).view(np.uint8), value)
+        value = zlib.crc32(np.ascontiguousarray(leaf).reshape(-1).view(np.uint8).data, value)
     return value
 
 
-def _follow(tree, path, like):
+def _follow(tree: Any, path: tuple[Any, ...], like: Any) -> Any:
     """Return the leaf of nested dicts and lists that lies at a pytree's path."""
     for key in path:
         name = jax.tree_util.keystr((key,), simple=True)

@@ -5,7 +5,7 @@ Images are RGB `[H, W, 3]` or gray `[H, W]`; floats in [0, 1] or uint8; NumPy or
 
 import base64
 import pathlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import cv2
 import imageio.v3 as imageio
@@ -31,9 +31,8 @@ def to_uint8(image: Image) -> np.ndarray:
         raise ValueError(f"an image must be [H, W, 3] or [H, W], got {image.shape}.")
     if image.dtype != np.uint8:
         image = np.rint(np.clip(np.nan_to_num(image.astype(np.float32)), 0, 1) * 255)
-    return (
-        np.repeat(image[..., None], 3, 2).astype(np.uint8) if image.ndim == 2 else np.uint8(image)
-    )
+    image = image.astype(np.uint8)
+    return np.repeat(image[..., None], 3, 2) if image.ndim == 2 else image
 
 
 def encode_png(image: Image) -> bytes:
@@ -176,16 +175,18 @@ def color_counts(count: Image) -> tuple[np.ndarray, np.ndarray]:
     return colors, legend(_LEGEND_WIDTH)
 
 
-def _panel(values, unseen, steps, last):
-    """An image of values in steps above its legend; small images are enlarged to fit it."""
+def _panel(values: np.ndarray, unseen: np.ndarray, steps: Sequence[int], last: str) -> np.ndarray:
+    """Draw an image of values in steps above its legend; small images are enlarged to fit it."""
     image, legend = _in_steps(values, unseen, steps, last)
     factor = -(-_LEGEND_WIDTH // image.shape[1])
     image = image.repeat(factor, axis=0).repeat(factor, axis=1)
     return np.concatenate([image, legend(image.shape[1])])
 
 
-def _in_steps(values, unseen, steps, last):
-    """Colors of values, and a function that draws their legend with a given width.
+def _in_steps(
+    values: np.ndarray, unseen: np.ndarray, steps: Sequence[int], last: str
+) -> tuple[np.ndarray, Callable[[int], np.ndarray]]:
+    """Return colors of values, and a function that draws their legend with a given width.
 
     `last` says what lies beyond all steps.
     """
@@ -235,7 +236,7 @@ def _label(text: str, width: int) -> np.ndarray:
     return cv2.putText(strip, text, (2, 17), font, scale, (0, 0, 0), 1, cv2.LINE_AA)
 
 
-def _legend(colors, texts, width):
+def _legend(colors: np.ndarray, texts: Sequence[str], width: int) -> np.ndarray:
     """Draw a strip of color boxes, each with its text."""
     edges = np.linspace(0, width, len(texts) + 1).astype(int)
     boxes = []

@@ -92,7 +92,7 @@ def read_surfels(path: str | pathlib.Path, *, num_scales: int = 2) -> Surfels:
         found not in ((3, 2, 4), (3, 3, 4))
         or bands not in (0, 3, 8, 15)
         or rest.shape[1] % 3
-        or "opacity" not in vertices.dtype.names
+        or "opacity" not in (vertices.dtype.names or ())
     ):
         raise PlyError(
             f"{path} lacks the properties of splats (f_dc_*, f_rest_*, opacity, scale_*, rot_*): "
@@ -109,15 +109,15 @@ def read_surfels(path: str | pathlib.Path, *, num_scales: int = 2) -> Surfels:
     )
 
 
-def _numbered(stem, array):
+def _numbered(stem: str, array: np.ndarray | jax.Array) -> dict[str, np.ndarray]:
     return {f"{stem}_{i}": column for i, column in enumerate(np.asarray(array).T)}
 
 
-def _columns(vertices, stem):
+def _columns(vertices: np.ndarray, stem: str) -> np.ndarray:
     """Stack the properties `stem_0`, `stem_1`, ... by number as `[P, count]`."""
     numbers = sorted(
         int(match[1])
-        for name in vertices.dtype.names
+        for name in vertices.dtype.names or ()
         if (match := re.fullmatch(rf"{stem}_(\d+)", name))
     )
     columns = [vertices[f"{stem}_{i}"] for i in numbers]

@@ -18,7 +18,12 @@ from jaxcloseup.captures.world_frames import Frame, check_photographs
 from jaxcloseup.photos.scene import SceneError
 
 
-_FIELDS = {"f": "fl_x", "fx": "fl_x", "fy": "fl_y", "k": "k1"}  # other names are the same
+_FIELDS: dict[str, str] = {
+    "f": "fl_x",
+    "fx": "fl_x",
+    "fy": "fl_y",
+    "k": "k1",
+}  # other names are the same
 _RIGID = 1e-3
 
 
@@ -54,9 +59,8 @@ def read_colmap(
     suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"
 
     def count_parameters(name: int | str) -> int:
-        name = int(name) if suffix == ".bin" else str(name)
         kinds = pycolmap.CameraModelId
-        kind = kinds(name) if suffix == ".bin" else kinds.__members__[name]
+        kind = kinds(int(name)) if suffix == ".bin" else kinds.__members__[str(name)]
         return len(pycolmap.Camera.create_from_model_id(1, kind, 1.0, 1, 1).params)
 
     check_files(model, suffix, count_parameters)
@@ -114,8 +118,8 @@ def read_colmap(
             )
         )
     check_photographs(source, frames)
-    rgb = [reconstruction.points3D[i].color for i in kept]
-    rgb = np.array(rgb, np.float32).reshape(-1, 3) / 255
+    colors = [reconstruction.points3D[i].color for i in kept]
+    rgb = np.array(colors, np.float32).reshape(-1, 3) / 255
     errors = np.array([reconstruction.points3D[i].error for i in kept], np.float32).reshape(-1)
     errors = np.where(errors >= 0, errors, np.nan)  # COLMAP writes -1 for an unknown one
     return source, frames, (xyz[keep].astype(np.float32), rgb), errors
@@ -128,11 +132,11 @@ def _lens(file: pathlib.Path, camera: Any) -> tuple[dict[str, Any], tuple[int, i
         int(number(label, "width", camera.width, above=0)),
         int(number(label, "height", camera.height, above=0)),
     )
-    names = [name.strip() for name in camera.params_info.split(",")]
+    names: list[str] = [name.strip() for name in camera.params_info.split(",")]
     values = dict(zip(names, map(float, camera.params), strict=True))
     for name, value in values.items():
         number(label, name, value, above=0 if name in ("f", "fx", "fy") else -np.inf)
-    lens = {_FIELDS.get(name, name): value for name, value in values.items()}
+    lens: dict[str, Any] = {_FIELDS.get(name, name): value for name, value in values.items()}
     return {"camera_model": camera.model_name, **lens}, size
 
 

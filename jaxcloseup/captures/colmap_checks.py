@@ -7,7 +7,7 @@ text files do not name the file. Formats: https://colmap.github.io/format.html
 import math
 import pathlib
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from jaxcloseup.io.files import read_bytes
 from jaxcloseup.photos.scene import SceneError
@@ -15,11 +15,10 @@ from jaxcloseup.photos.scene import SceneError
 
 LARGEST_FILE = 2**32  # bytes
 NAMES = ("cameras", "images", "points3D")
+_Count = Callable[[int | str], int]  # number of parameters of a camera model
 
 
-def check_files(
-    folder: pathlib.Path, suffix: str, count_parameters: Callable[[int | str], int]
-) -> None:
+def check_files(folder: pathlib.Path, suffix: str, count_parameters: _Count) -> None:
     """Check every record of a model's cameras, images and points.
 
     Args:
@@ -46,14 +45,14 @@ def check_files(
                 _check_binary(path, data, count_parameters)
 
 
-def _read(path):
+def _read(path: pathlib.Path) -> bytes:
     try:
         return read_bytes(path, most=LARGEST_FILE)
     except OSError as error:
         raise SceneError(f"{path} cannot be read ({error.strerror}): restore the file.") from error
 
 
-def _check_binary(path, data, count_parameters):
+def _check_binary(path: pathlib.Path, data: bytes, count_parameters: _Count) -> None:
     walk = _WALKS[path.stem]
     if not data:
         raise SceneError(f"{path} is empty: copy or export it again.")
@@ -74,12 +73,12 @@ def _check_binary(path, data, count_parameters):
         )
 
 
-def _walk_camera(path, data, at, count_parameters):
+def _walk_camera(path: pathlib.Path, data: bytes, at: int, count_parameters: _Count) -> int:
     camera, model, _, _ = struct.unpack_from("<IiQQ", data, at)
     return at + 24 + 8 * _parameters(path, f"camera {camera}", model, count_parameters)
 
 
-def _walk_image(path, data, at, _):
+def _walk_image(path: pathlib.Path, data: bytes, at: int, _: _Count) -> int:
     (image,) = struct.unpack_from("<I", data, at)
     pose = struct.unpack_from("<7d", data, at + 4)
     end = data.find(b"\0", at + 64)
@@ -96,7 +95,7 @@ def _walk_image(path, data, at, _):
     return end + 9 + 24 * observations
 
 
-def _walk_point(path, data, at, _):
+def _walk_point(path: pathlib.Path, data: bytes, at: int, _: _Count) -> int:
     point, *position = struct.unpack_from("<Q3d", data, at)
     if not all(map(math.isfinite, position)):
         raise SceneError(
@@ -106,7 +105,7 @@ def _walk_point(path, data, at, _):
     return at + 51 + 8 * track
 
 
-def _walk_rig(path, data, at, _):
+def _walk_rig(path: pathlib.Path, data: bytes, at: int, __: _Count) -> int:
     _, sensors = struct.unpack_from("<II", data, at)
     at += 8 + 8 * min(sensors, 1)  # the first sensor is the origin and has no pose
     for _ in range(sensors - 1):
@@ -115,7 +114,7 @@ def _walk_rig(path, data, at, _):
     return at
 
 
-def _walk_frame(path, data, at, _):
+def _walk_frame(path: pathlib.Path, data: bytes, at: int, _: _Count) -> int:
     frame, _, *pose, photographs = struct.unpack_from("<II7dI", data, at)
     _check_pose(f"{path}: frame {frame}", pose)
     return at + 68 + 16 * photographs
@@ -127,7 +126,7 @@ _WALKS = {
 }
 
 
-def _check_text(path, data, count_parameters):
+def _check_text(path: pathlib.Path, data: bytes, count_parameters: _Count) -> None:
     try:
         lines = data.decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
@@ -173,7 +172,7 @@ def _check_text(path, data, count_parameters):
                 )
 
 
-def _parameters(path, camera, model, count_parameters):
+def _parameters(path: pathlib.Path, camera: str, model: int | str, count_parameters: _Count) -> int:
     try:
         return count_parameters(model)
     except (ValueError, KeyError) as error:
@@ -183,7 +182,7 @@ def _parameters(path, camera, model, count_parameters):
         ) from error
 
 
-def _check_pose(label, pose):
+def _check_pose(label: str, pose: Sequence[float]) -> None:
     if not all(map(math.isfinite, pose)):
         raise SceneError(
             f"{label}: its pose is not finite: delete the image from the model or solve it again."
@@ -195,6 +194,6 @@ def _check_pose(label, pose):
         )
 
 
-def _check_finite(label, values):
+def _check_finite(label: str, values: Sequence[float]) -> None:
     if not all(map(math.isfinite, values)):
         raise SceneError(f"{label} holds a value that is not finite: export the model again.")

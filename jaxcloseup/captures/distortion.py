@@ -103,8 +103,8 @@ def undistortion_map(
     fx, fy, cx, cy = intrinsics
     matrix = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
     coefficients = np.array(distortion.coefficients)
-    make = cv2.fisheye.initUndistortRectifyMap if distortion.fisheye else None
-    make = make or cv2.initUndistortRectifyMap
+    fisheye, perspective = cv2.fisheye.initUndistortRectifyMap, cv2.initUndistortRectifyMap
+    make = fisheye if distortion.fisheye else perspective
     x, y = make(matrix, coefficients, np.eye(3), matrix, (width, height), cv2.CV_32FC1)
     inside = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
     across = (np.arange(width) + 0.5 - cx) / fx

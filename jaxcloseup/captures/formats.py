@@ -99,11 +99,11 @@ def read_listing(
             f"add {_SEPARATE}, {_SINGLE}, {_LLFF}, or a COLMAP model in {', '.join(_MODELS)} or in "
             "the folder itself."
         )
-        if photographs := None if format else _photographs_in(path):
+        if pictures := None if format else _photographs_in(path):
             target = shlex.quote(f"{path.resolve().name}_capture")
             raise SceneError(
                 f"{path} holds no capture but photographs: find their poses with jaxcloseup "
-                f"process --images={shlex.quote(str(photographs))} --output_dir={target}, or "
+                f"process --images={shlex.quote(str(pictures))} --output_dir={target}, or "
                 f"{files}"
             )
         raise SceneError(f"{path} holds no capture{wanted}: {files}")
@@ -241,7 +241,7 @@ def _seen_in_training(train: Sequence[Frame], count: int) -> np.ndarray:
 
     A point that only other photographs see would leak their content into training.
     """
-    seen = [frame.seen for frame in train]
-    if any(rows is None for rows in seen):
+    seen = [frame.seen for frame in train if frame.seen is not None]
+    if len(seen) < len(train):
         return np.ones(count, bool)
     return np.bincount(np.concatenate(seen), minlength=count) >= 2

@@ -121,7 +121,7 @@ def _pixels(data: np.ndarray) -> float:
         # Pillow warns of many pixels too, and of fields that do not matter here.
         with _filters, warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            with PIL.Image.open(io.BytesIO(data)) as image:
+            with PIL.Image.open(io.BytesIO(data.data)) as image:
                 return math.prod(image.size)
     except PIL.Image.DecompressionBombError:
         return math.inf

@@ -50,7 +50,7 @@ def attach_masks(
     places = {frame.file: list(_places(folder, frame.file)) for frame in waiting}
     holders = sorted({holder for found in places.values() for holder, _ in found})
     pictures = functools.cache(_by_stem)  # list each folder once
-    found = {}
+    found: dict[pathlib.Path, pathlib.Path | None] = {}
     for file, around in places.items():
         masks = (_find(pictures(place), file, _IN_FOLDER) for _, place in around)
         found[file] = next((mask for mask in masks if mask), None)
@@ -66,10 +66,10 @@ def attach_masks(
     for file in found:
         beside = _find(pictures(file.parent), file, _BESIDE)
         found[file] = found[file] or (None if beside in listed else beside)
-    masked = [file for file, mask in found.items() if mask]
+    masked = {file: mask for file, mask in found.items() if mask}
     if not holders and not masked:
         return splits, ()
-    _check_shared({file: found[file] for file in masked})
+    _check_shared(masked)
     count = len(masked) + total - len(waiting)
     note = f"{folder.resolve().name}: {count} of {total} photographs have a mask"
     if count < total:

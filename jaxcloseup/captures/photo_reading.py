@@ -8,6 +8,7 @@ import os
 import pathlib
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -76,7 +77,7 @@ def _one_at_a_time(function: Callable[..., Remap]) -> Callable[..., Remap]:
     """Lock a cached function, so that concurrent threads compute each map once."""
     lock = threading.Lock()
 
-    def locked(*arguments):
+    def locked(*arguments: Any) -> Remap:
         with lock:
             return function(*arguments)
 
@@ -164,6 +165,7 @@ def _make_photo(
         )
     mask = None
     if mask_picture is not None:
+        assert frame.mask is not None
         mask = read_mask(frame.mask, data=mask_picture)
         mask = 255 - mask if reading.invert_masks else mask
         if frame.reduced and mask.shape[::-1] == frame.size:
@@ -205,6 +207,7 @@ def _without_alpha(photo: Photo) -> Photo:
 
 def _check_reduced(frame: Frame, size: tuple[int, int], downscale: int) -> None:
     """Raise if the shrunk copy's size differs from the expected one by more than rounding."""
+    assert frame.size is not None  # `attach_reduced` needs it
     if any(abs(side - whole / downscale) > 1 for side, whole in zip(size, frame.size, strict=True)):
         raise SceneError(
             f"{frame.reduced} is {size[0]} x {size[1]} pixels, which is not {frame.size[0]} x "

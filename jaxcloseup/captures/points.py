@@ -39,7 +39,7 @@ def read_ply_points(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
 
 def _colors(vertices: np.ndarray) -> np.ndarray:
     names = ["red", "green", "blue"]
-    if not set(names) <= set(vertices.dtype.names):
+    if not set(names) <= set(vertices.dtype.names or ()):
         return np.full((len(vertices), 3), 0.5, np.float32)
     rgb = np.stack([vertices[name] for name in names], -1)
     if rgb.dtype.kind in "iu":

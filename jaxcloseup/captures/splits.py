@@ -238,13 +238,14 @@ def _choose(
     for key, (split, names) in lists.items():
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise SceneError(f"{file}: {key} must be a list of the frames' {field}: correct it.")
-        unlisted = [name for name in names if find(name) is None]
+        members = {name: find(name) for name in names}
+        unlisted = [name for name in names if members[name] is None]
         if unlisted:
             raise SceneError(
                 f"{file}: {key} names {unlisted[0]!r}, which is no frame's {field} "
                 f"({len(unlisted)} of {len(names)} such names): correct it."
             )
-        splits[split] = [find(name) for name in names]
+        splits[split] = [frame for name in names if (frame := members[name]) is not None]
     return splits
 
 

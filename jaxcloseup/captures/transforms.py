@@ -69,7 +69,9 @@ def _read_frame(path: pathlib.Path, fields: dict[str, Any], entry: dict[str, Any
     lens = {**fields, **entry}
     if ("w" in lens) != ("h" in lens):
         raise SceneError(f"{label}: w and h belong together: give both or neither.")
-    size = tuple(image_side(label, key, lens[key]) for key in "wh" if key in lens)
+    size = None
+    if "w" in lens:
+        size = image_side(label, "w", lens["w"]), image_side(label, "h", lens["h"])
     if "transform_matrix" not in entry:
         raise SceneError(f"{label}: no transform_matrix: give its camera-to-world pose.")
     pose = rigid_transform(label, "transform_matrix", entry["transform_matrix"])
@@ -84,7 +86,7 @@ def _read_frame(path: pathlib.Path, fields: dict[str, Any], entry: dict[str, Any
         file=_find(path.parent, listed),
         mask=_find(path.parent, mask) if mask else None,
         camtoworld=pose * np.array([1, -1, -1, 1]),  # OpenGL to OpenCV: y and z change sign
-        size=size or None,
+        size=size,
         lens=(entry, fields),
         distortion=read_distortion(label, lens),
     )

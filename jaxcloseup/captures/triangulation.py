@@ -85,7 +85,7 @@ def _find_features(image: np.ndarray, mask: np.ndarray) -> _Features:
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if scale < 1 else image
     usable = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) if scale < 1 else mask
     # Without precise upscaling OpenCV's keypoints are a quarter of a pixel off.
-    sift = cv2.SIFT_create(nfeatures=_MAX_FEATURES, enable_precise_upscale=True)
+    sift = cv2.SIFT.create(nfeatures=_MAX_FEATURES, enable_precise_upscale=True)
     gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
     keypoints, descriptors = sift.detectAndCompute(gray, np.uint8(255) * (usable >= 128))
     if not keypoints:

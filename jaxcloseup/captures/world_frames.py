@@ -84,7 +84,7 @@ def check_photographs(path: pathlib.Path, frames: Sequence[Frame]) -> None:
 
 
 def _focal(label: str, lens: dict[str, Any], width: int, height: int) -> tuple[float, float] | None:
-    def one(keys: tuple[str, str], angle: str, side: int) -> float | None:
+    def along(keys: tuple[str, str], angle: str, side: int) -> float | None:
         for key in keys:
             if key in lens:
                 return number(label, key, lens[key], above=0)
@@ -95,8 +95,9 @@ def _focal(label: str, lens: dict[str, Any], width: int, height: int) -> tuple[f
             raise SceneError(f"{label}: {angle} must be in radians, below pi, got {radians}.")
         return side / 2 / math.tan(radians / 2)
 
-    x = one(("fx", "fl_x"), "camera_angle_x", width)
-    y = one(("fy", "fl_y"), "camera_angle_y", height)
-    if x is None and y is None:
-        return None
-    return (y if x is None else x), (x if y is None else y)
+    x = along(("fx", "fl_x"), "camera_angle_x", width)
+    y = along(("fy", "fl_y"), "camera_angle_y", height)
+    if x is None or y is None:
+        focal = y if x is None else x
+        return None if focal is None else (focal, focal)
+    return x, y

@@ -129,7 +129,7 @@ def cache_path(*parts: str) -> pathlib.Path:
 
 def content_hash(data: bytes | np.ndarray) -> str:
     """Return the SHA-256 of some bytes, or of the values of an array, in hexadecimal."""
-    return hashlib.sha256(memoryview(data)).hexdigest()
+    return hashlib.sha256(data.data if isinstance(data, np.ndarray) else data).hexdigest()
 
 
 def hash_files(files: Iterable[pathlib.Path]) -> str:

@@ -77,7 +77,8 @@ def write_vertices(
     Raises:
       OSError: one sentence that names the path and the reason.
     """
-    fields = [(name, vertices.dtype[name].str[1:]) for name in vertices.dtype.names]
+    names = vertices.dtype.names or ()
+    fields = [(name, vertices.dtype[name].str[1:]) for name in names]
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
     lines += [f"property {_NAMES[kind]} {name}" for name, kind in fields]
     data = vertices.astype([(name, "<" + kind) for name, kind in fields]).tobytes()

@@ -11,7 +11,8 @@ import pathlib
 import pickle
 import struct
 import zipfile
-from typing import Any
+from collections.abc import Callable
+from typing import IO, Any
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from jaxcloseup.io.messages import printable, reason
 
 
 LARGEST_FILE = LARGEST  # bytes, also unpacked; the largest known file of weights has 528 MiB
-_TYPES = {
+_TYPES: dict[str, np.dtype] = {
     "FloatStorage": np.dtype(np.float32),
     "DoubleStorage": np.dtype(np.float64),
     "HalfStorage": np.dtype(np.float16),
@@ -66,73 +67,73 @@ def read_tensors(path: str | pathlib.Path) -> dict[str, np.ndarray]:
     return dict(found)
 
 
-def _read_zip(path):
+def _read_zip(path: pathlib.Path) -> Any:
     with zipfile.ZipFile(path) as archive:
         if sum(part.file_size for part in archive.infolist()) > LARGEST_FILE:
             raise ValueError(f"unpacked, it has more than {LARGEST_FILE >> 20} MiB")
         inner = next(name for name in archive.namelist() if name.endswith("data.pkl"))
         root = inner.removesuffix("data.pkl")
 
-        def load(kind, key):
+        def load(kind: _Kind, key: str) -> _Storage:
             return _Storage(np.frombuffer(archive.read(f"{root}data/{key}"), kind.dtype))
 
         return _built(_Unpickler(io.BytesIO(archive.read(inner)), load).load())
 
 
-def _read_legacy(path):
+def _read_legacy(path: pathlib.Path) -> Any:
     with path.open("rb") as file:
         storages: dict[str, _Storage] = {}
 
-        def later(kind, key):
+        def later(kind: _Kind, key: str) -> _Storage:
             # The numbers follow the pickle, so tensors are built after it.
             return storages.setdefault(key, _Storage(np.zeros(0, kind.dtype)))
 
         if _Unpickler(file, later).load() != _MAGIC or _Unpickler(file, later).load() != _VERSION:
             raise ValueError("its magic number is not PyTorch's")
         _Unpickler(file, later).load()  # sizes of the writer's integers
-        found = _Unpickler(file, later).load()
+        value = _Unpickler(file, later).load()
         for key in _Unpickler(file, later).load():
             (count,) = struct.unpack("<q", file.read(8))
             kind = storages[key].numbers.dtype
             if not 0 <= count <= LARGEST_FILE:
                 raise ValueError(f"a storage claims {count} numbers")
             storages[key].numbers = np.frombuffer(file.read(count * kind.itemsize), kind, count)
-    return _built(found)
+    return _built(value)
 
 
-def _built(found):
-    """The tensors of a dictionary, once their storages are read."""
-    if not isinstance(found, dict):
-        return found
+def _built(value: Any) -> Any:
+    """Build the tensors of a dictionary, once their storages are read."""
+    if not isinstance(value, dict):
+        return value
     return {
-        name: _array(value) if isinstance(value, _Tensor) else value
-        for name, value in found.items()
+        name: _array(item) if isinstance(item, _Tensor) else item for name, item in value.items()
     }
 
 
 class _Kind:
     """The type of a storage; nothing that a pickle could call."""
 
-    def __init__(self, dtype):
+    def __init__(self, dtype: np.dtype) -> None:
         self.dtype = dtype
 
 
 class _Storage:
     """Numbers that tensors share."""
 
-    def __init__(self, numbers):
+    def __init__(self, numbers: np.ndarray) -> None:
         self.numbers = numbers
 
 
 class _Tensor:
     """A part of a storage, whose numbers may not have been read yet."""
 
-    def __init__(self, storage, offset, shape, strides, *_):
+    # A pickle calls this with anything, which `_array` checks.
+    def __init__(self, storage: Any, offset: Any, shape: Any, strides: Any, *_: Any) -> None:
         self.storage, self.offset, self.shape, self.strides = storage, offset, shape, strides
 
 
-def _array(tensor):
-    """A tensor as an array of its own.
+def _array(tensor: _Tensor) -> np.ndarray:
+    """Copy a tensor to an array.
 
     A pickle may set any attribute to anything that it can build, so this believes none of them.
     """
@@ -149,23 +150,23 @@ def _array(tensor):
     last = offset + sum((n - 1) * step for n, step in zip(shape, strides, strict=True))
     if last >= numbers.size or math.prod(shape) > numbers.size:
         raise ValueError("a tensor reaches beyond its storage")
-    strides = [step * numbers.itemsize for step in strides]
-    return np.lib.stride_tricks.as_strided(numbers[offset:], shape, strides).copy()
+    steps = [step * numbers.itemsize for step in strides]
+    return np.lib.stride_tricks.as_strided(numbers[offset:], shape, steps).copy()
 
 
-def _parameter(tensor, *_):
+def _parameter(tensor: Any, *_: Any) -> Any:
     return tensor
 
 
 class _Unpickler(pickle.Unpickler):
     """Builds tensors, dictionaries and numbers, and refuses anything else."""
 
-    def __init__(self, file, load):
+    def __init__(self, file: IO[bytes], load: Callable[[_Kind, str], _Storage]) -> None:
         super().__init__(file, encoding="utf-8")
         self._load = load
 
     def find_class(self, module: str, name: str) -> Any:
-        """The function or type behind a name, if a pickle may use it."""
+        """Return the function or type behind a name, if a pickle may use it."""
         known = {
             ("collections", "OrderedDict"): collections.OrderedDict,
             ("torch._utils", "_rebuild_tensor_v2"): _Tensor,
@@ -178,7 +179,7 @@ class _Unpickler(pickle.Unpickler):
         return known[module, name]
 
     def persistent_load(self, pid: Any) -> Any:
-        """The storage with the type and key in `pid`."""
+        """Return the storage with the type and key in `pid`."""
         _, kind, key, *_ = pid
         if not isinstance(kind, _Kind) or not isinstance(key, str):
             raise pickle.UnpicklingError("a storage has no type or no name")
