@@ -24,30 +24,23 @@ class LabelConfig:
         choices=("warp", "residual"),
     )
     magnification: tuple[float, float] = setting(
-        (2.0, 8.0),
-        "range of lambda, by how much nearer virtual cameras are",
-        low=1,
-        rising=True,
+        (2.0, 8.0), "range of lambda, by how much nearer virtual cameras are", low=1, rising=True
     )
     max_angle: float = setting(
-        math.pi / 4,
-        "epsilon, the largest change of each Euler angle in radians",
+        math.pi / 4, "epsilon, the largest change of each Euler angle in radians"
     )
     anchor_tolerance: float = setting(
-        math.inf,
-        "largest relative distance of an anchor from its view's mean depth",
+        math.inf, "largest relative distance of an anchor from its view's mean depth"
     )
     look_at: bool = setting(False, "turn virtual cameras about the anchor, not about themselves")
     fixed_anchors: bool = setting(False, "draw only the four anchors of the paper's ablation")
     use_mask: bool = setting(True, "keep labels only where both warps agree in color")
     rgb_tolerance: float = setting(0.05, "epsilon of the mask, the largest difference of a channel")
     depth_tolerance: float = setting(
-        math.inf,
-        "largest relative difference from the source view's depth",
+        math.inf, "largest relative difference from the source view's depth"
     )
     max_ray_angle: float = setting(
-        math.inf,
-        "largest angle between the rays of a virtual pixel and its source in radians",
+        math.inf, "largest angle between the rays of a virtual pixel and its source in radians"
     )
     num_sources: int = setting(1, "photographs whose colors are averaged", low=1)
     forward_label: bool = setting(False, "take colors from the forward warps")
@@ -58,9 +51,7 @@ class LabelConfig:
         "as published",
     )
     label_loss_weight: float = setting(
-        0.5,
-        "weight of the labels' loss in a step; the photographs' loss has the rest",
-        high=1,
+        0.5, "weight of the labels' loss in a step; the photographs' loss has the rest", high=1
     )
     lr_scale: float = setting(1.0, "factor on the learning rates in steps with labels")
     expected_depth: bool | None = setting(

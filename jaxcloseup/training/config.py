@@ -10,14 +10,10 @@ class TrainConfig:
     """How much one step looks at."""
 
     num_rays: int | None = setting(
-        1024,
-        "pixels of photographs in a step; none takes one whole photograph",
-        low=1,
+        1024, "pixels of photographs in a step; none takes one whole photograph", low=1
     )
     num_label_rays: int | None = setting(
-        1024,
-        "labeled pixels in a step; none takes the whole virtual image",
-        low=1,
+        1024, "labeled pixels in a step; none takes the whole virtual image", low=1
     )
     label_rule: str = setting(
         "paper",

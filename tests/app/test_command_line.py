@@ -59,8 +59,10 @@ def call(*words, folder=ROOT):
 
 
 def test_the_command_knows_all_programs(monkeypatch, capsys):
-    found = {path.stem for path in (ROOT / "experiments").glob("[a-z]*.py")} - {"bench"}
+    files = pathlib.Path(command.__file__).parent.glob("*.py")
+    found = {path.stem for path in files if "\ndef main(_: list" in path.read_text()}
     assert set(command.PROGRAMS) == found
+    assert all((ROOT / "experiments" / f"{name}.py").is_file() for name in found)
     for words in ([], ["--help"]):
         monkeypatch.setattr("sys.argv", ["jaxcloseup", *words])
         command.main()
@@ -86,24 +88,16 @@ def test_help_does_not_wait_for_jax(name, tmp_path):
     assert same.stdout == done.stdout
 
 
-def test_a_new_flag_is_one_line():
-    """A program's flag is defined in its file under a topic, and is in its help alone."""
-    code = (
-        "import sys\n"
-        "from absl import flags\n"
-        "from jaxcloseup.app.cli import {0}\n"
-        "from jaxcloseup.app.cli.start import start\n"
-        "from jaxcloseup.app.cli.topics import topic\n"
-        'line = \'flags.DEFINE_integer("trial", 3, "a trial flag", lower_bound=2)\'\n'
-        "with topic('Trials'):\n"
-        "    exec(line, vars(mesh))\n"
-        "sys.argv[0] = '{0}'\n"
-        "start({0})"
-    ).replace("(mesh)", "({0})")
-    done = call("-c", code.format("mesh"), "--help")
-    assert "\nTrials:\n  --trial=3               a trial flag\n" in done.stdout + "\n"
-    done = call("-c", code.format("mesh"), "--trial=1")
-    assert done.stderr == ("jaxcloseup mesh: --trial=1 must be a whole number of at least 2\n")
+def test_a_new_flag_is_one_line(tmp_path):
+    """A program's file defines a flag, under a topic or none; its help and its errors know it."""
+    source = (ROOT / "jaxcloseup" / "app" / "cli" / "mesh.py").read_text()
+    line = 'flags.DEFINE_integer("trial", 3, "a trial flag", lower_bound=2)\n\n\ndef main('
+    (tmp_path / "trial.py").write_text(source.replace("def main(", line))
+    code = "import trial; from jaxcloseup.app.cli.start import start; start(trial)"
+    done = call("-c", code, "--help", folder=tmp_path)
+    assert "\n  --trial=3               a trial flag\n" in done.stdout
+    done = call("-c", code, "--trial=1", folder=tmp_path)
+    assert done.stderr == "jaxcloseup trial: --trial=1 must be a whole number of at least 2\n"
 
 
 def test_help_shows_each_shared_flag_under_one_topic():

@@ -24,15 +24,12 @@ class TargetConfig:
     """How target views are labeled and learned where random close-ups differ."""
 
     label: str = setting(
-        "warp",
-        "source of labels, as in `LabelConfig`",
-        choices=("warp", "residual"),
+        "warp", "source of labels, as in `LabelConfig`", choices=("warp", "residual")
     )
     label_loss_weight: float = setting(0.5, "weight of the labels' loss in a step", high=1)
     lr_scale: float = setting(1.0, "factor on the learning rates in steps with labels")
     control_lr_scale: float = setting(
-        1.0,
-        "factor on the learning rates of `test_time_control`, as many steps without labels",
+        1.0, "factor on the learning rates of `test_time_control`, as many steps without labels"
     )
 
 
@@ -50,9 +47,7 @@ class WindowConfig:
         low=1,
     )
     whole_share: float = setting(
-        0.4,
-        "share of the steps, or pixels, that read a whole reduced photograph",
-        high=1,
+        0.4, "share of the steps, or pixels, that read a whole reduced photograph", high=1
     )
 
 
@@ -82,20 +77,16 @@ class Preset:
         low=1,
     )
     gated: bool = setting(
-        False,
-        "let held-out training photographs decide the weight of labels, which may be 0",
+        False, "let held-out training photographs decide the weight of labels, which may be 0"
     )
     windows: WindowConfig | None = setting(
-        None,
-        "how steps read finer photographs; none reads reduced photographs only",
+        None, "how steps read finer photographs; none reads reduced photographs only"
     )
     coarse: CoarseConfig | None = setting(
-        None,
-        "training before stage 1; none begins stage 1 with the initial points",
+        None, "training before stage 1; none begins stage 1 with the initial points"
     )
     targets: TargetConfig | None = setting(
-        None,
-        "how target views are labeled; none labels them as random close-ups",
+        None, "how target views are labeled; none labels them as random close-ups"
     )
 
     @property

@@ -25,8 +25,7 @@ class NerfTrainingConfig(NerfConfig, DepthConfig, AdamConfig):
     initial_lr: float = 5e-4
     lr_decay_steps: int = 250_000
     normalize: bool = setting(
-        False,
-        "scale the scene to the unit cube around the cameras and their view",
+        False, "scale the scene to the unit cube around the cameras and their view"
     )
 
 

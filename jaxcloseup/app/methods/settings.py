@@ -172,7 +172,7 @@ def check_value(value: Any, kind: Any, limits: Limits) -> Any:
     or_none = " or none" if len(kinds) > 1 else ""
     if kind is str:
         if value not in limits.choices:
-            raise ValueError(" or ".join(limits.choices))
+            raise ValueError(" or ".join(limits.choices) + or_none)
         return value
     if kind is bool:
         if not isinstance(value, bool):

@@ -19,8 +19,7 @@ class McmcConfig:
     start: int = setting(500, "step after which relocations begin")
     stop: int = setting(25_000, "step before which relocations and growth end")
     growth: float = setting(
-        1.05,
-        "largest factor by which one relocation multiplies the number of living splats",
+        1.05, "largest factor by which one relocation multiplies the number of living splats"
     )
     min_opacity: float = setting(0.005, "splats no more opaque than this are dead", high=1)
     noise: float = setting(
@@ -46,8 +45,7 @@ class AdaptiveConfig:
     shrink: float = setting(1.6, "factor by which the halves of a split splat are smaller")
     min_opacity: float = setting(0.05, "fainter splats are removed", high=1)
     huge: float = setting(
-        0.1,
-        "larger splats are removed after the first reset, unless they are split",
+        0.1, "larger splats are removed after the first reset, unless they are split"
     )
     reset_every: int = setting(3000, "steps between resets of the opacities", low=1)
     reset_opacity: float = setting(0.01, "largest opacity after a reset", high=1)
@@ -77,9 +75,7 @@ class RasterizeConfig:
         high=64,
     )
     chunk: int | None = setting(
-        None,
-        "splats of a tile that loops evaluate at once; none is 8",
-        low=1,
+        None, "splats of a tile that loops evaluate at once; none is 8", low=1
     )
     block: int | None = setting(
         None,
@@ -158,17 +154,13 @@ class SplatConfig:
         "compares unchanged colors",
     )
     ssim_weight: float = setting(
-        0.2,
-        "share of 1 - SSIM in the image loss; the absolute difference has the rest",
-        high=1,
+        0.2, "share of 1 - SSIM in the image loss; the absolute difference has the rest", high=1
     )
     distortion_weight: float = setting(
-        1.0,
-        "weight of the spread of light along a ray, scaled to a mean depth of 1",
+        1.0, "weight of the spread of light along a ray, scaled to a mean depth of 1"
     )
     regularize_from: int = setting(
-        3000,
-        "first step with the losses of distortion and of surfels' normals",
+        3000, "first step with the losses of distortion and of surfels' normals"
     )
     opacity_weight: float = setting(0.01, "weight of the mean opacity")
     scale_weight: float = setting(0.01, "weight of the mean scale")
@@ -179,12 +171,10 @@ class SplatConfig:
     )
     means_lr_steps: int = setting(30_000, "steps over which `means_lr` decays", low=1)
     late_lr_scale: float = setting(
-        1.0,
-        "factor on all learning rates from step `means_lr_steps` on",
+        1.0, "factor on all learning rates from step `means_lr_steps` on"
     )
     sh_lr: float = setting(
-        2.5e-3,
-        "Adam's learning rate of the constant color; view-dependent color has 1/20 of it",
+        2.5e-3, "Adam's learning rate of the constant color; view-dependent color has 1/20 of it"
     )
     opacity_lr: float = setting(5e-2, "Adam's learning rate of the opacity logits")
     scale_lr: float = setting(5e-3, "Adam's learning rate of the log scales")
@@ -196,8 +186,7 @@ class SplatConfig:
         low=1e-6,
     )
     selective_adam: bool = setting(
-        False,
-        "update only splats that a step sees, see `scale_by_selective_adam`",
+        False, "update only splats that a step sees, see `scale_by_selective_adam`"
     )
     density: Hashable | None = setting(
         McmcConfig(),

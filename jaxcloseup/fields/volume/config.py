@@ -13,37 +13,26 @@ class NerfConfig:
     depth: int = setting(8, "layers of the trunk", low=1, high=64)
     width: int = setting(256, "width of the trunk's layers", low=1)
     skip_after: int = setting(
-        4,
-        "index of the trunk's layer after which the encoded position enters again",
+        4, "index of the trunk's layer after which the encoded position enters again"
     )
     position_octaves: int = setting(10, "octaves of the positional encoding of positions", high=64)
     direction_octaves: int = setting(
-        4,
-        "octaves of the positional encoding of view directions",
-        high=64,
+        4, "octaves of the positional encoding of view directions", high=64
     )
     direction_width: int = setting(128, "width of the layer that sees the view direction", low=1)
     num_coarse: int = setting(64, "stratified samples per ray of the coarse network", low=1)
     num_fine: int = setting(
-        64,
-        "importance samples per ray; the fine network sees these and the coarse ones",
-        low=1,
+        64, "importance samples per ray; the fine network sees these and the coarse ones", low=1
     )
     density_noise: float = setting(1.0, "standard deviation of noise on raw densities in training")
     background: float | None = setting(
-        None,
-        "gray level behind the scene; none adds nothing, which is black",
-        high=1,
+        None, "gray level behind the scene; none adds nothing, which is black", high=1
     )
     chunk: int | None = setting(
-        None,
-        "rays rendered at once; none chooses by `rays_in_cache`",
-        low=1,
+        None, "rays rendered at once; none chooses by `rays_in_cache`", low=1
     )
     compute_dtype: str = setting(
-        "float32",
-        "type of the operands of the network's products",
-        choices=("float32", "bfloat16"),
+        "float32", "type of the operands of the network's products", choices=("float32", "bfloat16")
     )
 
 
@@ -54,34 +43,24 @@ class MipNerfConfig:
     depth: int = setting(8, "layers of the trunk", low=1, high=64)
     width: int = setting(256, "width of the trunk's layers", low=1)
     skip_after: int = setting(
-        4,
-        "index of the trunk's layer after which the encoded position enters again",
+        4, "index of the trunk's layer after which the encoded position enters again"
     )
     position_octaves: int = setting(16, "octaves of the integrated positional encoding", high=64)
     direction_octaves: int = setting(
-        4,
-        "octaves of the positional encoding of view directions",
-        high=64,
+        4, "octaves of the positional encoding of view directions", high=64
     )
     direction_width: int = setting(128, "width of the layer that sees the view direction", low=1)
     num_coarse: int = setting(128, "intervals per ray of the coarse pass", low=1)
     num_fine: int = setting(128, "intervals per ray of the fine pass", low=1)
     coarse_weight: float = setting(0.1, "weight of the coarse colors in the loss")
     spacing: float = setting(
-        1.0,
-        "exponent of the coarse pass's spacing, see `spaced`",
-        low=-100,
-        high=1,
+        1.0, "exponent of the coarse pass's spacing, see `spaced`", low=-100, high=1
     )
     background: float | None = setting(
-        None,
-        "gray level behind the scene; none adds nothing, which is black",
-        high=1,
+        None, "gray level behind the scene; none adds nothing, which is black", high=1
     )
     chunk: int | None = setting(
-        None,
-        "rays rendered at once; none chooses by `rays_in_cache`",
-        low=1,
+        None, "rays rendered at once; none chooses by `rays_in_cache`", low=1
     )
 
 
@@ -92,10 +71,7 @@ class HashGridConfig:
     levels: int = setting(16, "number of grids", low=1, high=64)
     features: int = setting(2, "trained numbers at each vertex", low=1, high=64)
     log2_entries: int = setting(
-        19,
-        "base-2 logarithm of the largest number of entries of a level",
-        low=1,
-        high=28,
+        19, "base-2 logarithm of the largest number of entries of a level", low=1, high=28
     )
     coarsest: int = setting(16, "cells along each side of the first grid", low=1)
     finest: int = setting(2048, "cells along each side of the last grid", low=1)
@@ -134,23 +110,16 @@ class NgpConfig:
     width: int = setting(64, "width of hidden layers", low=1)
     proposal_width: int = setting(16, "width of the proposals' hidden layer", low=1)
     color_layers: int = setting(
-        2,
-        "hidden layers of the color network; the density network has one",
-        high=64,
+        2, "hidden layers of the color network; the density network has one", high=64
     )
     direction_octaves: int = setting(
-        4,
-        "octaves of the positional encoding of view directions",
-        high=64,
+        4, "octaves of the positional encoding of view directions", high=64
     )
     num_coarse: int = setting(256, "intervals per ray of the first proposal", low=1)
     num_middle: int = setting(96, "intervals per ray of the second proposal; 0 leaves it out")
     num_fine: int = setting(48, "intervals per ray that are rendered", low=1)
     spacing: float = setting(
-        1.0,
-        "exponent of the first round's spacing, see `spaced`",
-        low=-100,
-        high=1,
+        1.0, "exponent of the first round's spacing, see `spaced`", low=-100, high=1
     )
     contracted: bool = setting(
         False,
@@ -159,9 +128,7 @@ class NgpConfig:
     )
     distortion_weight: float = setting(0.0, "weight of mip-NeRF 360's distortion")
     background: float | None = setting(
-        None,
-        "gray level behind the scene; none adds nothing, which is black",
-        high=1,
+        None, "gray level behind the scene; none adds nothing, which is black", high=1
     )
     chunk: int = setting(2**15, "rays rendered at once", low=1)
 
@@ -179,34 +146,23 @@ class TensorfConfig:
     appearance: int = setting(27, "appearance features, the color network's input", low=1)
     width: int = setting(128, "width of the color network's two hidden layers", low=1)
     octaves: int = setting(
-        2,
-        "octaves of the positional encodings of view directions and of appearance",
-        high=64,
+        2, "octaves of the positional encodings of view directions and of appearance", high=64
     )
     density_shift: float = setting(
-        -10.0,
-        "added to the sum of products before softplus",
-        low=-1e6,
-        high=1e6,
+        -10.0, "added to the sum of products before softplus", low=-1e6, high=1e6
     )
     density_scale: float = setting(25.0, "density per field unit where softplus is 1")
     sparsity_weight: float = setting(8e-5, "weight of the mean absolute density factor")
     smoothness_weight: float = setting(
-        0.1,
-        "weight of the mean squared difference of neighboring factors",
+        0.1, "weight of the mean squared difference of neighboring factors"
     )
     num_coarse: int = setting(512, "intervals per ray of the first round", low=1)
     num_fine: int = setting(128, "intervals per ray that are rendered", low=1)
     spacing: float = setting(
-        1.0,
-        "exponent of the first round's spacing, see `spaced`",
-        low=-100,
-        high=1,
+        1.0, "exponent of the first round's spacing, see `spaced`", low=-100, high=1
     )
     background: float | None = setting(
-        None,
-        "gray level behind the scene; none adds nothing, which is black",
-        high=1,
+        None, "gray level behind the scene; none adds nothing, which is black", high=1
     )
     chunk: int = setting(2**12, "rays rendered at once", low=1)
 
@@ -233,14 +189,10 @@ class ZipNerfConfig:
     )
     width: int = setting(64, "width of hidden layers", low=1)
     color_layers: int = setting(
-        3,
-        "hidden layers of the color network; density networks have one",
-        high=64,
+        3, "hidden layers of the color network; density networks have one", high=64
     )
     direction_octaves: int = setting(
-        4,
-        "octaves of the positional encoding of view directions",
-        high=64,
+        4, "octaves of the positional encoding of view directions", high=64
     )
     num_coarse: int = setting(64, "intervals per ray of the first proposal", low=1)
     num_middle: int = setting(64, "intervals per ray of the second proposal; 0 leaves it out")
@@ -248,10 +200,7 @@ class ZipNerfConfig:
     proposal_points: int = setting(6, "Gaussians of each interval of a proposal; the paper has 6")
     points: int = setting(6, "Gaussians of each interval that is rendered; the paper has 6")
     spacing: float = setting(
-        -1.5,
-        "exponent of the first round's spacing, see `spaced`",
-        low=-100,
-        high=1,
+        -1.5, "exponent of the first round's spacing, see `spaced`", low=-100, high=1
     )
     contracted: bool = setting(
         True,
@@ -262,8 +211,6 @@ class ZipNerfConfig:
     distortion_weight: float = setting(0.01, "weight of mip-NeRF 360's distortion")
     decay_weight: float = setting(0.1, "weight of the mean square of each level's features")
     background: float | None = setting(
-        None,
-        "gray level behind the scene; none adds nothing, which is black",
-        high=1,
+        None, "gray level behind the scene; none adds nothing, which is black", high=1
     )
     chunk: int = setting(2**14, "rays rendered at once", low=1)

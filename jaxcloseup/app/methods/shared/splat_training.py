@@ -108,13 +108,20 @@ def refine(
     each = min(max(0, free) // views, math.prod(pyramid.sizes[level]))
     sample = _sampler(config, each)
     # With all rows, so that what is compiled here is what renders the field later.
-    shown = _with_rows((surfels, buffers), config.capacity)
+    padded, padded_buffers = _with_rows((surfels, buffers), config.capacity)
 
     def search(view: int) -> Any:
         camera = pyramid.camera(camera_at(cameras, view), view, level)
-        photograph, seen = to_float(pyramid.image(view, level)), render(*shown, camera)
-        data = photograph[..., :3], photograph[..., 3], seen.rgb, label_depth(seen)
-        return sample(jax.random.fold_in(key, view), camera, *data)
+        photograph = to_float(pyramid.image(view, level))
+        seen = render(padded, padded_buffers, camera)
+        return sample(
+            jax.random.fold_in(key, view),
+            camera,
+            photograph[..., :3],
+            photograph[..., 3],
+            seen.rgb,
+            label_depth(seen),
+        )
 
     new = _search_each(search, views, "photographs searched")
     # The filter of finer photographs is smaller, so what the coarse one made stays as it is.
@@ -150,8 +157,14 @@ def add_for_targets(
     def search(view: int) -> Any:
         camera = camera_at(labels.cameras, view)
         seen = render(camera)
-        data = labels.rgb[view], labels.weight[view], seen.rgb, label_depth(seen)
-        return sample(jax.random.fold_in(key, view), camera, *data)
+        return sample(
+            jax.random.fold_in(key, view),
+            camera,
+            labels.rgb[view],
+            labels.weight[view],
+            seen.rgb,
+            label_depth(seen),
+        )
 
     new, found = _search_each(search, count, "views searched for more")
     old = state.params, state.buffers.alive
