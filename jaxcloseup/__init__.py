@@ -3,8 +3,26 @@
 Names load their modules on first use, so `import jaxcloseup` is cheap.
 """
 
+from typing import TYPE_CHECKING
+
 from jaxcloseup.lazy import lazy_names
 
+
+if TYPE_CHECKING:  # type checkers do not follow the lazy list below
+    from jaxcloseup.captures.load import load_scene
+    from jaxcloseup.fields.contract import RadianceField, Rendering
+    from jaxcloseup.fields.splats.render import render_surfels
+    from jaxcloseup.fields.splats.surfels import Surfels, surfels_from_points
+    from jaxcloseup.geometry.cameras import Camera
+    from jaxcloseup.labels.config import LabelConfig, pseudo_settings
+    from jaxcloseup.labels.make import PseudoLabel, PseudoSettings, make_label
+    from jaxcloseup.labels.target_views import best_source, label_views
+    from jaxcloseup.photos.scene import Scene, SceneError
+    from jaxcloseup.photos.support import find_support
+    from jaxcloseup.photos.views import Views
+    from jaxcloseup.training.config import TrainConfig
+    from jaxcloseup.training.steps import TrainState, init_state, pseudo_step, train_step
+    from jaxcloseup.version import __version__
 
 __all__, __getattr__, __dir__ = lazy_names(
     __name__,

@@ -167,8 +167,7 @@ def label_pixels(
 ) -> PseudoLabel:
     """Label pixels of a virtual view from the training photographs.
 
-    It is compiled here: the steps, gate, audit and pictures of a run share one program, and callers
-    that are not compiled themselves get the same digits.
+    Compiled here, so that steps, gate, audit and pictures of a run share a program and its digits.
 
     Args:
       camera: the virtual camera.
@@ -198,10 +197,9 @@ def label_pixels(
         return jax.tree.map(jnp.add, sums, new)
 
     none = jnp.zeros(depth.shape, points.dtype)
+    start = jnp.zeros((*depth.shape, 3), points.dtype), none, none
     count = jnp.clip(settings.num_sources.astype(jnp.int32), 1, len(views))
-    colors, weight, known = jax.lax.fori_loop(
-        0, count, add_source, (jnp.zeros((*depth.shape, 3), points.dtype), none, none)
-    )
+    colors, weight, known = jax.lax.fori_loop(0, count, add_source, start)
     defined = known > 0
     weight = safe_divide(weight, known)
     backward = safe_divide(colors, known[..., None])
