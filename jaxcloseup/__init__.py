@@ -20,8 +20,10 @@ if TYPE_CHECKING:  # type checkers do not follow the lazy list below
     from jaxcloseup.photos.scene import Scene, SceneError
     from jaxcloseup.photos.support import find_support
     from jaxcloseup.photos.views import Views
+    from jaxcloseup.training.arms import arm_state, run_arms, stack_arms, stack_states
     from jaxcloseup.training.config import TrainConfig
-    from jaxcloseup.training.steps import TrainState, init_state, pseudo_step, train_step
+    from jaxcloseup.training.state import TrainState, init_state
+    from jaxcloseup.training.steps import closeup_step, pseudo_step, train_step
     from jaxcloseup.version import __version__
 
 __all__, __getattr__, __dir__ = lazy_names(

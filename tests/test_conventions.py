@@ -106,35 +106,24 @@ def faults_of_lengths(name):
 
 _LEFT = {
     "docstrings": """
-fields/splats/adaptive.py fields/splats/control.py fields/splats/culling.py
-fields/splats/density.py fields/splats/ellipsoids.py fields/splats/filters.py
-fields/splats/mcmc.py fields/splats/projection.py fields/splats/refinement.py
-fields/splats/regularizers.py fields/splats/selective_adam.py
-fields/splats/spherical_harmonics.py fields/splats/splat_field.py fields/splats/surfels.py
-fields/splats/tile_test.py fields/splats/tiling.py fields/splats/vectors.py
 fields/volume/compositing.py fields/volume/cones.py fields/volume/config.py
 fields/volume/coordinates.py fields/volume/depth_supervision.py fields/volume/encodings.py
 fields/volume/hash_fields.py fields/volume/hash_grid.py fields/volume/interpolation.py
-fields/volume/networks.py fields/volume/rays.py fields/volume/regularizers.py
-fields/volume/samplers.py fields/volume/tensorf.py fields/volume/zipnerf.py
-metrics/image_metrics.py metrics/perceptual.py photos/pyramids.py photos/scene.py
-photos/support.py photos/tsdf.py photos/views.py photos/windows.py training/loss.py
-training/sampling.py training/steps.py
+fields/volume/networks.py fields/volume/rays.py fields/volume/samplers.py
+fields/volume/tensorf.py fields/volume/zipnerf.py metrics/image_metrics.py metrics/perceptual.py
+photos/pyramids.py photos/scene.py photos/views.py photos/windows.py
 """,
     "arguments": """
 fields/splats/splat_math.py fields/volume/depth_supervision.py training/loss.py
 """,
     "lengths": """
-app/jobs/render.py app/process/pipeline.py app/run/loop.py app/run/programs.py app/run/setup.py
-app/run/stages.py captures/colmap.py captures/folder.py captures/formats.py captures/load.py
-captures/photo_reading.py captures/splits.py drawn_scenes/lighting.py drawn_scenes/raycast.py
-drawn_scenes/textures/materials.py drawn_scenes/textures/prints.py fields/splats/blend_lax.py
-fields/splats/blend_pallas.py fields/splats/ellipsoids.py fields/splats/projection.py
-fields/splats/splat_field.py fields/volume/hash_fields.py fields/volume/rays.py
-fields/volume/tensorf.py labels/make.py photos/gather.py training/steps.py
+app/cli/sweep.py app/process/pipeline.py app/sweep/scene_sweeps.py captures/colmap.py
+captures/folder.py captures/formats.py captures/load.py drawn_scenes/lighting.py
+fields/splats/ellipsoids.py fields/splats/projection.py fields/volume/hash_fields.py
+fields/volume/rays.py fields/volume/tensorf.py photos/gather_sums.py
 """,
     "names": """
-choices compare evaluate mesh process render run sweep table view
+arms choices render table threads
 """,
 }
 LEFT = {kind: set(files.split()) for kind, files in _LEFT.items()}

@@ -211,13 +211,9 @@ def label_pixels(
     agree = union.hit & rgb_consistent(backward, forward, settings.rgb_tolerance)
     from_forward = settings.forward_label > 0
     keep = jnp.where(settings.use_mask > 0, agree, union.hit | ~from_forward)
-    label = PseudoLabel(
-        rgb=jnp.where(from_forward, forward, backward),
-        weight=jnp.where(defined & keep, weight, 0),
-        backward=backward,
-        forward=forward,
-    )
-    return jax.lax.stop_gradient(label)
+    rgb = jnp.where(from_forward, forward, backward)
+    weight = jnp.where(defined & keep, weight, 0)
+    return jax.lax.stop_gradient(PseudoLabel(rgb, weight, backward, forward))
 
 
 def _read_source(
