@@ -49,6 +49,43 @@ def read_colmap(
     Raises:
       SceneError: names the file and the record in it, and says what to do.
     """
+    suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"
+    reconstruction = _reconstruct(model, suffix)
+    source, cameras = model / f"images{suffix}", model / f"cameras{suffix}"
+    lenses = {i: _lens(cameras, camera) for i, camera in reconstruction.cameras.items()}
+    images = [image for image in reconstruction.images.values() if image.has_pose]
+    images.sort(key=lambda image: image.name)
+    _check_names(source, [image.name for image in images])
+    table = model / f"points3D{suffix}"
+    numbers = sorted(reconstruction.points3D)
+    xyz = np.array([reconstruction.points3D[i].xyz for i in numbers], np.float64).reshape(-1, 3)
+    keep = plausible(table, xyz, np.stack([image.projection_center() for image in images]))
+    kept = [point for point, good in zip(numbers, keep, strict=True) if good]
+    known, rows = set(numbers), {point: row for row, point in enumerate(kept)}
+    frames = []
+    for image in images:
+        lens, size = lenses[image.camera_id]
+        frame = _frame(
+            image, source, photographs, lens, size, f"{cameras}: camera {image.camera_id}"
+        )
+        seen = {point.point3D_id for point in image.get_observation_points2D()}
+        if absent := seen - known:
+            raise SceneError(
+                f"{source}: image {image.name!r} shows point {min(absent)}, which {table} lacks: "
+                "export the model again."
+            )
+        visible = np.array(sorted(rows[point] for point in seen & rows.keys()), np.int64)
+        frames.append(frame._replace(seen=visible))
+    check_photographs(source, frames)
+    colors = [reconstruction.points3D[i].color for i in kept]
+    rgb = np.array(colors, np.float32).reshape(-1, 3) / 255
+    errors = np.array([reconstruction.points3D[i].error for i in kept], np.float32).reshape(-1)
+    errors = np.where(errors >= 0, errors, np.nan)  # COLMAP writes -1 for an unknown one
+    return source, frames, (xyz[keep].astype(np.float32), rgb), errors
+
+
+def _reconstruct(model: pathlib.Path, suffix: str) -> Any:
+    """Check the files of a model, then let pycolmap read them."""
     try:
         import pycolmap
     except ImportError as error:
@@ -56,7 +93,6 @@ def read_colmap(
             f"{model} is a COLMAP model, and reading it needs pycolmap: install it with "
             "pip install 'jaxcloseup[colmap]'."
         ) from error
-    suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"
 
     def count_parameters(name: int | str) -> int:
         kinds = pycolmap.CameraModelId
@@ -73,56 +109,38 @@ def read_colmap(
         raise SceneError(
             f"{model}: its files do not match each other ({reason}): export the model again."
         ) from error
+    return reconstruction
 
-    source, cameras = model / f"images{suffix}", model / f"cameras{suffix}"
-    lenses = {i: _lens(cameras, camera) for i, camera in reconstruction.cameras.items()}
-    images = [image for image in reconstruction.images.values() if image.has_pose]
-    images.sort(key=lambda image: image.name)
-    _check_names(source, [image.name for image in images])
-    table = model / f"points3D{suffix}"
-    numbers = sorted(reconstruction.points3D)
-    xyz = np.array([reconstruction.points3D[i].xyz for i in numbers], np.float64).reshape(-1, 3)
-    keep = plausible(table, xyz, np.stack([image.projection_center() for image in images]))
-    kept = [point for point, good in zip(numbers, keep, strict=True) if good]
-    known, rows = set(numbers), {point: row for row, point in enumerate(kept)}
-    frames = []
-    for image in images:
-        world_to_camera = image.cam_from_world().matrix()
-        rotation = world_to_camera[:, :3].T
-        # pycolmap normalizes the quaternions of images, but not those of frames.
-        with np.errstate(all="ignore"):
-            rigid = np.allclose(rotation.T @ rotation, np.eye(3), atol=_RIGID)
-        if not rigid:
-            raise SceneError(
-                f"{source}: image {image.name!r} has a pose whose rotation is none: export the "
-                "model again."
-            )
-        lens, size = lenses[image.camera_id]
-        seen = {point.point3D_id for point in image.get_observation_points2D()}
-        if absent := seen - known:
-            raise SceneError(
-                f"{source}: image {image.name!r} shows point {min(absent)}, which {table} lacks: "
-                "export the model again."
-            )
-        frames.append(
-            Frame(
-                source=source,
-                listed=image.name,
-                file=photographs / image.name,
-                mask=None,
-                camtoworld=np.column_stack([rotation, -rotation @ world_to_camera[:, 3]]),
-                size=size,
-                lens=(lens, {}),
-                distortion=read_distortion(f"{cameras}: camera {image.camera_id}", lens),
-                seen=np.array(sorted(rows[point] for point in seen & rows.keys()), np.int64),
-            )
+
+def _frame(
+    image: Any,
+    source: pathlib.Path,
+    photographs: pathlib.Path,
+    lens: dict[str, Any],
+    size: tuple[int, int],
+    camera: str,
+) -> Frame:
+    """Convert an image of pycolmap; `camera` names its lens in error messages."""
+    world_to_camera = image.cam_from_world().matrix()
+    rotation = world_to_camera[:, :3].T
+    # pycolmap normalizes the quaternions of images, but not those of frames.
+    with np.errstate(all="ignore"):
+        rigid = np.allclose(rotation.T @ rotation, np.eye(3), atol=_RIGID)
+    if not rigid:
+        raise SceneError(
+            f"{source}: image {image.name!r} has a pose whose rotation is none: export the "
+            "model again."
         )
-    check_photographs(source, frames)
-    colors = [reconstruction.points3D[i].color for i in kept]
-    rgb = np.array(colors, np.float32).reshape(-1, 3) / 255
-    errors = np.array([reconstruction.points3D[i].error for i in kept], np.float32).reshape(-1)
-    errors = np.where(errors >= 0, errors, np.nan)  # COLMAP writes -1 for an unknown one
-    return source, frames, (xyz[keep].astype(np.float32), rgb), errors
+    return Frame(
+        source=source,
+        listed=image.name,
+        file=photographs / image.name,
+        mask=None,
+        camtoworld=np.column_stack([rotation, -rotation @ world_to_camera[:, 3]]),
+        size=size,
+        lens=(lens, {}),
+        distortion=read_distortion(camera, lens),
+    )
 
 
 def _lens(file: pathlib.Path, camera: Any) -> tuple[dict[str, Any], tuple[int, int]]:
