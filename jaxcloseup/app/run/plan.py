@@ -9,13 +9,25 @@ from jaxcloseup.photos.scene import Scene
 
 # Seconds of a step, or of a whole part, of a default run of `table` on two cores.
 _STEP = {
-    **{"coarse_baseline": 0.044, "baseline": 0.1, "control": 0.1, "closeup": 0.2},
-    **{"test_time_control": 0.1, "test_time": 0.2},
+    "coarse_baseline": 0.044,
+    "baseline": 0.1,
+    "control": 0.1,
+    "closeup": 0.2,
+    "test_time_control": 0.1,
+    "test_time": 0.2,
 }
 _PART = {
-    **{"refine_baseline": 11, "depths": 30, "gate": 5, "closeup_labels": 30, "detail": 46},
-    **{"test_time_labels": 2, "audit": 10, "dolly": 10, "report": 4},
-    **{"baseline_evaluation": 10, "detail_evaluation": 15},
+    "refine_baseline": 11,
+    "depths": 30,
+    "gate": 5,
+    "closeup_labels": 30,
+    "detail": 46,
+    "test_time_labels": 2,
+    "audit": 10,
+    "dolly": 10,
+    "report": 4,
+    "baseline_evaluation": 10,
+    "detail_evaluation": 15,
 }
 _EVALUATION = 3.5  # seconds of any other
 _RAYS = 8  # times as long for images of a field that renders single rays
