@@ -71,16 +71,7 @@ def load_capture(
 
 
 def _load(listing: Listing, reading: Reading) -> Scene:
-    transform = listing.fields.get("applied_transform")
-    if transform is not None:
-        transform = affine_transform(str(listing.file), "applied_transform", transform)
-        if np.linalg.matrix_rank(transform[:, :3]) < 3:
-            raise SceneError(
-                f"{listing.file}: applied_transform flattens space and has no inverse: correct it."
-            )
-    scale = listing.fields.get("applied_scale", 1.0)
-    scale = number(str(listing.file), "applied_scale", scale, above=0)
-
+    transform, scale = _applied(listing)
     parts = read_photos(listing.frames, reading)
     photos = [photo for members in parts.values() for photo in members]
     check_weights(listing.folder, listing.frames, photos, reading)
@@ -134,6 +125,19 @@ def _load(listing: Listing, reading: Reading) -> Scene:
         # With a zoom, finer photographs would show the very crops that are held out.
         photographs_at=None if reading.zoom > 1 else functools.partial(_read_at, listing, reading),
     )
+
+
+def _applied(listing: Listing) -> tuple[np.ndarray | None, float]:
+    """Return the transform `[3, 4]`, if any, and the scale that made the world of the files."""
+    transform = listing.fields.get("applied_transform")
+    if transform is not None:
+        transform = affine_transform(str(listing.file), "applied_transform", transform)
+        if np.linalg.matrix_rank(transform[:, :3]) < 3:
+            raise SceneError(
+                f"{listing.file}: applied_transform flattens space and has no inverse: correct it."
+            )
+    scale = listing.fields.get("applied_scale", 1.0)
+    return transform, number(str(listing.file), "applied_scale", scale, above=0)
 
 
 def _is_oriented(listing: Listing) -> bool:

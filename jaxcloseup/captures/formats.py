@@ -94,19 +94,7 @@ def read_listing(
     """
     found = [(kind, name) for kind, name in _detect(path) if format in (None, kind)]
     if not found:
-        wanted = f" in the format {format}" if format else ""
-        files = (
-            f"add {_SEPARATE}, {_SINGLE}, {_LLFF}, or a COLMAP model in {', '.join(_MODELS)} or in "
-            "the folder itself."
-        )
-        if pictures := None if format else _photographs_in(path):
-            target = shlex.quote(f"{path.resolve().name}_capture")
-            raise SceneError(
-                f"{path} holds no capture but photographs: find their poses with jaxcloseup "
-                f"process --images={shlex.quote(str(pictures))} --output_dir={target}, or "
-                f"{files}"
-            )
-        raise SceneError(f"{path} holds no capture{wanted}: {files}")
+        raise _no_capture(path, format)
     (kind, name), *others = found
     folder = _folder_of_model(path) if name == "." else path
     content = {"transforms": _read_transforms, "colmap": _read_model, "llff": _read_llff}[kind](
@@ -154,6 +142,23 @@ def read_listing(
         times_nearer=division.times_nearer,
         errors=None if content.errors is None else content.errors[keep],
     )
+
+
+def _no_capture(path: pathlib.Path, format: str | None) -> SceneError:
+    """Return the error for a folder that holds no capture of this format."""
+    kind = f" in the format {format}" if format else ""
+    files = (
+        f"add {_SEPARATE}, {_SINGLE}, {_LLFF}, or a COLMAP model in {', '.join(_MODELS)} or in "
+        "the folder itself."
+    )
+    if pictures := None if format else _photographs_in(path):
+        target = shlex.quote(f"{path.resolve().name}_capture")
+        return SceneError(
+            f"{path} holds no capture but photographs: find their poses with jaxcloseup "
+            f"process --images={shlex.quote(str(pictures))} --output_dir={target}, or "
+            f"{files}"
+        )
+    return SceneError(f"{path} holds no capture{kind}: {files}")
 
 
 def _detect(path: pathlib.Path) -> list[tuple[str, str]]:
