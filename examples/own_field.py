@@ -49,10 +49,9 @@ BOUND = {"field": FIELD, "optimizer": optax.adam(0.02), "config": jc.TrainConfig
 
 if __name__ == "__main__":
     views, depths = jax.vmap(photograph, (0, None))(jnp.linspace(-0.6, 0.6, 5), 2.0)
-    near, _ = photograph(0.1, 0.8)
-    labels = views, depths, jc.pseudo_settings(jc.LabelConfig())
+    (near, _), settings = photograph(0.1, 0.8), jc.pseudo_settings(jc.LabelConfig())
     state = jc.init_state(jax.random.key(0), None, None, field=FIELD, optimizer=optax.adam(0.02))
-    for step, data in ((jc.train_step, (views,)), (jc.pseudo_step, labels)):
+    for step, data in ((jc.train_step, (views,)), (jc.pseudo_step, (views, depths, settings))):
         compiled = jax.jit(functools.partial(step, **BOUND))
         for _ in range(20):
             state, _ = compiled(state, *data)
