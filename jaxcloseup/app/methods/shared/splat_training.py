@@ -171,7 +171,8 @@ def add_for_targets(
     surfels, alive, changed = _replace_least(*old, _in_kind(new, state.params), found)
     state = replace_surfels(state, surfels, alive, changed)
     interval = _intervals(config, surfels, scene)
-    return state.replace(buffers=state.buffers.replace(interval=interval))
+    buffers = state.buffers.replace(interval=interval)
+    return dataclasses.replace(state, buffers=buffers)
 
 
 def _search_each(search: Callable[[int], Any], count: int, what: str) -> Any:
