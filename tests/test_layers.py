@@ -37,7 +37,7 @@ ROOMS = {
     "view": {"methods", "score", "progress", "run", "store"},
     "process": {"progress"},
     "cli": {
-        *("methods", "score", "progress", "run", "report", "view", "process", "store", "sweep"),
+        *("methods", "score", "progress", "run", "report", "view", "process", "store", "sweep")
     },
 }
 LIBRARIES_OF_GEOMETRY = {"jax", "chex", "flax", "typing", "collections", "jaxcloseup"}

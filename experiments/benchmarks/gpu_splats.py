@@ -67,12 +67,7 @@ def splat_rates(cases: Sequence[Case], known: Mapping[str, float]) -> list[dict[
         surfels_, camera = splats.discs_on_a_wall(count, image)
         config, pairs = _config(surfels_, camera)
         for compositor in _compositors():
-            row = {
-                "splats": count,
-                "image": list(image),
-                "compositor": compositor,
-                "pairs": pairs,
-            }
+            row = {"splats": count, "image": list(image), "compositor": compositor, "pairs": pairs}
             try:
                 row |= _passes(surfels_, camera, _by(config, compositor), pairs, known)
             except Exception as error:  # such as too little memory

@@ -76,10 +76,7 @@ def _report(surfels, camera, rate):
     memory = compiled.memory_analysis().temp_size_in_bytes
 
     pixels = -(-size[0] // config.tile) * -(-size[1] // config.tile) * config.tile**2
-    calls = {
-        "forward": lambda: forward(surfels, camera),
-        "both": lambda: compiled(surfels, camera),
-    }
+    calls = {"forward": lambda: forward(surfels, camera), "both": lambda: compiled(surfels, camera)}
     scan_memory = None
     if pixels * longest * 80 < SCAN_BYTES:
         loss = functools.partial(

@@ -120,8 +120,7 @@ class Checkpoints:
         try:
             found = manager.restore(step, args=items)
             plain = jax.tree_util.tree_map_with_path(
-                lambda path, leaf: _follow(found["state"], path, leaf),
-                _plain(like),
+                lambda path, leaf: _follow(found["state"], path, leaf), _plain(like)
             )
             progress = _checked(plain, found["progress"])
         except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:

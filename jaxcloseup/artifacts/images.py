@@ -77,11 +77,7 @@ def encode_webp_animation(frames: Sequence[Image], *, fps: float, quality: int =
 
 
 def colorize_depth(
-    depth: Image,
-    *,
-    near: float | None = None,
-    far: float | None = None,
-    valid: Image | None = None,
+    depth: Image, *, near: float | None = None, far: float | None = None, valid: Image | None = None
 ) -> np.ndarray:
     """Map depth to colors, uint8 `[H, W, 3]`: near is red, far is blue, invalid is black.
 

@@ -55,10 +55,7 @@ def write_surfels(
         **dict(zip("xyz", np.asarray(surfels.means).T, strict=True)),
         **dict(zip(("nx", "ny", "nz"), normals.T, strict=True)),
         **_numbered("f_dc", sh[:, 0]),
-        **_numbered(
-            "f_rest",
-            sh[:, 1:].swapaxes(1, 2).reshape(len(sh), 3 * (sh.shape[1] - 1)),
-        ),
+        **_numbered("f_rest", sh[:, 1:].swapaxes(1, 2).reshape(len(sh), 3 * (sh.shape[1] - 1))),
         "opacity": surfels.opacity_logits,
         **_numbered("scale", scales),
         **_numbered("rot", np.asarray(surfels.quaternions)),

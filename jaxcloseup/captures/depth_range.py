@@ -39,10 +39,7 @@ def near_far_from_points(
 
 
 def depths_in_view(
-    points: np.ndarray,
-    camtoworld: np.ndarray,
-    intrinsics: np.ndarray,
-    size: Sequence[int],
+    points: np.ndarray, camtoworld: np.ndarray, intrinsics: np.ndarray, size: Sequence[int]
 ) -> np.ndarray:
     """Compute the z-depths `[Q]`, in world units, of the points that lie inside an image.
 

@@ -222,10 +222,7 @@ def _points_of(reading: Reading, frames: Sequence[Frame]) -> tuple[list[Frame], 
 
 
 def _near_far(
-    listing: Listing,
-    camtoworld: np.ndarray,
-    intrinsics: np.ndarray,
-    sizes: np.ndarray,
+    listing: Listing, camtoworld: np.ndarray, intrinsics: np.ndarray, sizes: np.ndarray
 ) -> tuple[float, float]:
     label = str(listing.file)
     given = {

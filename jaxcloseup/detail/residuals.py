@@ -121,11 +121,7 @@ def render_residuals(
     return Residuals(Pyramid(jnp.asarray(values), intrinsics, pyramid.sizes), jnp.stack(depths))
 
 
-def reproduced(
-    shown: Pyramid,
-    *,
-    blur: Callable[[Any, float], Any] = blur_images,
-) -> jax.Array:
+def reproduced(shown: Pyramid, *, blur: Callable[[Any, float], Any] = blur_images) -> jax.Array:
     """Return how far the model reproduces each photograph, `[V, H, W]` in [0, 1].
 
     Where it fails at the size that it learned from, its depth is not to be trusted either: a

@@ -143,11 +143,7 @@ def in_pyramid(solids: Solids, apex: jax.Array, corners: jax.Array) -> jax.Array
 
 
 def cast_rays(
-    solids: Solids,
-    origins: np.ndarray,
-    directions: np.ndarray,
-    *,
-    wanted: np.ndarray | None = None,
+    solids: Solids, origins: np.ndarray, directions: np.ndarray, *, wanted: np.ndarray | None = None
 ) -> Hit:
     """Find the first hits `[...]` of many rays `[..., 3]`, as NumPy arrays.
 

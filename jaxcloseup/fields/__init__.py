@@ -3,9 +3,4 @@
 from jaxcloseup.lazy import lazy_names
 
 
-__all__, __getattr__, __dir__ = lazy_names(
-    __name__,
-    {
-        "contract": "Rendering RadianceField",
-    },
-)
+__all__, __getattr__, __dir__ = lazy_names(__name__, {"contract": "Rendering RadianceField"})

@@ -37,11 +37,7 @@ from jaxcloseup.geometry.rotations import (
     quaternion_to_matrix,
 )
 from jaxcloseup.geometry.union_warp import SourceBlocks, block_sources, union_warp
-from jaxcloseup.geometry.visibility import (
-    VisiblePoints,
-    sample_where_visible,
-    sphere_in_view,
-)
+from jaxcloseup.geometry.visibility import VisiblePoints, sample_where_visible, sphere_in_view
 from jaxcloseup.geometry.warp import (
     BackwardWarp,
     ForwardWarp,

@@ -64,11 +64,7 @@ def label_views(
     def one_view(target: tuple[Camera, jax.Array]) -> tuple[jax.Array, jax.Array]:
         camera, depth = target
         source = best_source(
-            camera,
-            sources.views,
-            sources.depths,
-            depth=depth,
-            tolerance=settings.source_tolerance,
+            camera, sources.views, sources.depths, depth=depth, tolerance=settings.source_tolerance
         )
         label = label_pixels(camera, pixels, depth, source, sources, settings)
         return label.rgb, label.weight

@@ -202,9 +202,7 @@ def _fuse_block(
         camera = camera_at(maps.cameras, view)
         visible = sphere_in_view(camera, matmul(center - camera.position, camera.rotation), radius)
         return jax.lax.cond(
-            visible,
-            lambda: _add_view(sums, points, maps, truncation, values, view),
-            lambda: sums,
+            visible, lambda: _add_view(sums, points, maps, truncation, values, view), lambda: sums
         ), None
 
     none = jnp.zeros(len(points), points.dtype)

@@ -140,12 +140,7 @@ def _chunked_forward(
 
 
 def _add_up(
-    field: RadianceField,
-    chunk: int,
-    params: Any,
-    buffers: Any,
-    batch: Batch,
-    key: jax.Array | None,
+    field: RadianceField, chunk: int, params: Any, buffers: Any, batch: Batch, key: jax.Array | None
 ) -> tuple[Loss, Any]:
     """Return the loss and its gradients, one chunk of pixels after the other."""
     total = jnp.sum(batch.weight)

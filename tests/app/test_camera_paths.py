@@ -15,12 +15,7 @@ from tiny_runs import path_file
 from jaxcloseup.app.run.manifest import write_dataparser_transforms
 from jaxcloseup.app.view import camera_files, camera_paths
 from jaxcloseup.app.view.camera_files import read_camera_path
-from jaxcloseup.app.view.camera_paths import (
-    CameraError,
-    check_pixel,
-    dolly,
-    focus_point,
-)
+from jaxcloseup.app.view.camera_paths import CameraError, check_pixel, dolly, focus_point
 from jaxcloseup.app.view.orientation import up_direction
 from jaxcloseup.captures.load import SceneError, load_scene
 from jaxcloseup.geometry.cameras import Camera, pixels_to_points, points_to_pixels

@@ -19,12 +19,7 @@ from jaxcloseup.app.cli import flags as shared
 from jaxcloseup.app.cli import main as command
 from jaxcloseup.app.cli import run as program
 from jaxcloseup.app.cli import sweep, topics
-from jaxcloseup.app.cli.output_folder import (
-    LOCK,
-    check_unused,
-    choose_output_dir,
-    lock_output_dir,
-)
+from jaxcloseup.app.cli.output_folder import LOCK, check_unused, choose_output_dir, lock_output_dir
 from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.methods.settings import plain_config, settings_of
 from jaxcloseup.app.run.scene_input import load

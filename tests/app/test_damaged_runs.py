@@ -10,12 +10,7 @@ from wrong_input import endless, pipe, terabyte
 
 from jaxcloseup.app.cli import render, sweep
 from jaxcloseup.app.methods.registry import METHODS
-from jaxcloseup.app.methods.settings import (
-    check_value,
-    plain_config,
-    settings_of,
-    with_settings,
-)
+from jaxcloseup.app.methods.settings import check_value, plain_config, settings_of, with_settings
 from jaxcloseup.app.run import states
 from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.logs import TrainLog

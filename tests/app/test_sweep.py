@@ -242,10 +242,7 @@ def parsed_flags():
 )
 def test_flags_that_make_no_sense_are_one_sentence(parsed_flags, tmp_path, changes, message):
     out = str(tmp_path / "out")
-    with (
-        flagsaver.flagsaver(output_dir=out, **changes),
-        pytest.raises(SystemExit, match=message),
-    ):
+    with flagsaver.flagsaver(output_dir=out, **changes), pytest.raises(SystemExit, match=message):
         sweep.main(["sweep"])
     assert not (tmp_path / "out").exists()
 

@@ -178,9 +178,7 @@ CASES = {
         (ply(10**12, "1234", kind="binary_little_endian"), "before its 1000000000000 vertices do"),
         (terabyte("points3d.ply"), LARGE),
     ],
-    masked: [
-        (pipe("m.png"), NOT_ORDINARY),
-    ],
+    masked: [(pipe("m.png"), NOT_ORDINARY)],
     single: [
         (listing(train_filenames="images/000.png"), "train_filenames must be a list"),
         (listing(test_filenames=["000.png"]), r"test_filenames names '000\.png', which is no fr"),
@@ -295,8 +293,7 @@ CASES = {
 
 
 @pytest.mark.parametrize(
-    ("make", "change", "words"),
-    [(make, *case) for make, cases in CASES.items() for case in cases],
+    ("make", "change", "words"), [(make, *case) for make, cases in CASES.items() for case in cases]
 )
 def test_a_wrong_capture_is_refused_in_one_sentence(tmp_path, make, change, words):
     assert str(tmp_path) in refused(tmp_path, make, change, words)
@@ -340,12 +337,7 @@ WHOLE = "must be a whole number of at least"
         (llff, same, {"split": "closest"}, "closest needs points.*--format=colmap.*--split="),
         (single, same, {"zoom": 4}, "zoom needs split 'zoom', but split is 'given': leave out z"),
         *((single, same, {"split": "zoom", "zoom": x}, f"zoom {WHOLE} 2") for x in (1, 2.5, True)),
-        (
-            single,
-            same,
-            {"split": "zoom", "downscale": 2},
-            "downscale 2 times zoom 4 leaves",
-        ),
+        (single, same, {"split": "zoom", "downscale": 2}, "downscale 2 times zoom 4 leaves"),
         (single, masks(255), {"invert_masks": True}, "keeps black pixels; leave it out if"),
         (single, masks(0), {}, "white pixels are kept; set invert_masks if"),
         (single, same, {"invert_masks": True}, "no photograph has a mask to invert"),

@@ -61,9 +61,7 @@ def test_ssim_agrees_with_the_oracle(pair, weight):
     np.testing.assert_allclose(ssim(*pair), expected.mean(), atol=1e-5)
     centers = weight[5:-5, 5:-5]
     np.testing.assert_allclose(
-        ssim(*pair, weight=weight),
-        (expected.mean(-1) * centers).sum() / centers.sum(),
-        atol=1e-5,
+        ssim(*pair, weight=weight), (expected.mean(-1) * centers).sum() / centers.sum(), atol=1e-5
     )
 
 

@@ -56,11 +56,7 @@ with topic("Cameras"):
     flags.DEFINE_list("pixel", None, "x,y: pixel of the --from view, at the view's training size")
     flags.DEFINE_float("magnification", 4.0, "how many times nearer to the surface a dolly ends")
     flags.DEFINE_integer(
-        "frames",
-        60,
-        "number of frames of an orbit or a dolly",
-        lower_bound=1,
-        upper_bound=100_000,
+        "frames", 60, "number of frames of an orbit or a dolly", lower_bound=1, upper_bound=100_000
     )
     flags.DEFINE_float(
         "fps", None, "frames per second of the video; default: the camera path's, or 30"

@@ -5,8 +5,5 @@ from jaxcloseup.lazy import lazy_names
 
 __all__, __getattr__, __dir__ = lazy_names(
     __name__,
-    {
-        "method": "CoarseConfig Method Preset TargetConfig WindowConfig",
-        "registry": "METHODS",
-    },
+    {"method": "CoarseConfig Method Preset TargetConfig WindowConfig", "registry": "METHODS"},
 )

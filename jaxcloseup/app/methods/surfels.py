@@ -141,11 +141,7 @@ STANDARD = dataclasses.replace(
 def with_adaptive_density(preset: Preset, density: AdaptiveConfig) -> Preset:
     """Return the preset with clone, split and prune; it starts fainter, without decay."""
     field = dataclasses.replace(
-        preset.field,
-        density=density,
-        initial_opacity=0.1,
-        opacity_weight=0.0,
-        scale_weight=0.0,
+        preset.field, density=density, initial_opacity=0.1, opacity_weight=0.0, scale_weight=0.0
     )
     return dataclasses.replace(preset, field=field)
 

@@ -166,10 +166,7 @@ def print_sweep(scenes: Scenes) -> None:
 
 
 def write_sweep(
-    folder: pathlib.Path,
-    scenes: Scenes,
-    about: Mapping[str, Any],
-    pictures: Sequence[Picture] = (),
+    folder: pathlib.Path, scenes: Scenes, about: Mapping[str, Any], pictures: Sequence[Picture] = ()
 ) -> None:
     """Write `sweep.json`, `table.md`, `table.csv` and `report.html`.
 

@@ -42,9 +42,7 @@ def meet() -> None:
     """Wait until all hosts are here: one may be minutes behind, and collectives wait 30 seconds."""
     if jax.process_count() > 1:
         sync_global_processes(
-            f"arms {next(_meetings)}",
-            processes=set(range(jax.process_count())),
-            timeout=HOSTS_WAIT,
+            f"arms {next(_meetings)}", processes=set(range(jax.process_count())), timeout=HOSTS_WAIT
         )
 
 

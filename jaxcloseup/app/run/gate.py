@@ -70,9 +70,7 @@ def gated(labels: LabelConfig, gate: Mapping[str, Any] | None) -> PseudoSettings
 
 
 def weigh_labels(
-    sources: LabelSources,
-    render: Callable[[Camera], Rendering],
-    settings: PseudoSettings,
+    sources: LabelSources, render: Callable[[Camera], Rendering], settings: PseudoSettings
 ) -> dict[str, Any]:
     """Measure how well labels agree on left-out photographs, and derive their weight.
 

@@ -126,11 +126,7 @@ def label_target_views(
 
 
 def label_closeups(
-    programs: Programs,
-    start: LabelStart,
-    labels: LabelConfig,
-    keys: RunKeys,
-    get_detail: GetDetail,
+    programs: Programs, start: LabelStart, labels: LabelConfig, keys: RunKeys, get_detail: GetDetail
 ) -> Views:
     """Label random close-ups with detail, all before the first step: each costs a render.
 

@@ -25,10 +25,7 @@ FINER_RAYS = 1  # the same for fields that render single rays, and so whole imag
 
 
 def render_residuals(
-    programs: Programs,
-    state: TrainState,
-    pyramid: Pyramid,
-    views: Sequence[int] | None = None,
+    programs: Programs, state: TrainState, pyramid: Pyramid, views: Sequence[int] | None = None
 ) -> Residuals:
     """Render photographs' views, and subtract the renders from the photographs at every level.
 

@@ -59,13 +59,7 @@ def _refine_coarse(training: Training, stage: str, keys: RunKeys) -> TrainState:
     key_fine, key_refine = jax.random.split(jax.random.fold_in(state.key, state.step))
     with timed(training.seconds, f"refine_{stage}"):
         params, buffers = programs.method.refine(
-            key_refine,
-            preset.field,
-            state.params,
-            state.buffers,
-            render,
-            programs.scene,
-            pyramid,
+            key_refine, preset.field, state.params, state.buffers, render, programs.scene, pyramid
         )
     moments = jax.jit(programs.optimizer.init)(params)
     return TrainState(jnp.zeros_like(state.step), params, buffers, moments, key_fine)

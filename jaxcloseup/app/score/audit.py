@@ -129,10 +129,7 @@ def _audit_closeup(
 
 
 def error_curve(
-    score: np.ndarray,
-    error: np.ndarray,
-    total: int,
-    more: Mapping[str, np.ndarray] | None = None,
+    score: np.ndarray, error: np.ndarray, total: int, more: Mapping[str, np.ndarray] | None = None
 ) -> dict[str, list[float] | float] | None:
     """Return the mean error of the best labels by score, for a growing number of labels.
 

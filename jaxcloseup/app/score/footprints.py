@@ -69,11 +69,7 @@ def resolved_by_photographs(
 
 @jax.jit
 def seen_by(
-    camera: Camera,
-    pixels: jax.Array,
-    depth: jax.Array,
-    source: Camera,
-    source_depth: jax.Array,
+    camera: Camera, pixels: jax.Array, depth: jax.Array, source: Camera, source_depth: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Return where a source sees the surfaces of a camera, and how large its pixels are there.
 

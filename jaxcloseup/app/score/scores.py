@@ -200,10 +200,7 @@ def _full_metrics(image: jax.Array, truth: jax.Array, weight: jax.Array) -> Metr
 
 @jax.jit
 def _masked_metrics(image: jax.Array, truth: jax.Array, weight: jax.Array) -> Metrics:
-    return {
-        "psnr": psnr(image, truth, weight=weight),
-        "ssim": _ssim(image, truth, weight=weight),
-    }
+    return {"psnr": psnr(image, truth, weight=weight), "ssim": _ssim(image, truth, weight=weight)}
 
 
 @jax.jit

@@ -62,10 +62,7 @@ def _remove(config: dict[str, Any], name: str) -> None:
 
 
 def _rebuild(
-    value: Mapping[str, Any],
-    name: str,
-    records: Mapping[str, set[type]],
-    absent: dict[str, Any],
+    value: Mapping[str, Any], name: str, records: Mapping[str, set[type]], absent: dict[str, Any]
 ) -> Any:
     if name not in records:
         raise ValueError(f"{name} holds fields")

@@ -17,10 +17,7 @@ from jaxcloseup.io.files import read_object
 
 
 def sweep_methods(
-    folder: pathlib.Path,
-    methods: Sequence[str],
-    scenes: Mapping[str, str],
-    command: Sequence[str],
+    folder: pathlib.Path, methods: Sequence[str], scenes: Mapping[str, str], command: Sequence[str]
 ) -> list[str]:
     """Sweep method by method, scene by scene, and write the tables after each.
 

@@ -149,12 +149,7 @@ def check_pixel(camera: Camera, pixel: tuple[float, float]) -> tuple[int, int]:
 
 
 def dolly(
-    camera: Camera,
-    pixel: tuple[float, float],
-    depth: float,
-    *,
-    magnification: float,
-    frames: int,
+    camera: Camera, pixel: tuple[float, float], depth: float, *, magnification: float, frames: int
 ) -> Shots:
     """Return cameras that move from a view towards the surface at a pixel, without turning.
 

@@ -160,12 +160,7 @@ class Viewer:
         return int(ranks.argmax()), point, shown
 
     def render(
-        self,
-        camera: Camera,
-        *,
-        tuned: bool,
-        detail: bool,
-        say_steps: Callable[[int, int], None],
+        self, camera: Camera, *, tuned: bool, detail: bool, say_steps: Callable[[int, int], None]
     ) -> tuple[dict[str, Image], str]:
         """Return pictures of a camera by kind, and a description of the work.
 

@@ -58,9 +58,7 @@ def adaptive_control(
     """
     del means_lr
 
-    def wrap_optimizer(
-        optimizer: optax.GradientTransformation,
-    ) -> optax.GradientTransformation:
+    def wrap_optimizer(optimizer: optax.GradientTransformation) -> optax.GradientTransformation:
         return optax.chain(record_image_gradients(), optimizer)
 
     def adapt(key: jax.Array, state: Any) -> Any:

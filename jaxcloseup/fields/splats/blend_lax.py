@@ -12,13 +12,7 @@ from flax import struct
 from jax import lax
 
 from jaxcloseup.fields.splats.config import RasterPlan
-from jaxcloseup.fields.splats.layout import (
-    MOMENTS,
-    PAYLOAD,
-    Channels,
-    Trace,
-    pixel_rows,
-)
+from jaxcloseup.fields.splats.layout import MOMENTS, PAYLOAD, Channels, Trace, pixel_rows
 from jaxcloseup.fields.splats.splat_math import (
     TRANSMITTANCE_MIN,
     Moments,

@@ -17,14 +17,7 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
 from jaxcloseup.fields.splats.config import RasterPlan
-from jaxcloseup.fields.splats.layout import (
-    ANCHOR,
-    MOMENTS,
-    PAYLOAD,
-    Channels,
-    Column,
-    Trace,
-)
+from jaxcloseup.fields.splats.layout import ANCHOR, MOMENTS, PAYLOAD, Channels, Column, Trace
 from jaxcloseup.fields.splats.splat_math import (
     TRANSMITTANCE_MIN,
     Moments,
@@ -99,15 +92,7 @@ def backward(
         out_shape=jax.ShapeDtypeStruct((capacity, table.shape[1]), table.dtype),
         interpret=plan.interpret,
         compiler_params=_TILE,
-    )(
-        table,
-        *in_turn,
-        trace.transmittance,
-        trace.stop,
-        trace.reference,
-        sums_bar,
-        median_bar,
-    )
+    )(table, *in_turn, trace.transmittance, trace.stop, trace.reference, sums_bar, median_bar)
     return _add_pairs(pairs_bar, lists, table.shape[0], interpret=plan.interpret)
 
 

@@ -11,11 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.custom_derivatives import (
-    CustomVJPPrimal,
-    SymbolicZero,
-    custom_vjp_primal_tree_values,
-)
+from jax.custom_derivatives import CustomVJPPrimal, SymbolicZero, custom_vjp_primal_tree_values
 
 from jaxcloseup.fields.splats.ellipsoids import bounded_slopes
 from jaxcloseup.fields.splats.filters import DILATION, LOW_PASS, PIXEL_VARIANCE

@@ -13,11 +13,7 @@ Point = tuple[jax.Array, jax.Array]  # cos and sin `[N]`
 
 
 def disc_box(
-    center: Vector,
-    vectors: tuple[Vector, Vector],
-    cutoff: jax.Array,
-    camera: Camera,
-    near: float,
+    center: Vector, vectors: tuple[Vector, Vector], cutoff: jax.Array, camera: Camera, near: float
 ) -> list[jax.Array]:
     """Return exact bounds x0, y0, x1, y1 `[N]` in pixels of discs of radius `cutoff[N]`.
 

@@ -52,8 +52,7 @@ def project_ellipsoids(
     slopes = [ellipsoids.center[i] * inverse_depth for i in range(2)]
     center = [slopes[i] * focal[i] + principal[i] for i in range(2)]
     (first, below, second), kept = widen_ellipse(
-        *_image_axes(ellipsoids, slopes, inverse_depth, focal, camera),
-        antialias=antialias,
+        *_image_axes(ellipsoids, slopes, inverse_depth, focal, camera), antialias=antialias
     )
     opacity = opacity * kept
     none = jnp.zeros_like(depth)

@@ -141,11 +141,7 @@ def split_opacity(opacity: jax.Array, copies: jax.Array) -> tuple[jax.Array, jax
 
 
 def add_position_noise(
-    key: jax.Array,
-    surfels: Surfels,
-    alive: jax.Array,
-    learning_rate: jax.Array,
-    config: McmcConfig,
+    key: jax.Array, surfels: Surfels, alive: jax.Array, learning_rate: jax.Array, config: McmcConfig
 ) -> Surfels:
     """Move means by Gaussian noise within their discs or ellipsoids, faint ones most.
 

@@ -240,11 +240,7 @@ def _homographies(
     ray = [(anchor[i] - principal[i]) / focal[i] for i in range(2)]
     at_centers: tuple[jax.Array | int, ...] = (0, 0, inverse_depth)  # exact, unlike the sum
     u, v, w = (
-        (
-            jnp.where(centered, at_center, x * ray[0] + y * ray[1] + z),
-            x / focal[0],
-            y / focal[1],
-        )
+        (jnp.where(centered, at_center, x * ray[0] + y * ray[1] + z), x / focal[0], y / focal[1])
         for (x, y, z), at_center in zip(covectors, at_centers, strict=True)
     )
     return (u, v, w), edge_on

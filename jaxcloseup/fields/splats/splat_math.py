@@ -249,9 +249,7 @@ def pull_back(
 
 
 def sum_pixels(
-    pulled: Pulled,
-    moments: Callable[[jax.Array], Moments],
-    total: Callable[[jax.Array], jax.Array],
+    pulled: Pulled, moments: Callable[[jax.Array], Moments], total: Callable[[jax.Array], jax.Array]
 ) -> PulledSums:
     """Sum cotangents over the pixels of a tile, by functions for moments and for plain sums."""
     return PulledSums(

@@ -14,11 +14,7 @@ def dot(a: Vector, b: Vector) -> jax.Array:
 
 def cross(a: Vector, b: Vector) -> Vector:
     """Return cross products."""
-    return (
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    )
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 def scaled(factor: jax.Array, vector: Vector) -> Vector:

@@ -105,10 +105,5 @@ def interval_field(
         return Traced(Rendering(fine.rgb, fine.depth, fine.alpha, aux), colored)
 
     return ray_field(
-        extent,
-        init=init,
-        trace=trace,
-        chunk=config.chunk,
-        loss=loss,
-        supervision=supervision,
+        extent, init=init, trace=trace, chunk=config.chunk, loss=loss, supervision=supervision
     )

@@ -61,13 +61,7 @@ def nerf_field(
         background=config.background,
         chunk=config.chunk or rays_in_cache(config.num_coarse + config.num_fine, config.width),
     )
-    return volume_field(
-        volume,
-        extent,
-        init=init,
-        query=query,
-        supervision=supervision,
-    )
+    return volume_field(volume, extent, init=init, query=query, supervision=supervision)
 
 
 def _init(key: jax.Array, config: NerfConfig) -> Params:

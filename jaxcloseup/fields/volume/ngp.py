@@ -13,12 +13,7 @@ from jaxcloseup.fields.contract import RadianceField
 from jaxcloseup.fields.volume.config import NgpConfig
 from jaxcloseup.fields.volume.coordinates import contract
 from jaxcloseup.fields.volume.depth_supervision import DepthSupervision
-from jaxcloseup.fields.volume.hash_fields import (
-    GEOMETRY,
-    hash_field,
-    init_color_network,
-    init_part,
-)
+from jaxcloseup.fields.volume.hash_fields import GEOMETRY, hash_field, init_color_network, init_part
 from jaxcloseup.fields.volume.hash_grid import hash_features
 from jaxcloseup.fields.volume.intervals import Histogram
 from jaxcloseup.fields.volume.networks import Params

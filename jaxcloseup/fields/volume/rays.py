@@ -174,11 +174,7 @@ def ray_field(
 
 
 def photometric_loss(
-    rendering: Rendering,
-    target_rgb: jax.Array,
-    weight: jax.Array,
-    *,
-    coarse_weight: float = 1.0,
+    rendering: Rendering, target_rgb: jax.Array, weight: jax.Array, *, coarse_weight: float = 1.0
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Weighted mean squared error of the fine and the coarse colors (NeRF, eq. 6), and penalties.
 

@@ -81,13 +81,7 @@ def volume_field(
     def trace(params: Any, buffers: Any, key: jax.Array | None, rays: Rays) -> Traced:
         return _two_passes(config, extent, functools.partial(query, params, buffers), key, rays)
 
-    return ray_field(
-        extent,
-        init=init,
-        trace=trace,
-        chunk=config.chunk,
-        supervision=supervision,
-    )
+    return ray_field(extent, init=init, trace=trace, chunk=config.chunk, supervision=supervision)
 
 
 def _two_passes(

@@ -59,21 +59,13 @@ def tensorf_field(
         return positions, extent.scale * per_field_unit.reshape(edges.shape[0], -1)
 
     def look(
-        params: Params,
-        buffers: TensorfBuffers,
-        key: jax.Array | None,
-        rays: Rays,
-        edges: jax.Array,
+        params: Params, buffers: TensorfBuffers, key: jax.Array | None, rays: Rays, edges: jax.Array
     ) -> Samples:
         del key
         return Samples(density(params, buffers, rays, edges)[1], None)
 
     def render(
-        params: Params,
-        buffers: TensorfBuffers,
-        key: jax.Array | None,
-        rays: Rays,
-        edges: jax.Array,
+        params: Params, buffers: TensorfBuffers, key: jax.Array | None, rays: Rays, edges: jax.Array
     ) -> Samples:
         del key
         positions, absorbed = density(params, buffers, rays, edges)
@@ -194,8 +186,7 @@ def _grown(state: Any, old: int, new: int) -> Any:
     params = state.params | {name: grow(state.params[name]) for name in ("density", "color")}
     # Moments of other vertices say nothing of these; counts of steps stay.
     opt_state = jax.tree.map(
-        lambda x: jnp.zeros_like(x) if jnp.issubdtype(x.dtype, jnp.floating) else x,
-        state.opt_state,
+        lambda x: jnp.zeros_like(x) if jnp.issubdtype(x.dtype, jnp.floating) else x, state.opt_state
     )
     buffers = TensorfBuffers(jnp.asarray(new, jnp.int32))
     return state.replace(params=params, buffers=buffers, opt_state=opt_state)

@@ -13,11 +13,7 @@ from splat_scenes import random_scene, to_camera, to_surfels, trainer
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.fields.splats import RasterizeConfig, SurfelConfig
 from jaxcloseup.fields.splats.config import McmcConfig
-from jaxcloseup.fields.splats.splat_field import (
-    camera_extent,
-    surfel_field,
-    with_expected_depth,
-)
+from jaxcloseup.fields.splats.splat_field import camera_extent, surfel_field, with_expected_depth
 from jaxcloseup.fields.splats.splat_optimizer import surfel_optimizer
 from jaxcloseup.fields.splats.surfels import random_points
 from jaxcloseup.geometry.cameras import Camera

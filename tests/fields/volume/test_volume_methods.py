@@ -32,11 +32,7 @@ from jaxcloseup.fields.volume.config import (
 from jaxcloseup.fields.volume.mipnerf import mipnerf_field
 from jaxcloseup.fields.volume.ngp import ngp_field
 from jaxcloseup.fields.volume.rays import Extent
-from jaxcloseup.fields.volume.tensorf import (
-    TensorfBuffers,
-    factor_products,
-    tensorf_field,
-)
+from jaxcloseup.fields.volume.tensorf import TensorfBuffers, factor_products, tensorf_field
 from jaxcloseup.fields.volume.zipnerf import zipnerf_field
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.training.state import TrainState
