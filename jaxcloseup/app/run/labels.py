@@ -5,7 +5,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 
 from jaxcloseup.app import progress
 from jaxcloseup.app.run.kept_detail import GetDetail, detailed_views
@@ -18,12 +17,12 @@ from jaxcloseup.labels.make import (
     LabelSources,
     PseudoSettings,
     label_sources,
-    sample_virtual_camera,
+    sample_closeups,
 )
 from jaxcloseup.labels.rules import LABEL_RULES, label_depth
-from jaxcloseup.labels.target_views import label_views
+from jaxcloseup.labels.target_views import label_views, render_depths
 from jaxcloseup.photos.scene import Scene
-from jaxcloseup.photos.views import Views, camera_at
+from jaxcloseup.photos.views import Views
 from jaxcloseup.training.state import TrainState
 
 
@@ -89,13 +88,15 @@ def rendered_depths(
       key: consumed by the renderings; None renders deterministically.
       depth: that of a `LabelRule`.
     """
-    count = cameras.intrinsics.shape[0]
-    keys = [None] * count if key is None else jax.random.split(key, count)
-
-    def depth_of(view: int) -> jax.Array:
-        return depth(render(camera_at(cameras, view), keys[view]), near=near, far=scene.far)
-
-    return jnp.stack(list(progress.each(depth_of, range(count), "rendering depths")))
+    return render_depths(
+        render,
+        cameras,
+        near=near,
+        far=scene.far,
+        key=key,
+        depth=depth,
+        each=lambda one_view, views: progress.each(one_view, views, "rendering depths"),
+    )
 
 
 def label_target_views(
@@ -139,6 +140,6 @@ def label_closeups(
     """
     settings = pseudo_settings(labels)
     count = min(programs.preset.closeup_steps, _MOST_CLOSEUPS)
-    drawn = jax.random.split(keys.closeups, count)
-    draw = jax.vmap(lambda key: sample_virtual_camera(key, start.sources, settings)[0])
-    return label_target_views(programs, start, jax.jit(draw)(drawn), labels, settings, get_detail)
+    draw = jax.jit(lambda key: sample_closeups(key, start.sources, settings, count))
+    cameras = draw(keys.closeups)
+    return label_target_views(programs, start, cameras, labels, settings, get_detail)
