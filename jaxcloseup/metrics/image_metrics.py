@@ -6,7 +6,6 @@ everywhere gives NaN, which callers report as absent.
 """
 
 import chex
-import dm_pix
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -54,6 +53,8 @@ def ssim(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = None
     weight = _check(image, target, weight)
     if min(image.shape[:2]) < SSIM_TAPS:
         raise ValueError(f"SSIM needs {SSIM_TAPS} pixels a side: the image is {image.shape[:2]}.")
+    import dm_pix  # here, so that fields can be imported without it
+
     with jax.numpy_dtype_promotion("standard"):  # dm_pix mixes integers and floats
         similarity = dm_pix.ssim(image, target, max_val=1.0, filter_fn=_blur, return_map=True)
     border = SSIM_TAPS // 2
