@@ -13,12 +13,7 @@ from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.labels.config import LabelConfig, pseudo_settings
-from jaxcloseup.labels.make import (
-    LabelSources,
-    PseudoSettings,
-    label_sources,
-    sample_closeups,
-)
+from jaxcloseup.labels.make import LabelSources, PseudoSettings, label_sources, sample_closeups
 from jaxcloseup.labels.rules import LABEL_RULES, label_depth
 from jaxcloseup.labels.target_views import label_views, render_depths
 from jaxcloseup.photos.scene import Scene
