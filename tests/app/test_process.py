@@ -34,6 +34,7 @@ from posing import (
 from jaxcloseup.app.process import solver_process
 from jaxcloseup.app.process.pairs import choose_pairing, pairs_to_match, similarity
 from jaxcloseup.app.process.video_frames import choose_frames
+from jaxcloseup.artifacts import video as video_writer
 from jaxcloseup.artifacts.video import write_video
 from jaxcloseup.captures.load import SceneError, load_scene
 
@@ -130,8 +131,9 @@ def test_what_is_left_out_is_named_with_a_reason(capture):
     assert picture.shape[0] > 500 and picture.std() > 10
 
 
-def test_poses_of_a_video(walk, tmp_path):
+def test_poses_of_a_video(walk, tmp_path, monkeypatch):
     """A video by the program's own writer; a third of its frames is blurred, and none is taken."""
+    monkeypatch.setattr(video_writer, "_has_ffmpeg", lambda: False)  # the same codec everywhere
     rgb, poses = walk
     frames = [cv2.blur(one, (9, 9)) if i % 3 == 1 else one for i, one in enumerate(rgb)]
     video, out = write_video(tmp_path / "walk", frames, fps=12), tmp_path / "capture"

@@ -272,11 +272,11 @@ found = test_sweep.sweep_tiny(scene, folder / "sweep", ("control", "diverse"), 1
 
 def start(script, *arguments):
     """A Python of its own, on one device, that has what is compiled already."""
-    tests = pathlib.Path(__file__).parents[1]
+    own, tests = pathlib.Path(__file__).parent, pathlib.Path(__file__).parents[1]
     environment = os.environ | {
         "JAX_PLATFORMS": "cpu",
         "XLA_FLAGS": f"{QUICKLY} --xla_force_host_platform_device_count=1",
-        "PYTHONPATH": os.pathsep.join([str(tests.parent), str(tests)]),
+        "PYTHONPATH": os.pathsep.join(map(str, (tests.parent, tests, own))),
         "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir,
     }
     imports = "import json, pathlib, sys, jax, test_sweep; from tiny_runs import write_plane"
