@@ -9,8 +9,7 @@ from flax import struct
 from jaxcloseup.geometry.cameras import Camera
 
 
-@struct.dataclass
-class Views:
+class Views(struct.PyTreeNode):
     """Photographs of one capture, padded to one static size.
 
     Attributes:

@@ -19,8 +19,7 @@ Metrics = dict[str, jax.Array]
 DrawLoss = Callable[[Any, Any, DrawKeys, Any], tuple[jax.Array, Metrics]]
 
 
-@struct.dataclass
-class TrainState:
+class TrainState(struct.PyTreeNode):
     """Everything a step changes. Steps draw from `fold_in(key, step)`, so a resumed run repeats.
 
     Attributes:
