@@ -23,7 +23,7 @@ def quantize(image: jax.Array) -> jax.Array:
 
 
 def psnr(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = None) -> jax.Array:
-    """Peak signal-to-noise ratio, -10 log10(mean squared error), in dB; inf for equal images.
+    """Compute the PSNR, -10 log10(mean squared error), in dB; inf for equal images.
 
     Args:
       image: `[H, W, 3]` in [0, 1].
@@ -35,7 +35,7 @@ def psnr(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = None
 
 
 def ssim(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = None) -> jax.Array:
-    """Structural similarity, 1 for equal images; mean over the windows inside the image.
+    """Compute SSIM, 1 for equal images; the mean over the windows inside the image.
 
     Wang et al., "Image quality assessment: from error visibility to structural similarity", 2004,
     equations 13 to 17, per channel: Gaussian windows of 11 taps and sigma 1.5,
@@ -62,21 +62,21 @@ def ssim(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = None
 
 
 def _blur(image: jax.Array) -> jax.Array:
-    """Gaussian windows of `ssim`, as matrices: XLA's CPU backend convolves ten times slower."""
+    """Blur by the Gaussian of `ssim`, as matrices: XLA's CPU backend convolves ten times slower."""
     rows, columns = (jnp.asarray(_window_sums(size), image.dtype) for size in image.shape[:2])
     image = jnp.einsum("ih,hwc->iwc", rows, image, precision=lax.Precision.HIGHEST)
     return jnp.einsum("jw,iwc->ijc", columns, image, precision=lax.Precision.HIGHEST)
 
 
 def _window_sums(size: int) -> np.ndarray:
-    """Matrix `[size - 10, size]` whose rows are the window at all places along a side."""
+    """Return the matrix `[size - 10, size]` whose rows are the window at all places of a side."""
     taps = np.exp(-0.5 * ((np.arange(SSIM_TAPS) - SSIM_TAPS // 2) / SSIM_SIGMA) ** 2)
     places = range(size - SSIM_TAPS + 1)
     return np.stack([np.pad(taps / taps.sum(), (k, len(places) - 1 - k)) for k in places])
 
 
 def cc_psnr(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = None) -> jax.Array:
-    """PSNR after the affine change of the image's colors that fits the target best.
+    """Compute the PSNR after the affine change of colors that fits the target best.
 
     The change, a 3x3 matrix and an offset for the whole image, minimizes the weighted squared
     error; its result is clipped to [0, 1]. Differences in exposure and white balance do not count.
@@ -92,7 +92,7 @@ def cc_psnr(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = N
 def fit_colors(
     image: jax.Array, target: jax.Array, weight: jax.Array, *, ridge: float = 0.0
 ) -> tuple[jax.Array, jax.Array]:
-    """The affine change of an image's colors with the least weighted squared error.
+    """Fit the affine change of an image's colors with the least weighted squared error.
 
     Args:
       image: `[H, W, 3]` colors to change.
@@ -119,7 +119,7 @@ def fit_colors(
 
 
 def change_colors(image: jax.Array, matrix: jax.Array, offset: jax.Array) -> jax.Array:
-    """Colors `image @ matrix + offset` of an image `[H, W, 3]`."""
+    """Change the colors of an image `[H, W, 3]` to `image @ matrix + offset`."""
     return matmul(image, matrix[None]) + offset[None, None]
 
 
@@ -135,6 +135,6 @@ def _check(image: jax.Array, target: jax.Array, weight: jax.Array | None) -> jax
 
 
 def _weighted_mean(values: jax.Array, weight: jax.Array) -> jax.Array:
-    """Mean of `[H, W, 3]` values with weights `[H, W]`, NaN where these sum to 0."""
+    """Average `[H, W, 3]` values with weights `[H, W]`; NaN where these sum to 0."""
     total = jnp.sum(weight)
     return safe_divide(jnp.sum(jnp.mean(values, axis=-1) * weight), total, fill=jnp.nan)

@@ -79,7 +79,7 @@ class LpipsWeights(struct.PyTreeNode):
 
 
 def lpips(weights: LpipsWeights, image: jax.Array, target: jax.Array) -> jax.Array:
-    """LPIPS `[...]` of images `[..., H, W, 3]` in [0, 1]; 0 for equal images, more for others.
+    """Compute LPIPS `[...]` of images `[..., H, W, 3]` in [0, 1]; 0 for equal images.
 
     It is differentiable in the images, which need 16 pixels a side for VGG, 31 for AlexNet.
 
@@ -103,7 +103,7 @@ def lpips(weights: LpipsWeights, image: jax.Array, target: jax.Array) -> jax.Arr
 
 
 def _features(weights: LpipsWeights, images: jax.Array) -> list[jax.Array]:
-    """The features `[N, h, w, C]` of each tapped layer of images `[N, H, W, 3]`."""
+    """Compute features `[N, h, w, C]` of each tapped layer of images `[N, H, W, 3]`."""
     shift, scale = (jnp.array(v, images.dtype)[None, None, None] for v in (_SHIFT, _SCALE))
     now = (2 * images - 1 - shift) / scale
     convolutions, tapped = iter(weights.convolutions), []
@@ -130,7 +130,7 @@ def _features(weights: LpipsWeights, images: jax.Array) -> list[jax.Array]:
 
 
 def layer_shapes(backbone: str) -> tuple[list[tuple[int, ...]], list[int]]:
-    """Kernel shapes `[out, in, kh, kw]` of the convolutions, and channels of the heads."""
+    """Return kernel shapes `[out, in, kh, kw]` of the convolutions, and channels of the heads."""
     kernels: list[tuple[int, ...]] = []
     heads: list[int] = []
     channels = 3

@@ -39,7 +39,7 @@ class Pyramid:
 
     @property
     def starts(self) -> tuple[int, ...]:
-        """Index of each level's first pixel, among the P."""
+        """Return the index of each level's first pixel, among the P."""
         counts = [height * width for height, width in self.sizes]
         return tuple(itertools.accumulate(counts[:-1], initial=0))
 

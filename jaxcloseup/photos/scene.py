@@ -17,7 +17,7 @@ class SceneError(ValueError):
     """The scene cannot be loaded; the message is one printable sentence that says what to do."""
 
     def __init__(self, message: str):
-        """Escape what names from files bring into the message."""
+        """Keep what names from files bring out of the terminal: the message is escaped."""
         super().__init__(printable(message))
 
 
@@ -25,7 +25,7 @@ class SceneWarning(UserWarning):
     """The scene was loaded, but something in its files looks like a mistake."""
 
     def __init__(self, message: str):
-        """Escape what names from files bring into the message."""
+        """Keep what names from files bring out of the terminal: the message is escaped."""
         super().__init__(printable(message))
 
 
@@ -101,19 +101,19 @@ class Scene:
     photographs_at: Callable[..., tuple[Views, list[tuple[int, int]]]] | None = None
 
     def sizes(self, split: str) -> list[tuple[int, int]]:
-        """Width and height of each photograph of a split, without its padding."""
+        """Return width and height of each photograph of a split, without its padding."""
         views = getattr(self, split)
         padded = views.cameras.width, views.cameras.height
         return self.metadata.get("sizes", {}).get(split) or [padded] * len(views)
 
     def camera(self, split: str, index: int) -> Camera:
-        """The camera of one photograph, without the padding at its right and its bottom."""
+        """Return the camera of one photograph, without the padding at its right and bottom."""
         width, height = self.sizes(split)[index]
         return camera_at(getattr(self, split).cameras, index).replace(width=width, height=height)
 
 
 def keep_photographs(scene: Scene, chosen: Sequence[int]) -> Scene:
-    """The scene with some of its training photographs, and the points in two of their pictures.
+    """Return the scene with some training photographs, and the points that two of them see.
 
     Args:
       scene: a scene whose metadata say nothing of single training photographs.

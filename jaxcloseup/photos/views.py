@@ -23,7 +23,7 @@ class Views(struct.PyTreeNode):
     weight: jax.Array
 
     def __len__(self) -> int:
-        """Number of photographs."""
+        """Return the number of photographs."""
         return self.rgb.shape[0]
 
 
@@ -44,7 +44,7 @@ class Batch(NamedTuple):
 
 
 def to_float(rgb: jax.Array) -> jax.Array:
-    """Colors as float32 in [0, 1] from uint8, or in [-1, 1] from int8; floats as they are."""
+    """Convert colors to float32: uint8 to [0, 1], int8 to [-1, 1]; floats stay."""
     if rgb.dtype in (jnp.uint8, jnp.int8):
         return rgb.astype(jnp.float32) / jnp.iinfo(rgb.dtype).max
     return rgb

@@ -37,12 +37,12 @@ class Windows:
     places: jax.Array | None = None
 
     def __len__(self) -> int:
-        """Number of photographs."""
+        """Return the number of photographs."""
         return self.pyramid.values.shape[0]
 
     @property
     def size(self) -> tuple[int, int]:
-        """Height and width of a window in pixels."""
+        """Return height and width of a window in pixels."""
         return self.cameras.height, self.cameras.width
 
 

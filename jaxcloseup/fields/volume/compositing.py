@@ -34,7 +34,7 @@ class Composite(NamedTuple):
     median_depth: jax.Array
 
     def over(self, background: float | None) -> "Composite":
-        """The same, with a gray level behind the samples in `rgb`; None adds nothing."""
+        """Return the same with a gray level behind the samples in `rgb`; None adds nothing."""
         if background is None:
             return self
         return self._replace(rgb=self.rgb + (1 - self.alpha[..., None]) * background)

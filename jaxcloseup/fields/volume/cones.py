@@ -30,7 +30,7 @@ class Moments(NamedTuple):
 
 
 def frustum_moments(edges: jax.Array, radius: jax.Array) -> Moments:
-    """Mean and variances of points in frustums (mip-NeRF, eq. 7).
+    """Compute mean and variances of points in frustums (mip-NeRF, eq. 7).
 
     Args:
       edges: `[R, S + 1]` ascending z-depths.
@@ -51,7 +51,7 @@ def frustum_moments(edges: jax.Array, radius: jax.Array) -> Moments:
 
 
 def frustum_gaussians(rays: Rays, edges: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Means and variances `[3, R, S]` of frustums along the axes (mip-NeRF, eq. 8 and 16)."""
+    """Compute means and variances `[3, R, S]` of frustums (mip-NeRF, eq. 8 and 16)."""
     moments = frustum_moments(edges, RADIUS * rays.pixel)
     squared = (rays.directions**2).T[..., None]  # [3, R, 1]
     share = squared / jnp.sum(squared, axis=0, keepdims=True)
@@ -60,7 +60,7 @@ def frustum_gaussians(rays: Rays, edges: jax.Array) -> tuple[jax.Array, jax.Arra
 
 
 def integrated_encoding(mean: jax.Array, variance: jax.Array, num_octaves: int) -> jax.Array:
-    """The mean positional encoding of normally distributed positions (mip-NeRF, eq. 14).
+    """Return the mean positional encoding of normally distributed positions (mip-NeRF, eq. 14).
 
     Args:
       mean: `[3, M]`.
@@ -80,7 +80,7 @@ def integrated_encoding(mean: jax.Array, variance: jax.Array, num_octaves: int) 
 def frustum_samples(
     key: jax.Array | None, rays: Rays, edges: jax.Array, count: int = 6
 ) -> tuple[jax.Array, jax.Array]:
-    """Points in each frustum that have its moments, and their own scale (Zip-NeRF, eq. 1 to 3).
+    """Place points with a frustum's moments in it, with their scale (Zip-NeRF, eq. 1 to 3).
 
     Fewer points than the paper's six are cheaper. Depth and place across then go together in one
     frustum, though not on average over turns, and a single point has no variance along the ray.
@@ -116,7 +116,7 @@ def frustum_samples(
 
 
 def _across(unit: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Two unit vectors `[3, R]` across unit vectors, and across each other."""
+    """Return two unit vectors `[3, R]` orthogonal to unit vectors and to each other."""
     axes = jnp.eye(3, dtype=unit.dtype)
     least = axes[:, jnp.argmin(jnp.abs(unit), axis=0)]
     first = jnp.cross(unit, least, axis=0)

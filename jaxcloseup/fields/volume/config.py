@@ -78,7 +78,7 @@ class HashGridConfig:
 
     @property
     def resolutions(self) -> tuple[int, ...]:
-        """Cells along each side of every level, eq. 2 and 3."""
+        """Return the cells along each side of every level, eq. 2 and 3."""
         steps = max(1, self.levels - 1)
         growth = math.log(self.finest / self.coarsest) / steps
         # Rounding must not take a cell from a level that is a whole number of them.
@@ -89,12 +89,12 @@ class HashGridConfig:
 
     @property
     def entries(self) -> tuple[int, ...]:
-        """Entries of every level: its vertices, if they fit."""
+        """Return the entries of every level: its vertices, if they fit."""
         return tuple(min((n + 1) ** 3, 2**self.log2_entries) for n in self.resolutions)
 
     @property
     def size(self) -> int:
-        """Number of features of an encoded position."""
+        """Return the number of features of an encoded position."""
         return self.levels * self.features
 
 
@@ -168,7 +168,7 @@ class TensorfConfig:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Vertices along each side after 0, 1, ... growths: even steps of their logarithm."""
+        """Return the vertices a side after 0, 1, ... growths: even steps of their logarithm."""
         first, last = math.log(self.coarsest), math.log(self.finest)
         steps = max(1, self.growths)
         logarithms = [first + i * (last - first) / steps for i in range(self.growths + 1)]

@@ -10,7 +10,7 @@ from jaxcloseup.geometry.numerics import safe_norm
 
 
 def spaced(x: jax.Array, near: float, far: float, *, spacing: float) -> jax.Array:
-    """Distances in [near, far] to [0, 1], in proportion to a power transformation.
+    """Map distances in [near, far] to [0, 1], in proportion to a power transformation.
 
     The transformation is P(x) = |p - 1| / p ((x / |p - 1| + 1)^p - 1) for an exponent p (Zip-NeRF,
     eq. 24): even steps for p = 1, logarithmic ones for p = 0, and steps that grow with the square
@@ -27,7 +27,7 @@ def spaced(x: jax.Array, near: float, far: float, *, spacing: float) -> jax.Arra
 
 
 def unspaced(s: jax.Array, near: float, far: float, *, spacing: float) -> jax.Array:
-    """The inverse of `spaced`."""
+    """Map [0, 1] back to distances: the inverse of `spaced`."""
     low, high = (_power(np.float64(end), spacing, np) for end in (near, far))
     y = float(low) + s * float(high - low)
     if spacing == 1:
@@ -48,7 +48,7 @@ def _power(x: Any, p: float, xnp: Any) -> Any:
 
 
 def contract(positions: jax.Array) -> jax.Array:
-    """Positions `[3, ...]`, those beyond the unit ball drawn into a ball of radius 2.
+    """Draw positions `[3, ...]` beyond the unit ball into a ball of radius 2.
 
     `(2 - 1 / |x|) x / |x|` where |x| > 1 (mip-NeRF 360, eq. 10).
     """

@@ -54,7 +54,7 @@ class DepthSupervision(NamedTuple):
 def depth_divergence(
     edges: jax.Array, weights: jax.Array, depth: jax.Array, deviation: jax.Array
 ) -> jax.Array:
-    """KL divergence of a ray's light from a normal distribution of depth (DS-NeRF, eq. 5).
+    """Compute the KL divergence of a ray's light from a normal depth (DS-NeRF, eq. 5).
 
     The light has the constant density `weights / widths` in each interval, so the integral over
     normally distributed depths is a sum over intervals with their shares of the normal
@@ -83,7 +83,7 @@ def mean_divergence(
     num_pixels: int,
     see: Callable[..., list[tuple[jax.Array, jax.Array]]],
 ) -> jax.Array:
-    """The loss of rays through points drawn at random, `[]`, with its weight.
+    """Return the weighted loss `[]` of rays through points drawn at random.
 
     Args:
       supervision: what to draw from.

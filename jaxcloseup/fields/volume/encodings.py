@@ -9,7 +9,7 @@ from jaxcloseup.geometry.numerics import matmul
 
 
 def positional_encoding(x: jax.Array, num_octaves: int) -> jax.Array:
-    """`x`, then sin and cos of `2^k x` for k = 0, 1, ... (NeRF, eq. 4, with the input, without pi).
+    """Return x, then sin and cos of 2^k x, k = 0, 1, ... (NeRF, eq. 4, input added, without pi).
 
     Args:
       x: `[C, M]` coordinates, roughly within [-1, 1].
@@ -35,7 +35,7 @@ def positional_encoding(x: jax.Array, num_octaves: int) -> jax.Array:
 
 
 def _cos_of_turns(turns: jax.Array) -> jax.Array:
-    """cos(2 pi turns) to 1e-7, on a CPU 20 times as fast as `jnp.cos`, which is not vectorized."""
+    """Return cos(2 pi turns) to 1e-7; on a CPU `jnp.cos` is not vectorized: 20 times as slow."""
     # The sine of an angle in [-pi/2, pi/2], by its series up to the 11th power.
     angle = 2 * np.pi * (0.25 - jnp.abs(turns - jnp.round(turns)))
     square = angle * angle

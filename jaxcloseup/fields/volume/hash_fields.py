@@ -35,7 +35,7 @@ GEOMETRY = 16  # outputs of the rendered density network; the first is the logar
 def init_part(
     key_grid: jax.Array, key_density: jax.Array, grid: HashGridConfig, width: int, outputs: int = 1
 ) -> dict[str, Params]:
-    """A grid and its density network of one hidden layer; keys are consumed."""
+    """Initialize a grid and its density network of one hidden layer; keys are consumed."""
     return {
         "grid": init_hash_grid(key_grid, grid),
         "density": init_mlp(key_density, (grid.size, width, outputs)),
@@ -43,13 +43,13 @@ def init_part(
 
 
 def init_color_network(key: jax.Array, config: NgpConfig | ZipNerfConfig) -> Params:
-    """The color network on a density network's outputs; `key` is consumed."""
+    """Initialize the color network on a density network's outputs; `key` is consumed."""
     widths = (GEOMETRY, *(config.width,) * config.color_layers)
     return init_colors(key, widths, config.direction_octaves)
 
 
 def proposal_counts(config: NgpConfig | ZipNerfConfig) -> list[int]:
-    """Intervals of each proposal."""
+    """Return the intervals of each proposal."""
     return [count for count in (config.num_coarse, config.num_middle) if count]
 
 

@@ -22,13 +22,13 @@ _CORNERS = np.array(list(np.ndindex(2, 2, 2)), np.uint32)  # [8, 3]
 
 
 def init_hash_grid(key: jax.Array, config: HashGridConfig) -> jax.Array:
-    """The table `[sum of entries, features]`, level after level; `key` is consumed."""
+    """Initialize the table `[sum of entries, features]`, level after level; `key` is consumed."""
     shape = (sum(config.entries), config.features)
     return jax.random.uniform(key, shape, minval=-_INITIAL, maxval=_INITIAL)
 
 
 def hash_features(table: jax.Array, config: HashGridConfig, positions: jax.Array) -> jax.Array:
-    """Features of positions, interpolated between the vertices of their cells on every level.
+    """Interpolate features of positions between the vertices of their cells on every level.
 
     Args:
       table: from `init_hash_grid`.
@@ -44,7 +44,7 @@ def hash_features(table: jax.Array, config: HashGridConfig, positions: jax.Array
 
 
 def grid_rows(config: HashGridConfig, positions: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Rows of the table at the 8 corners of each position's cells, and trilinear weights.
+    """Return rows of the table at the 8 corners of each position's cells, and trilinear weights.
 
     Args:
       config: sizes.

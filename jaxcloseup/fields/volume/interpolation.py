@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 @jax.custom_vjp
 def weighted_rows(table: jax.Array, rows: jax.Array, weights: jax.Array) -> jax.Array:
-    """Sums over the corners of cells: `weights` times the `rows` of a table.
+    """Sum `weights` times the `rows` of a table over the corners of cells.
 
     On a CPU single numbers are gathered fastest, and whole rows are added up fastest. A loop over
     corners keeps XLA from computing rows and weights anew for each number that it adds: the

@@ -29,7 +29,7 @@ class Raw(NamedTuple):
 
 
 def rays_in_cache(samples: int, width: int) -> int:
-    """Rays to render, or to differentiate, at once, so that one layer's activations are small.
+    """Choose how many rays to process at once, so that one layer's activations stay small.
 
     Small is 2 MB on a CPU, the size of a core's cache, and 512 MB elsewhere. A whole image needs
     about 4 times as much memory, a training step `2 depth + 4` times.
@@ -53,7 +53,7 @@ def init_network(
     direction_features: int,
     direction_width: int,
 ) -> Params:
-    """Parameters of NeRF's network (NeRF, fig. 7), Glorot-uniform; `key` is consumed.
+    """Initialize NeRF's network (NeRF, fig. 7), Glorot-uniform; `key` is consumed.
 
     Args:
       key: random key.
@@ -104,7 +104,7 @@ def apply_network(network: Params, positions: jax.Array, directions: jax.Array) 
 
 
 def init_mlp(key: jax.Array, widths: Sequence[int], *, ray_features: int = 0) -> Params:
-    """Layers of a small network, Glorot-uniform; `key` is consumed.
+    """Initialize the layers of a small network, Glorot-uniform; `key` is consumed.
 
     Args:
       key: random key.
@@ -136,7 +136,7 @@ def apply_mlp(layers: Params, x: jax.Array, of_rays: jax.Array | None = None) ->
 
 
 def init_colors(key: jax.Array, widths: Sequence[int], octaves: int) -> Params:
-    """Layers of a network for `apply_colors`; `key` is consumed.
+    """Initialize the layers of a network for `apply_colors`; `key` is consumed.
 
     Args:
       key: random key.
@@ -147,7 +147,7 @@ def init_colors(key: jax.Array, widths: Sequence[int], octaves: int) -> Params:
 
 
 def apply_colors(layers: Params, x: jax.Array, rays: Rays, octaves: int) -> jax.Array:
-    """Colors `[R, S, 3]` in [0, 1] of samples, seen along their rays (NeRF, section 3).
+    """Compute colors `[R, S, 3]` in [0, 1] of samples seen along their rays (NeRF, section 3).
 
     Args:
       layers: from `init_colors`.
@@ -161,7 +161,7 @@ def apply_colors(layers: Params, x: jax.Array, rays: Rays, octaves: int) -> jax.
 
 
 def exponential_density(raw: jax.Array) -> jax.Array:
-    """Densities of any shape, `exp(raw)`, finite for all raw values (Instant-NGP, section 5.4)."""
+    """Return densities exp(raw), finite for all raw values (Instant-NGP, section 5.4)."""
     return jnp.exp(jnp.minimum(raw, _LARGEST_LOG_DENSITY))
 
 
@@ -169,7 +169,7 @@ def exponential_density(raw: jax.Array) -> jax.Array:
 def dense(
     weights: Sequence[jax.Array], bias: jax.Array, inputs: Sequence[jax.Array], relu: bool
 ) -> jax.Array:
-    """`sum_i W_i x_i + b`, or its positive part.
+    """Compute `sum_i W_i x_i + b`, or its positive part.
 
     Products use the dtype of the inputs, sums that of the weights. Plain differentiation would
     multiply float32 cotangents with bfloat16 operands, keep values from before the activation and

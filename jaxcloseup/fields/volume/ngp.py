@@ -41,7 +41,7 @@ def ngp_field(
     def encode(
         table: jax.Array, rendered: bool, key: jax.Array | None, rays: Rays, edges: jax.Array
     ) -> jax.Array:
-        """Features at the middles of intervals."""
+        """Return features at the middles of intervals."""
         del key
         grid = config.grid if rendered else config.proposal
         positions = rays.at_middles(edges)

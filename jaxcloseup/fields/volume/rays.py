@@ -42,7 +42,7 @@ class Extent:
     scale: float = 1.0
 
     def __post_init__(self) -> None:
-        """Refuse an empty depth range."""
+        """Raise a ValueError if the depth range is empty."""
         if not 0 < self.near < self.far:
             raise ValueError(
                 f"near and far must satisfy 0 < near < far, not {self.near} and {self.far}"
@@ -66,15 +66,15 @@ class Rays(NamedTuple):
 
     @property
     def unit(self) -> jax.Array:
-        """Unit directions, coordinates first, `[3, R]`."""
+        """Return unit directions, coordinates first, `[3, R]`."""
         return (self.directions / safe_norm(self.directions, keepdims=True)).T
 
     def at(self, depth: jax.Array) -> jax.Array:
-        """Positions `[3, R, S]` at z-depths `[R, S]`."""
+        """Return positions `[3, R, S]` at z-depths `[R, S]`."""
         return self.origins.T[..., None] + self.directions.T[..., None] * depth[None]
 
     def at_middles(self, edges: jax.Array) -> jax.Array:
-        """Positions `[3, R * S]` in the middle of intervals with edges `[R, S + 1]`."""
+        """Return positions `[3, R * S]` in the middle of intervals with edges `[R, S + 1]`."""
         return self.at(0.5 * (edges[..., 1:] + edges[..., :-1])).reshape(3, -1)
 
 
@@ -145,7 +145,7 @@ def ray_field(
         key: jax.Array | None,
         take: Callable[[Traced], Any],
     ) -> Any:
-        """`take(Traced)` of pixels `[N, 2]`, chunk by chunk."""
+        """Return `take(Traced)` of pixels `[N, 2]`, chunk by chunk."""
 
         def trace_rays(keyed: tuple[Any, jax.Array, jax.Array, jax.Array]) -> Any:
             key, *world_rays = keyed
@@ -176,7 +176,7 @@ def ray_field(
 def photometric_loss(
     rendering: Rendering, target_rgb: jax.Array, weight: jax.Array, *, coarse_weight: float = 1.0
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Weighted mean squared error of the fine and the coarse colors (NeRF, eq. 6), and penalties.
+    """Compute the weighted squared error of fine and coarse colors (NeRF, eq. 6), with penalties.
 
     Args:
       rendering: rendering of pixels `[...]` with a `VolumeAux`.
@@ -216,7 +216,7 @@ def _to_field(extent: Extent, origins: jax.Array, directions: jax.Array, pixel: 
 
 
 def _rays(camera: Camera, pixels: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Rays of one camera, or of stacked cameras `[N]`, one for each of `pixels[N, 2]`."""
+    """Return rays of one camera, or of stacked cameras `[N]`, one for each of `pixels[N, 2]`."""
     # A pixel that is not square has the width of a square one of its area.
     width = jax.lax.rsqrt(camera.intrinsics[..., 0] * camera.intrinsics[..., 1])
     if camera.intrinsics.ndim == 1:
@@ -231,7 +231,7 @@ def _map_chunks(
     rays: tuple[jax.Array, jax.Array, jax.Array],
     chunk: int | None,
 ) -> Any:
-    """`fn((key, *rays))` on chunks of the rays' leading axis `[R]`, in fixed memory.
+    """Map `fn((key, *rays))` over chunks of the rays' leading axis `[R]`, in fixed memory.
 
     A backward pass computes each chunk again: remembering all of them takes as long, and gigabytes.
     """

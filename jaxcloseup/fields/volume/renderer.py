@@ -91,7 +91,7 @@ def _two_passes(
     key: jax.Array | None,
     rays: Rays,
 ) -> Traced:
-    """Trace a coarse pass, and a fine pass with importance samples beside the coarse ones."""
+    """Render a coarse pass, and a fine pass with importance samples beside the coarse ones."""
     near, far = extent.near, extent.far
     keys = (None,) * 4 if key is None else jax.random.split(key, 4)
     key_coarse, key_fine, key_coarse_query, key_fine_query = keys

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 def stratified(
     key: jax.Array | None, near: float, far: float, num_samples: int, shape: tuple[int, ...]
 ) -> jax.Array:
-    """One sample in each of `num_samples` equal bins of [near, far] (NeRF, eq. 2).
+    """Draw one sample in each of `num_samples` equal bins of [near, far] (NeRF, eq. 2).
 
     Args:
       key: consumed; None takes the centers of the bins.
@@ -32,7 +32,7 @@ def stratified(
 def importance(
     key: jax.Array | None, edges: jax.Array, weights: jax.Array, num_samples: int
 ) -> jax.Array:
-    """Samples distributed like a histogram, by inverting its piecewise linear CDF (NeRF, 5.2).
+    """Draw samples like a histogram, by inverting its piecewise linear CDF (NeRF, 5.2).
 
     Each weight is first raised by 1e-5, so that empty rays are sampled evenly.
 
@@ -57,7 +57,7 @@ def importance(
 def interval_quantiles(
     key: jax.Array | None, num_intervals: int, shape: tuple[int, ...]
 ) -> jax.Array:
-    """Edges of intervals in [0, 1]: 0, about i / `num_intervals`, and 1.
+    """Draw edges of intervals in [0, 1]: 0, about i / `num_intervals`, and 1.
 
     Args:
       key: consumed, moves each inner edge by up to half of a step; None leaves it.
@@ -76,7 +76,7 @@ def interval_quantiles(
 def resample(
     key: jax.Array | None, edges: jax.Array, weights: jax.Array, num_intervals: int
 ) -> jax.Array:
-    """Intervals with about equal shares of a histogram; they cover all of it.
+    """Return intervals with about equal shares of a histogram; they cover all of it.
 
     Args:
       key: consumed, as in `interval_quantiles`.
@@ -92,7 +92,7 @@ def resample(
 
 
 def widen(weights: jax.Array) -> jax.Array:
-    """Weights `[..., S]` that reach into the intervals beside them (mip-NeRF, section 3.1).
+    """Widen weights `[..., S]` into the intervals beside them (mip-NeRF, section 3.1).
 
     The mean of the maxima over each interval and its left, and its right neighbor, plus 0.01.
     """
@@ -103,7 +103,7 @@ def widen(weights: jax.Array) -> jax.Array:
 
 
 def _cdf(edges: jax.Array, weights: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Edges, and where the CDF of the raised weights begins and what it gains in each bin."""
+    """Return edges, and for each bin where the CDF of the raised weights begins and its gain."""
     chex.assert_equal_shape_prefix([edges, weights], weights.ndim - 1)
     chex.assert_axis_dimension(edges, -1, weights.shape[-1] + 1)
     edges, weights = jax.lax.stop_gradient((edges, weights))

@@ -93,7 +93,7 @@ def tensorf_field(
 
 
 def factor_products(factors: Any, vertices: jax.Array, positions: jax.Array) -> jax.Array:
-    """Matrices times vectors at positions (TensoRF, eq. 4), interpolated between vertices.
+    """Multiply matrices and vectors at positions (TensoRF, eq. 4), interpolated between vertices.
 
     Args:
       factors: planes `[3, N, N, C]`, of axes (x, y), (x, z) and (y, z), and lines `[3, N, C]`, of
@@ -137,7 +137,7 @@ def _init_params(key: jax.Array, config: TensorfConfig) -> Params:
 def _penalty(
     config: TensorfConfig, params: Params, buffers: TensorfBuffers, histograms: list[Histogram]
 ) -> jax.Array:
-    """Sparse densities and smooth factors, the same for all rays (TensoRF, section 4.3)."""
+    """Return the penalty of dense and rough factors, equal for all rays (TensoRF, section 4.3)."""
     vertices = buffers.vertices
     total = config.sparsity_weight * _mean_size(params["density"], vertices)
     for factors in (params["density"], params["color"]):
@@ -152,7 +152,7 @@ def _init_factors(key: jax.Array, size: int, components: int) -> dict[str, jax.A
 
 
 def _mean_size(factors: dict[str, jax.Array], vertices: jax.Array) -> jax.Array:
-    """The mean absolute factor, planes plus lines (TensoRF, eq. 11)."""
+    """Return the mean absolute factor, planes plus lines (TensoRF, eq. 11)."""
     inside = jnp.arange(factors["lines"].shape[1], dtype=jnp.int32) < vertices
     both = inside[:, None] & inside[None]
     lines = _mean(jnp.abs(factors["lines"]), inside[None, :, None])
@@ -160,7 +160,7 @@ def _mean_size(factors: dict[str, jax.Array], vertices: jax.Array) -> jax.Array:
 
 
 def _mean_step(factors: dict[str, jax.Array], vertices: jax.Array) -> jax.Array:
-    """The mean squared step between neighbors in planes, along both axes (TensoRF, eq. 12)."""
+    """Return the mean squared step between neighbors in planes, on both axes (TensoRF, eq. 12)."""
     planes = factors["planes"]
     inside = jnp.arange(planes.shape[1], dtype=jnp.int32) < vertices
     both = (inside[:, None] & inside[None])[None, :, :, None]
@@ -174,7 +174,7 @@ def _mean(values: jax.Array, inside: jax.Array) -> jax.Array:
 
 
 def _grown(state: Any, old: int, new: int) -> Any:
-    """The state with a grid of `new` instead of `old` vertices, and an optimizer without memory."""
+    """Return the state with `new` instead of `old` vertices, and an optimizer without memory."""
 
     def grow(factors: dict[str, jax.Array]) -> dict[str, jax.Array]:
         size = factors["lines"].shape[1]
@@ -193,7 +193,7 @@ def _grown(state: Any, old: int, new: int) -> Any:
 
 
 def _resampling(size: int, old: int, new: int) -> jax.Array:
-    """The matrix `[size, size]` that interpolates `old` vertices to `new` between the same ends."""
+    """Return the matrix `[size, size]` that interpolates `old` vertices to `new`, same ends."""
     matrix = np.zeros((size, size))
     at = np.arange(new) * (old - 1) / (new - 1)
     low = np.minimum(at.astype(int), old - 2)

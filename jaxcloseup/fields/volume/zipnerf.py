@@ -58,7 +58,7 @@ def zipnerf_field(
     def encode(
         table: jax.Array, rendered: bool, key: jax.Array | None, rays: Rays, edges: jax.Array
     ) -> jax.Array:
-        """Mean features of Gaussians in frustums (eq. 1 to 5)."""
+        """Return mean features of Gaussians in frustums (eq. 1 to 5)."""
         grid, count = config.proposal, config.proposal_points
         if rendered:
             grid, count = config.grid, config.points
@@ -97,7 +97,7 @@ def zipnerf_field(
 def downweighted_features(
     table: jax.Array, grid: HashGridConfig, positions: jax.Array, deviation: jax.Array
 ) -> jax.Array:
-    """Hash features of isotropic Gaussians (Zip-NeRF, eq. 4).
+    """Compute hash features of isotropic Gaussians (Zip-NeRF, eq. 4).
 
     Each level counts `erf(1 / sqrt(8 deviation^2 n^2))`, n being its cells along each side.
 
@@ -116,7 +116,7 @@ def downweighted_features(
 
 
 def mean_squares(table: jax.Array, grid: HashGridConfig) -> jax.Array:
-    """The mean square of each level's features, summed over levels (Zip-NeRF, section 2)."""
+    """Sum the mean square of each level's features over levels (Zip-NeRF, section 2)."""
     starts = np.cumsum([0, *grid.entries])
     squares = [jnp.mean(jnp.square(table[i:j])) for i, j in itertools.pairwise(starts)]
     return jnp.asarray(sum(squares))
