@@ -162,7 +162,7 @@ def colorize_support(count: Image, footprint: Image) -> np.ndarray:
 
 
 def color_counts(count: Image) -> tuple[np.ndarray, np.ndarray]:
-    """Colors uint8 `[..., 3]` of numbers of photographs `[...]`, as in `colorize_support`.
+    """Return uint8 colors `[..., 3]` of numbers of photographs `[...]`, as `colorize_support`.
 
     The second array is their legend, an image.
     """

@@ -25,7 +25,7 @@ class Mesh(NamedTuple):
 def surface_mesh(
     distance: np.ndarray, corner: np.ndarray, voxel: float, *, steepest: float = np.inf
 ) -> Mesh:
-    """The surface where distances on a grid are 0, by marching cubes (scikit-image), in black.
+    """Extract the surface where distances on a grid are 0, by marching cubes, in black.
 
     Args:
       distance: `[X, Y, Z]` signed distances, positive outside; NaN where they are unknown, and

@@ -28,7 +28,7 @@ _RIGID = 1e-3
 
 
 def holds_model(folder: pathlib.Path) -> bool:
-    """Whether a folder holds a COLMAP model, complete or not."""
+    """Return True if a folder holds a COLMAP model, complete or not."""
     return any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))
 
 

@@ -141,7 +141,7 @@ def _applied(listing: Listing) -> tuple[np.ndarray | None, float]:
 
 
 def _is_oriented(listing: Listing) -> bool:
-    """Whether a capture says that z points up.
+    """Return True if a capture says that z points up.
 
     Blender's files give an angle of view. `orientation_override: none` tells nerfstudio to keep the
     orientation, because a phone has measured it.
@@ -163,7 +163,7 @@ def _read_at(
 
 
 def _padded(photos: Sequence[Photo], intrinsics: np.ndarray, height: int, width: int) -> Views:
-    """Photographs padded to one size."""
+    """Pad photographs to one size."""
     poses = np.stack([photo.frame.camtoworld for photo in photos])
     return Views(
         cameras=Camera(

@@ -170,7 +170,7 @@ def _detect(path: pathlib.Path) -> list[tuple[str, str]]:
 
 
 def _photographs_in(path: pathlib.Path) -> pathlib.Path | None:
-    """The folder with photographs, if there are any: this one, or `images` in it."""
+    """Return the folder with photographs, if there are any: this one, or `images` in it."""
     for folder in (path, path / "images"):
         if folder.is_dir() and any(one.suffix.lower() in ENDINGS for one in folder.iterdir()):
             return folder
@@ -233,7 +233,7 @@ def _read_ply(
 
 
 def _renumbered(frames: list[Frame], keep: np.ndarray) -> list[Frame]:
-    """Frames whose `seen` counts only the points `[P]` that are kept."""
+    """Return frames whose `seen` counts only the points `[P]` that are kept."""
     rows = np.cumsum(keep) - 1
     return [
         frame if frame.seen is None else frame._replace(seen=rows[frame.seen[keep[frame.seen]]])
@@ -242,7 +242,7 @@ def _renumbered(frames: list[Frame], keep: np.ndarray) -> list[Frame]:
 
 
 def _seen_in_training(train: Sequence[Frame], count: int) -> np.ndarray:
-    """Whether two training photographs see each point, `[P]` bool; all True if files do not say.
+    """Return which points `[P]` two training photographs see; all if files do not say.
 
     A point that only other photographs see would leak their content into training.
     """

@@ -69,7 +69,7 @@ def affine_transform(label: str, key: str, value: Any) -> np.ndarray:
 
 
 def rigid_transform(label: str, key: str, value: Any) -> np.ndarray:
-    """Like `affine_transform`, but the matrix must consist of a rotation and a position."""
+    """Read an `affine_transform` that must consist of a rotation and a position."""
     matrix = affine_transform(label, key, value)
     rotation = matrix[:, :3]
     error = np.abs(rotation.T @ rotation - np.eye(3)).max()

@@ -51,7 +51,7 @@ class Photo(NamedTuple):
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height in pixels."""
+        """Return width and height in pixels."""
         return self.rgb.shape[1], self.rgb.shape[0]
 
     def intrinsics(self, half_pixel: bool) -> np.ndarray:

@@ -116,7 +116,7 @@ def _decode(path: pathlib.Path, data: np.ndarray) -> np.ndarray:
 
 
 def _pixels(data: np.ndarray) -> float:
-    """Number of pixels that an image's header claims; 0 for formats that Pillow does not know."""
+    """Return the pixels that an image's header claims; 0 for formats unknown to Pillow."""
     try:
         # Pillow warns of many pixels too, and of fields that do not matter here.
         with _filters, warnings.catch_warnings():
@@ -130,7 +130,7 @@ def _pixels(data: np.ndarray) -> float:
 
 
 def _is_truncated_jpeg(data: bytes) -> bool:
-    """Whether a JPEG ends before its end marker; some decoders silently fill the rest with gray.
+    """Return True if a JPEG lacks its end marker; some decoders fill the rest with gray.
 
     The search skips the segments before the scan, since a thumbnail in one of them has its own end
     marker. Inside the scan, ff d9 is always the end marker.

@@ -22,7 +22,7 @@ _IN_FOLDER = (*_BESIDE, "{stem}")
 
 
 def is_picture(path: pathlib.Path) -> bool:
-    """Whether a file has an image's name; hidden files such as macOS's `._a.jpg` do not."""
+    """Return True if a file has an image's name; hidden files such as `._a.jpg` do not."""
     return path.suffix.lower() in ENDINGS and not path.name.startswith(".")
 
 

@@ -57,7 +57,7 @@ def check_positions(frames: Sequence[Frame], *, far: float = np.inf) -> None:
 
 
 def plausible(label: object, points: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """Whether points are finite as float32 and not absurdly far away; warns of those that are not.
+    """Check that points are finite as float32 and not absurdly far; warn of others.
 
     Points are too far at `STRAY` times the cameras' spread, or their own median distance if that is
     larger, so that cameras at one place keep their points.

@@ -124,7 +124,7 @@ def divide(
 
 
 def spread(name: str, total: int, count: int | None) -> list[int]:
-    """Which of `total` training photographs to keep: `count`, evenly spread over their order.
+    """Choose `count` of `total` training photographs, evenly spread over their order.
 
     Args:
       name: name of the capture, for the error.
@@ -215,7 +215,7 @@ def _zoom(name: str, frames: Sequence[Frame], zoom: int) -> Division:
 
 
 def _size_of_pixel(frame: Frame, points: np.ndarray) -> float:
-    """Median world size of a full-size pixel at the points seen; infinity without points."""
+    """Return the median world size of a full-size pixel at the points seen; inf without."""
     size = frame.size or read_image(frame.file).shape[1::-1]
     intrinsics = frame_intrinsics(frame, *size)
     if frame.seen is None:

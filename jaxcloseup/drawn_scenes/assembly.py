@@ -81,7 +81,7 @@ def _is_round(solid: Solid, side: int) -> bool:
 
 
 def _extent(solid: Solid, side: int) -> np.ndarray:
-    """Width and height of a face in meters, along its chart."""
+    """Return width and height of a face in meters, along its chart."""
     x, y, z = solid.size
     if _is_round(solid, side):
         return np.array([np.pi * (x + y) / 2, z])
@@ -93,7 +93,7 @@ def _extent(solid: Solid, side: int) -> np.ndarray:
 def _layout(
     solid: Solid, side: int, finish: Finish, extent: np.ndarray, index: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Affine maps `[2, 3]` from chart to texture and detail repeats; texture rows run down."""
+    """Return affine maps `[2, 3]` from chart to texture and detail; texture rows run down."""
     flip = solid.kind == BOX and side in (0, 3, 4)
     upright = np.array([[-1.0 if flip else 1.0, 0, float(flip)], [0, -1, 1]])
     meters = np.diag(extent) @ upright
@@ -111,7 +111,7 @@ def _layout(
 
 
 def _surface(solid: Solid, side: int, chart: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """World points and outward unit normals `[M, 3]` at chart coordinates `[M, 2]`."""
+    """Return world points and outward unit normals `[M, 3]` at chart coordinates `[M, 2]`."""
     a, b = 2 * chart.T - 1
     one = np.ones_like(a)
     if _is_round(solid, side):

@@ -115,7 +115,7 @@ def _look_up(light: jax.Array, faces: Faces, hits: Hit) -> jax.Array:
 def _within(
     solids: Solids, points: np.ndarray, normals: np.ndarray, end: np.ndarray, radius: float
 ) -> np.ndarray:
-    """Which solids `[N]` rise above a block's horizon and lie near its path to a ball."""
+    """Find which solids `[N]` rise above a block's horizon and lie near its path to a ball."""
     start = points.mean(0)
     radius = max(radius, np.linalg.norm(points - start, axis=-1).max())
     half, center = np.asarray(solids.bound)[..., :3], np.asarray(solids.bound)[..., 3]
@@ -144,7 +144,7 @@ def _smooth(light: np.ndarray, world: World) -> np.ndarray:
 
 
 def _spread(count: int, turns: np.ndarray, offset: float = 0.0) -> np.ndarray:
-    """Well-spread points `[L, count, 2]` of the unit square, shifted by `turns[L, 1, 2]` mod 1."""
+    """Return points `[L, count, 2]` that fill the unit square, shifted by `turns[L, 1, 2]` mod 1."""
     i = np.arange(count)
     lattice = np.stack([(i + 0.5) / count + offset, i * 0.618034 + 7 * offset], -1)
     return (lattice + turns) % 1

@@ -89,7 +89,7 @@ class Model(NamedTuple):
 
 
 def turn(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> np.ndarray:
-    """Rotation matrix `[3, 3]` by degrees about x, then y, then z."""
+    """Return the rotation matrix `[3, 3]` by degrees about x, then y, then z."""
     matrix = np.eye(3)
     for axis, angle in enumerate(np.deg2rad([x, y, z])):
         i, j = [(1, 2), (2, 0), (0, 1)][axis]
@@ -128,12 +128,12 @@ def box(
     texel: float = 0.03,
     faces: Mapping[int, Finish] | None = None,
 ) -> Solid:
-    """A box; `faces` overrides the finish of sides 0..5 = -x, +x, -y, +y, -z, +z."""
+    """Model a box; `faces` overrides the finish of sides 0..5 = -x, +x, -y, +y, -z, +z."""
     return _solid(BOX, center, size, finish, rotation=rotation, texel=texel, faces=faces)
 
 
 def block(low: ArrayLike, high: ArrayLike, finish: Finish, **options: Any) -> Solid:
-    """A box between two corners, with the options of `box`."""
+    """Model a box between two corners, with the options of `box`."""
     low, high = np.asarray(low, float), np.asarray(high, float)
     return box((low + high) / 2, high - low, finish, **options)
 
@@ -146,7 +146,7 @@ def sphere(
     rotation: np.ndarray | None = None,
     texel: float = 0.03,
 ) -> Solid:
-    """A sphere of diameter `size`, or an ellipsoid with three diameters."""
+    """Model a sphere of diameter `size`, or an ellipsoid with three diameters."""
     diameters = np.broadcast_to(size, 3)
     return _solid(SPHERE, center, diameters, finish, rotation=rotation, texel=texel)
 
@@ -162,7 +162,7 @@ def cylinder(
     texel: float = 0.03,
     faces: Mapping[int, Finish] | None = None,
 ) -> Solid:
-    """A cylinder or cone on `base` with diameters `bottom` and `top`; faces: side, bottom, top."""
+    """Model a cylinder or cone on `base`, diameters `bottom`, `top`; faces: side, bottom, top."""
     rotation = np.eye(3) if rotation is None else rotation
     center = np.asarray(base, float) + rotation @ [0, 0, height / 2]
     size, taper = ((bottom + top) / 2, (bottom + top) / 2, height), (top - bottom) / (top + bottom)
@@ -174,7 +174,7 @@ def cylinder(
 def rod(
     start: ArrayLike, end: ArrayLike, thickness: float, finish: Finish, *, texel: float = 0.03
 ) -> Solid:
-    """A thin round bar from `start` to `end`."""
+    """Model a thin round bar from `start` to `end`."""
     start, end = np.asarray(start, float), np.asarray(end, float)
     axis = (end - start) / np.linalg.norm(end - start)
     across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
@@ -193,7 +193,7 @@ def sheet(
     rotation: np.ndarray | None = None,
     texel: float = 0.03,
 ) -> Solid:
-    """A flat rectangle (width, height) that faces along an axis and is upright seen from there."""
+    """Model a flat rectangle (width, height) that faces along an axis, upright from there."""
     frames = {
         "+z": np.eye(3), "-z": turn(x=180),
         "-y": turn(x=90), "+y": turn(x=90, z=180), "-x": turn(x=90, z=-90), "+x": turn(x=90, z=90),

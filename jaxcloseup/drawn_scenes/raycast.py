@@ -130,7 +130,7 @@ def keep_solids(solids: Solids, wanted: jax.Array) -> Solids:
 
 
 def in_pyramid(solids: Solids, apex: jax.Array, corners: jax.Array) -> jax.Array:
-    """Which solids `[N]` rays from `apex[3]` between the directions `corners[4, 3]` may hit.
+    """Find solids `[N]` that rays from `apex[3]` between directions `corners[4, 3]` may hit.
 
     The corners are in cyclic order. The test is conservative: it excludes a solid only if its
     bounding box lies beyond one side of the pyramid.
@@ -186,7 +186,7 @@ def _apply(affine: jax.Array, vector: tuple[jax.Array, ...], w: float) -> list[j
 def _first_crossing(
     crossings: Callable, to_local: jax.Array, taper: jax.Array, ray: tuple, nearest: float
 ) -> jax.Array:
-    """Smallest ray parameter above `nearest` at which the ray crosses one solid, or inf."""
+    """Return the smallest ray parameter above `nearest` where the ray crosses one solid, or inf."""
     o, d = _apply(to_local, ray[:3], 1.0), _apply(to_local, ray[3:], 0.0)
     # Start at the ray's closest approach to the center: for a distant thin rail, b^2 - 4ac would
     # otherwise lose all precision.

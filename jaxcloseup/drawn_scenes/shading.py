@@ -107,7 +107,7 @@ def sample_texture(
 
 
 def _corners(xy: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The four integer neighbors `[..., 4, 2]` of points `[..., 2]`, and their bilinear weights."""
+    """Return the four integer neighbors `[..., 4, 2]` of points, and bilinear weights."""
     low = jnp.floor(xy)
     part = (xy - low)[..., None, :]
     far = jnp.array([[0, 0], [1, 0], [0, 1], [1, 1]]).reshape((1,) * (xy.ndim - 1) + (4, 2))
@@ -126,7 +126,7 @@ def sample_light(light: jax.Array, faces: Faces, hit: Hit) -> jax.Array:
 
 
 def surface_color(world: World, hit: Hit, footprint: jax.Array) -> jax.Array:
-    """Mean unlit color `[3]` of a surface patch `footprint` world units wide."""
+    """Return the mean unlit color `[3]` of a surface patch `footprint` world units wide."""
     faces, face = world.faces, hit.face
     chart = jnp.append(hit.chart, 1.0)
     texels = jnp.maximum(footprint * faces.pitch[face] * TEXTURE_SIZE, 1e-6)
@@ -212,7 +212,7 @@ def render_surface(world: World, camera: Camera, *, samples: int = 8) -> Surface
 
 
 def lattice(count: int) -> jax.Array:
-    """Well-spread offsets `[count, 2]` in (-0.5, 0.5)^2 with mean 0."""
+    """Return well-spread offsets `[count, 2]` in (-0.5, 0.5)^2 with mean 0."""
     i = np.arange(count)
     golden = (np.sqrt(5) - 1) / 2
     xy = np.stack([(i + 0.5) / count, (i * golden + 0.5) % 1], axis=-1)
@@ -220,7 +220,7 @@ def lattice(count: int) -> jax.Array:
 
 
 def mean_colors(texels: jax.Array) -> np.ndarray:
-    """Mean color `[K, 3]` of each pyramid."""
+    """Return the mean color `[K, 3]` of each pyramid."""
     return np.asarray(_unpack(texels[:, -1])).T
 
 

@@ -91,7 +91,7 @@ def write_vertices(
 
 
 def _parse_header(path: pathlib.Path, header: bytes) -> tuple[str, int, list[tuple[str, str]]]:
-    """Encoding, vertex count and the vertex's (name, type) pairs."""
+    """Read encoding, vertex count and the vertex's (name, type) pairs."""
     lines = [line.split() for line in header.decode("latin-1").splitlines() if line.split()]
     encodings = [line[1] for line in lines if line[0] == "format" and len(line) > 1]
     elements = [index for index, line in enumerate(lines) if line[0] == "element"]

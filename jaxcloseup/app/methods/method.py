@@ -91,7 +91,7 @@ class Preset:
 
     @property
     def target_labels(self) -> LabelConfig:
-        """Labels of target views."""
+        """Return how target views are labeled."""
         if self.targets is None:
             return self.labels
         own = {k: v for k, v in vars(self.targets).items() if k != "control_lr_scale"}

@@ -47,7 +47,7 @@ class Setting:
 
     @property
     def wanted(self) -> str:
-        """What it must be, as the error about a wrong value says it."""
+        """Return what it must be, as the error about a wrong value says it."""
         try:
             check_value(object(), self.kind, self.limits)
         except ValueError as error:

@@ -180,7 +180,7 @@ def map_photographs(say: Say, *, database: str, images: str, folder: str) -> lis
 
 
 def _refine(model: pycolmap.Reconstruction) -> None:
-    """Give lenses with enough photographs more distortion parameters, and solve all again.
+    """Solve again with more distortion parameters for lenses that have enough photographs.
 
     With many parameters from the start, the first photographs would be fitted with a wrong
     distortion that fits no others.

@@ -57,7 +57,7 @@ class Estimate:
 
     @property
     def place(self) -> tuple[int, int] | None:
-        """Number of the current part in the plan, from 1, and the number of parts."""
+        """Return the number of the current part in the plan, from 1, and the number of parts."""
         return (self._begun, len(self._names)) if self.name in self._plan else None
 
     def left(self) -> float | None:

@@ -68,7 +68,7 @@ def _effect_of_labels(results: Mapping[str, Any], psnr: Mapping[str, float]) -> 
 
 
 def compare_psnr(change: float, digits: int) -> str:
-    """Say how much better or worse a PSNR is, in dB."""
+    """Describe how much better or worse a PSNR is, in dB."""
     return f"{abs(change):.{digits}f} dB {'worse' if change < 0 else 'better'}"
 
 

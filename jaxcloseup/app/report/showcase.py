@@ -40,7 +40,7 @@ class Exhibit(NamedTuple):
 
     @property
     def pixel_size(self) -> str:
-        """Say how large the photograph's pixels are in the close-up."""
+        """Describe how large the photograph's pixels are in the close-up."""
         if self.pixel < 1:
             return f"whose pixels are {1 / self.pixel:.1f} times finer"
         return f"whose pixels are {self.pixel:.1f} times as large"

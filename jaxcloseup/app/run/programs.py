@@ -120,7 +120,7 @@ class Programs:
 
     @functools.cached_property
     def coarse(self) -> "Programs":
-        """The programs that train the preset's coarse model; all seeds share them."""
+        """Return the programs that train the preset's coarse model; all seeds share them."""
         assert self.preset.coarse is not None
         field = self.preset.coarse.field
         preset = dataclasses.replace(self.preset, field=field, coarse=None, windows=None)
@@ -128,7 +128,7 @@ class Programs:
 
     @functools.cached_property
     def photographs(self) -> Views | Windows:
-        """What steps learn from: reduced photographs, or windows or pixels of finer ones."""
+        """Return what steps learn from: reduced photographs, or windows or pixels of finer ones."""
         views, windows = self.scene.train, self.preset.windows
         if windows is None or windows.finest >= self.preset.downscale:
             return views

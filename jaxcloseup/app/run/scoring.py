@@ -37,7 +37,7 @@ class HeldOut(NamedTuple):
 
     @property
     def all(self) -> dict[str, Sequence[Target]]:
-        """Targets and ladder together."""
+        """Return targets and ladder together."""
         return {**self.targets, **self.ladder}
 
 

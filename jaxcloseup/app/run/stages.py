@@ -88,7 +88,7 @@ class Run:
 
     @property
     def programs(self) -> Programs:
-        """What is compiled."""
+        """Return the compiled programs."""
         return self.training.programs
 
     def train(

@@ -138,7 +138,7 @@ _NOT_FINITE = "the rendering is not finite"
 
 
 def _why_unknown(key: str, value: float, side: int, *, finite: bool) -> str:
-    """Say why a metric is not finite, for an image whose shorter side has `side` pixels."""
+    """Explain why a metric is not finite, for an image whose shorter side has `side` pixels."""
     if not finite:
         return _NOT_FINITE
     if np.isposinf(value):

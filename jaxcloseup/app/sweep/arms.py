@@ -44,18 +44,18 @@ class Arm(NamedTuple):
 
     @property
     def settings(self) -> PseudoSettings:
-        """The traced settings of its labels."""
+        """Return the traced settings of its labels."""
         return pseudo_settings(self.labels)
 
     @property
     def in_turn(self) -> bool:
-        """True if it trains alone, on views that are labeled before its first step."""
+        """Return True if it trains alone, on views that are labeled before its first step."""
         by_detail = self.labels.label == "residual"
         return self.kind in ARMS_IN_TURN or self.depth_error is not None or by_detail
 
     @property
     def outlook(self) -> str:
-        """Settings that decide, with the seed, which cameras it draws and what it warps there."""
+        """Return settings that decide, with the seed, which cameras it draws and what it warps."""
         settings, labels = self.settings, self.labels
         seen_from = settings.pose, settings.fixed_anchors, settings.leave_out_source
         return str(jax.device_get((seen_from, labels.expected_depth)))

@@ -195,7 +195,7 @@ class Viewer:
 
     @functools.cached_property
     def counts(self) -> np.ndarray:
-        """Number of photographs that saw each Gaussian, or each point of a scene without any."""
+        """Return how many photographs saw each Gaussian, or each point of a scene without any."""
         drawn = self.drawn()
         points = self.scene.points if drawn is None else drawn.means
         sources = self.labels.sources

@@ -69,7 +69,7 @@ def bench() -> Model:
 
 
 def _garden() -> list[Solid]:
-    """Lawn, path, wall, hedges, trees and an enclosing sky."""
+    """Model lawn, path, wall, hedges, trees and an enclosing sky."""
     solids = [
         sheet((0, 0, 0), (17, 17), GRASS, texel=0.22),
         block((-8.0, -0.95, -0.02), (8.0, 0.75, 0.006), GRAVEL, texel=0.08),
@@ -90,7 +90,7 @@ def _garden() -> list[Solid]:
 
 
 def _bench() -> list[Solid]:
-    """Slats on three cast-iron frames, with a plaque on the back."""
+    """Model slats on three cast-iron frames, with a plaque on the back."""
     solids = []
     for x in (-0.72, 0.0, 0.72):
         solids += [
@@ -119,7 +119,7 @@ def _bench() -> list[Solid]:
 
 
 def _left_behind() -> list[Solid]:
-    """A newspaper, a cup of coffee, a bag, three apples and a ball."""
+    """Model a newspaper, a cup of coffee, a bag, three apples and a ball."""
     seat = 0.438
     bag = turn(x=-8, z=-10)
     red, green = (0.75, 0.12, 0.1), (0.55, 0.7, 0.2)
@@ -163,7 +163,7 @@ def _lamp_post(x: float, y: float) -> list[Solid]:
 
 
 def _pigeon(base: tuple, facing: float) -> list[Solid]:
-    """A pigeon that faces -y, rotated by `facing` degrees about z."""
+    """Model a pigeon that faces -y, rotated by `facing` degrees about z."""
     rotation = turn(z=facing)
     gray, dark = peel(0.50, 0.53, 0.60), peel(0.26, 0.28, 0.34)
     neck, pink = peel(0.28, 0.46, 0.42), peel(0.80, 0.42, 0.36)

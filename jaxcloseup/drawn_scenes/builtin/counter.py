@@ -94,7 +94,7 @@ def _cupboards() -> list[Solid]:
 
 
 def _shelf() -> list[Solid]:
-    """Jars and cookery books."""
+    """Model jars and cookery books."""
     solids = [block((-1.35, -0.17, 1.36), (-0.1, -0.005, 1.385), PINE)]
     contents = ((0.7, 0.5, 0.1), (0.5, 0.1, 0.1), (0.3, 0.4, 0.2), (0.4, 0.25, 0.1))
     for i, (which, tint) in enumerate(zip((3, 0, 1, 3), contents, strict=True)):
@@ -111,7 +111,7 @@ def _shelf() -> list[Solid]:
 
 
 def _rail_of_tools() -> list[Solid]:
-    """Ladle, turners, whisk and spoon, hanging from a rail."""
+    """Model ladle, turners, whisk and spoon, hanging from a rail."""
     solids = [rod((-0.05, -0.05, 1.42), (0.68, -0.05, 1.42), 0.014, STEEL)]
     for i, x in enumerate((0.04, 0.18, 0.32, 0.46, 0.6)):
         solids.append(rod((x, -0.065, 1.43), (x, -0.065, 1.2), 0.009, (STEEL, PINE)[i % 2]))
@@ -128,7 +128,7 @@ def _rail_of_tools() -> list[Solid]:
 
 
 def _breakfast() -> list[Solid]:
-    """A box of cereal and four tins."""
+    """Model a box of cereal and four tins."""
     front = print_of("cereal", gloss=0.06)
     solids = [
         box(
@@ -149,7 +149,7 @@ def _breakfast() -> list[Solid]:
 
 
 def _baking() -> list[Solid]:
-    """A loaf and a knife on a board, and a cookery book on its stand."""
+    """Model a loaf and a knife on a board, and a cookery book on its stand."""
     lean, book = turn(x=-22, z=-6), np.array([0.27, -0.16, TOP + 0.14])
     return [
         box((-0.18, -0.36, 0.911), (0.44, 0.28, 0.022), PINE, rotation=turn(z=-8), texel=0.015),
@@ -185,7 +185,7 @@ def _fruit() -> list[Solid]:
 
 
 def _hob() -> list[Solid]:
-    """A pot and a kettle on a glass hob."""
+    """Model a pot and a kettle on a glass hob."""
     near, far = np.array([1.28, -0.43, 0.916]), np.array([0.96, -0.2, 0.916])
 
     def kettle(x: float, y: float, z: float) -> np.ndarray:

@@ -40,34 +40,34 @@ PAGES = (0.95, 0.92, 0.84)
 
 
 def tinted(finish: Finish, red: float, green: float, blue: float) -> Finish:
-    """The same finish with another tint."""
+    """Return the same finish with another tint."""
     return finish._replace(tint=(red, green, blue))
 
 
 def peel(red: float, green: float, blue: float) -> Finish:
-    """The skin of a fruit."""
+    """Return the skin of a fruit."""
     return Finish("peel", 0.12, "paper", 0.08, tint=(red, green, blue), gloss=0.15)
 
 
 def print_of(name: str, part: tuple[int, int, int, int] = (0, 0, 1, 1), **options: Any) -> Finish:
-    """A printed sheet; `part` = (column, row, columns, rows) selects one cell of its grid."""
+    """Return a printed sheet; `part` = (column, row, columns, rows) selects a cell of its grid."""
     column, row, columns, rows = part
     region = column / columns, row / rows, (column + 1) / columns, (row + 1) / rows
     return Finish(name, None, "paper", 0.1, region=region, **options)
 
 
 def label(index: int) -> Finish:
-    """A label: 0 is tomatoes, 1 peas, 2 wine, 3 honey."""
+    """Return a label: 0 is tomatoes, 1 peas, 2 wine, 3 honey."""
     return print_of("labels", (index % 2, index // 2, 2, 2), gloss=0.08)
 
 
 def spine(index: int) -> Finish:
-    """The spine of one of eight books."""
+    """Return the spine of one of eight books."""
     return print_of("spines", (index % 8, 0, 8, 1))
 
 
 def interior(low: tuple, high: tuple, floor: Finish, wall: Finish, **walls: Finish) -> list[Solid]:
-    """Six sheets that face into a room; `walls` overrides `back` (+y) or `right` (+x)."""
+    """Model six sheets that face into a room; `walls` overrides `back` (+y) or `right` (+x)."""
     (x0, y0, z0), (x1, y1, z1) = low, high
     x, y, z = (x0 + x1) / 2, (y0 + y1) / 2, (z0 + z1) / 2
     width, depth, height = x1 - x0, y1 - y0, z1 - z0
@@ -85,7 +85,7 @@ def interior(low: tuple, high: tuple, floor: Finish, wall: Finish, **walls: Fini
 def framed(
     center: tuple, size: tuple, name: str, *, facing: str = "-y", frame: Finish = WALNUT
 ) -> list[Solid]:
-    """A print in a frame of four bars, hung on the wall at `center`."""
+    """Model a print in a frame of four bars, hung on the wall at `center`."""
     out = np.array({"-y": (0.0, -1.0, 0.0), "-x": (-1.0, 0.0, 0.0)}[facing])
     across, up = np.array([abs(out[1]), abs(out[0]), 0]), np.array([0, 0, 1])
     width, height = size
@@ -102,7 +102,7 @@ def framed(
 
 
 def book(center: tuple, size: tuple, index: int, angle: float) -> list[Solid]:
-    """A book lying flat; its spine faces -y, rotated by `angle` degrees about z."""
+    """Model a book lying flat; its spine faces -y, rotated by `angle` degrees about z."""
     rotation, cover = turn(z=angle), tinted(PAPER, *COVERS[index % len(COVERS)])
     (width, depth, height), title = size, {2: spine(2 * index + 1)}
     back, lying = center + rotation @ [0, -depth / 2 - 0.002, 0], rotation @ turn(y=-90)
@@ -113,13 +113,13 @@ def book(center: tuple, size: tuple, index: int, angle: float) -> list[Solid]:
 
 
 def standing_book(corner: tuple, size: tuple, index: int) -> Solid:
-    """A book upright on a shelf, spine towards -y; `corner` is its lower left front corner."""
+    """Model an upright book, spine towards -y; `corner` is its lower left front corner."""
     sides = {k: tinted(PAPER, 0.4, 0.36, 0.34) for k in (0, 1)}
     return block(corner, np.add(corner, size), PAPER, faces={2: spine(index), **sides})
 
 
 def pot_plant(base: tuple, size: float, leaves: int) -> list[Solid]:
-    """Flat leaves that rise in a spiral from a flower pot `size` meters wide."""
+    """Model flat leaves that rise in a spiral from a flower pot `size` meters wide."""
     x, y, z = base
     solids = [cylinder(base, 0.88 * size, 0.7 * size, size, TERRACOTTA, texel=0.02)]
     for i in range(leaves):

@@ -104,7 +104,7 @@ def _sofa() -> list[Solid]:
 
 
 def _low_table(x: float, y: float, top: float) -> list[Solid]:
-    """A newspaper, a mug and some books on a low table."""
+    """Model a newspaper, a mug and some books on a low table."""
     above = top + 0.0175
     solids = [
         box((x, y, top), (1.1, 0.55, 0.035), WALNUT, texel=0.025),

@@ -74,7 +74,7 @@ def stairs() -> Model:
 
 
 def _step(number: int) -> list[Solid]:
-    """Tread, riser, runner with its rod, and two balusters."""
+    """Model tread, riser, runner with its rod, and two balusters."""
     y, low, z = RUN * number, RISE * number, RISE * (number + 1)
     solids = [
         block((-0.48, y, 0), (0.60, y + RUN, z - 0.03), WHITE, texel=0.08),
@@ -102,7 +102,7 @@ def _handrail() -> list[Solid]:
 
 
 def _boot(base: tuple, facing: float) -> list[Solid]:
-    """A rubber boot that points to -y, rotated by `facing` degrees about z."""
+    """Model a rubber boot that points to -y, rotated by `facing` degrees about z."""
     rotation = turn(z=facing)
 
     def at(*p: float) -> np.ndarray:

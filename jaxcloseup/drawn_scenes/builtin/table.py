@@ -94,7 +94,7 @@ def _table() -> list[Solid]:
 
 
 def _chair(x: float, y: float, facing: float) -> list[Solid]:
-    """A slatted chair at (x, y) that faces +y, rotated by `facing` degrees about z."""
+    """Model a slatted chair at (x, y) that faces +y, rotated by `facing` degrees about z."""
     rotation = turn(z=facing)
 
     def at(*p: float) -> np.ndarray:
@@ -111,7 +111,7 @@ def _chair(x: float, y: float, facing: float) -> list[Solid]:
 
 
 def _setting(x: float, y: float, facing: float) -> list[Solid]:
-    """Plate, knife, spoon, fork on a napkin and glass, for a guest who faces +y before rotation."""
+    """Model plate, cutlery on a napkin and glass, for a guest who faces +y before rotation."""
     rotation = turn(z=facing)
 
     def at(px: float, py: float, pz: float = 0.0) -> np.ndarray:
@@ -204,7 +204,7 @@ def _salt_and_pepper(x: float, y: float) -> list[Solid]:
 
 
 def _menu(x: float, y: float) -> list[Solid]:
-    """A card folded into a tent."""
+    """Model a card folded into a tent."""
     card = print_of("menu")
     return [
         sheet(

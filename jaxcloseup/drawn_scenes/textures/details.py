@@ -26,7 +26,7 @@ def _grit(rng: np.random.Generator) -> np.ndarray:
 
 
 def _pile(rng: np.random.Generator) -> np.ndarray:
-    """Carpet tufts in rows."""
+    """Draw carpet tufts in rows."""
     u, v, column, row = grid(56, 56, bond=0.5)
     tone = rng.uniform(-0.10, 0.10, (56, 56))[row, column]
     tuft = 0.9 * np.exp(-3.2 * ((u - 0.5) ** 2 + (v - 0.45) ** 2) * 2) - 0.6
@@ -34,7 +34,7 @@ def _pile(rng: np.random.Generator) -> np.ndarray:
 
 
 def _weave(rng: np.random.Generator) -> np.ndarray:
-    """Threads that cross over and under each other."""
+    """Draw threads that cross over and under each other."""
     u, v, column, row = grid(64, 64)
     over = (column + row) % 2 == 0
     along, across = np.where(over, u, v), np.where(over, v, u)

@@ -73,7 +73,7 @@ def paragraph(
 
 
 def blank(color: Color, aspect: float = 1.0) -> np.ndarray:
-    """An empty sheet 1024 pixels wide and `aspect` times as tall."""
+    """Return an empty sheet 1024 pixels wide and `aspect` times as tall."""
     return np.full((round(1024 * aspect), 1024, 3), color, np.uint8)
 
 

@@ -73,7 +73,7 @@ def _brick(rng: np.random.Generator) -> np.ndarray:
 
 
 def _tiles(rng: np.random.Generator) -> np.ndarray:
-    """Glazed 4 x 4 wall tiles; every second one has a painted flower."""
+    """Draw glazed 4 x 4 wall tiles; every second one has a painted flower."""
     u, v, column, row = grid(4, 4)
     base = rgb(0.88, 0.90, 0.88) * rng.uniform(0.95, 1.03, (4, 4, 1))[row, column]
     base = base * (1 + 0.012 * noise(rng, octave=10))[..., None]
@@ -139,7 +139,7 @@ def _iron(rng: np.random.Generator) -> np.ndarray:
 
 
 def _carpet(rng: np.random.Generator) -> np.ndarray:
-    """A rug: border, medallions and small diamonds, slightly worn."""
+    """Draw a rug: border, medallions and small diamonds, slightly worn."""
     x, y = axes()
     a, b = abs(2 * x - 1) + 0 * y, abs(2 * y - 1) + 0 * x
     wobble = 0.004 * noise(rng, octave=90)
@@ -256,7 +256,7 @@ def _bread(rng: np.random.Generator) -> np.ndarray:
 
 
 def _peel(rng: np.random.Generator) -> np.ndarray:
-    """Fruit peel, nearly white so that finishes can tint it."""
+    """Draw fruit peel, nearly white so that finishes can tint it."""
     pores = step(noise(rng, octave=60, slope=3), 1.2, 1.9)
     base = np.full((SIZE, SIZE, 3), 0.92, np.float32) * (1 + 0.05 * noise(rng, octave=4))[..., None]
     return base * (1 - 0.22 * pores)

@@ -41,18 +41,18 @@ def ramp(value: np.ndarray, *colors: tuple[float, float, float]) -> np.ndarray:
 
 
 def rgb(*values: float) -> np.ndarray:
-    """A color `[3]` in float32."""
+    """Return a color `[3]` in float32."""
     return np.array(values, np.float32)
 
 
 def axes() -> tuple[np.ndarray, np.ndarray]:
-    """Texel centers x `[1, S]` and y `[S, 1]` in [0, 1]."""
+    """Return texel centers x `[1, S]` and y `[S, 1]` in [0, 1]."""
     line = (np.arange(SIZE, dtype=np.float32) + 0.5) / SIZE
     return line[None], line[:, None]
 
 
 def grid(columns: int, rows: int, *, bond: float = 0.0) -> tuple[np.ndarray, ...]:
-    """Cells of a periodic wall: position in the cell in [0, 1]^2, column and row, each `[S, S]`."""
+    """Return cells of a periodic wall: position in the cell, column and row, each `[S, S]`."""
     x, y = axes()
     row = np.floor(y * rows)
     shifted = (x + 0 * y) * columns + bond * row
@@ -61,7 +61,7 @@ def grid(columns: int, rows: int, *, bond: float = 0.0) -> tuple[np.ndarray, ...
 
 
 def edge_distance(u: np.ndarray, v: np.ndarray, columns: int, rows: int) -> np.ndarray:
-    """Distance to the cell's border, in units of the texture's side."""
+    """Return the distance to the cell's border, in units of the texture's side."""
     return np.minimum(np.minimum(u, 1 - u) / columns, np.minimum(v, 1 - v) / rows)
 
 

@@ -109,7 +109,7 @@ def _cereal(rng: np.random.Generator) -> np.ndarray:
 
 
 def _labels(rng: np.random.Generator) -> np.ndarray:
-    """Four labels, one in each quarter, for tins, jars and bottles."""
+    """Draw four labels, one in each quarter, for tins, jars and bottles."""
     sheet = blank(WHITE)
     designs = (
         (RED, "TOMATOES", "peeled plum", (205, 52, 40)),
@@ -158,7 +158,7 @@ def _labels(rng: np.random.Generator) -> np.ndarray:
 
 
 def _spines(rng: np.random.Generator) -> np.ndarray:
-    """Eight book spines side by side, with titles along their length."""
+    """Draw eight book spines side by side, with titles along their length."""
     titles = (
         "A HISTORY OF LENSES", "THE LONG STAIRCASE", "Bread and Salt", "ATLAS OF SMALL THINGS",
         "Letters from a Garden", "GEOMETRY, VOL. II", "The Brickmaker", "NIGHT TRAINS",
@@ -188,7 +188,7 @@ def _spines(rng: np.random.Generator) -> np.ndarray:
 
 
 def _map(rng: np.random.Generator) -> np.ndarray:
-    """A town map with named streets."""
+    """Draw a town map with named streets."""
     sheet = blank((236, 230, 208), 0.75)
     x = np.arange(-20, 1060, 10)
     river = np.stack([x, 420 + 90 * np.sin(x / 170) + 30 * np.sin(x / 60)], 1).astype(np.int32)
@@ -219,7 +219,7 @@ def _map(rng: np.random.Generator) -> np.ndarray:
 
 
 def _chart(rng: np.random.Generator) -> np.ndarray:
-    """An eye chart: rows of letters, each row smaller than the one above."""
+    """Draw an eye chart: rows of letters, each row smaller than the one above."""
     sheet = blank(WHITE, 1.4)
     y, height = 0.0, 150.0
     while height > 5:
