@@ -11,7 +11,7 @@ from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.states import initial_state
 from jaxcloseup.app.run.step_data import CloseupData, TrainData
 from jaxcloseup.app.sweep.arm_training import join_arms
-from jaxcloseup.app.sweep.arms import make_arm
+from jaxcloseup.app.sweep.named_arms import make_arm
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.labels.config import pseudo_settings
 

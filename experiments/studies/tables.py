@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxcloseup.app.report.record_table import Table, markdown
 from jaxcloseup.app.report.sweep_tables import paired_bootstrap
-from jaxcloseup.app.report.table import Table, markdown
 from jaxcloseup.io.files import read_object
 
 

@@ -92,20 +92,8 @@ def read_listing(
     Raises:
       SceneError: the folder holds no known format, or one of its files is wrong.
     """
-    found = [(kind, name) for kind, name in _detect(path) if format in (None, kind)]
-    if not found:
-        raise _no_capture(path, format)
-    (kind, name), *others = found
-    folder = _folder_of_model(path) if name == "." else path
-    content = {"transforms": _read_transforms, "colmap": _read_model, "llff": _read_llff}[kind](
-        folder, path / name
-    )
-    check_positions(content.frames)
+    kind, folder, content, note = _read_content(path, format)
     scene = folder.resolve().name
-    rejected = " or ".join(_describe(*other, path) for other in others)
-    note = f"{scene}: reading {_describe(kind, name, path)}" + (
-        f" and not {rejected}" if rejected else ""
-    )
     given = content.given
     if split == "given" and not given:
         given = splits_from_file(folder, content.frames)
@@ -142,6 +130,23 @@ def read_listing(
         times_nearer=division.times_nearer,
         errors=None if content.errors is None else content.errors[keep],
     )
+
+
+def _read_content(
+    path: pathlib.Path, format: str | None
+) -> tuple[str, pathlib.Path, _Content, str]:
+    """Return the format that is read, its folder, its content, and a sentence about it."""
+    found = [(kind, name) for kind, name in _detect(path) if format in (None, kind)]
+    if not found:
+        raise _no_capture(path, format)
+    (kind, name), *others = found
+    folder = _folder_of_model(path) if name == "." else path
+    readers = {"transforms": _read_transforms, "colmap": _read_model, "llff": _read_llff}
+    content = readers[kind](folder, path / name)
+    check_positions(content.frames)
+    rejected = " or ".join(_describe(*other, path) for other in others)
+    note = f"{folder.resolve().name}: reading {_describe(kind, name, path)}"
+    return kind, folder, content, note + (f" and not {rejected}" if rejected else "")
 
 
 def _no_capture(path: pathlib.Path, format: str | None) -> SceneError:

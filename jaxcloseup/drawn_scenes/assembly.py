@@ -11,7 +11,7 @@ from jaxcloseup.drawn_scenes.lighting import bake_light
 from jaxcloseup.drawn_scenes.modeling import Finish, Model, Solid
 from jaxcloseup.drawn_scenes.raycast import BOX, CYLINDER, PLANE, SPHERE, make_solids
 from jaxcloseup.drawn_scenes.textures import draw_texture
-from jaxcloseup.drawn_scenes.threads import map_in_threads
+from jaxcloseup.drawn_scenes.threaded_map import map_in_threads
 
 
 # Scenes padded to the same sizes share compilations.

@@ -29,7 +29,7 @@ from jaxcloseup.drawn_scenes.planning import (
     plan_far,
 )
 from jaxcloseup.drawn_scenes.raycast import cast_rays
-from jaxcloseup.drawn_scenes.threads import map_in_threads
+from jaxcloseup.drawn_scenes.threaded_map import map_in_threads
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.io.cache import Stored, cache_path, cached, hash_files
 from jaxcloseup.photos.scene import Scene, Surface

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxcloseup.drawn_scenes.raycast import Hit, Solids, cast_rays
 from jaxcloseup.drawn_scenes.shading import GAMMA, Faces, World, mean_colors, sample_light
-from jaxcloseup.drawn_scenes.threads import map_in_threads
+from jaxcloseup.drawn_scenes.threaded_map import map_in_threads
 
 
 _BLOCK, _SAMPLES = 256, 16
@@ -50,11 +50,9 @@ def bake_light(
     """Bake light at surface points; neighbors in the list should be neighbors in space.
 
     Args:
-      world: solids, faces and textures; its `light` is not used.
-      lamps: lamps; the first one makes highlights.
-      ambience: light from all directions.
-      positions: `[L, 3]` surface points.
-      normals: `[L, 3]` outward unit normals.
+      world: its `light` is not used.
+      lamps: the first one makes highlights.
+      positions: `[L, 3]` surface points, with outward unit `normals[L, 3]`.
 
     Returns:
       `[L, 4]` RGB light in the encoding of images, and the visible fraction of the first lamp.
@@ -144,7 +142,7 @@ def _smooth(light: np.ndarray, world: World) -> np.ndarray:
 
 
 def _spread(count: int, turns: np.ndarray, offset: float = 0.0) -> np.ndarray:
-    """Return points `[L, count, 2]` that fill the unit square, shifted by `turns[L, 1, 2]` mod 1."""
+    """Return points `[L, count, 2]` in the unit square, shifted by `turns[L, 1, 2]` mod 1."""
     i = np.arange(count)
     lattice = np.stack([(i + 0.5) / count + offset, i * 0.618034 + 7 * offset], -1)
     return (lattice + turns) % 1

@@ -154,6 +154,14 @@ def _finish(sums: _Sums) -> Gathered:
     )
 
 
+def _read_maps(
+    sources: GatherSources, view: jax.Array, landed: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    maps = jnp.stack([sources.inverse_depth[view], sources.trust[view]], axis=-1)
+    inverse, trust = jnp.moveaxis(backward_warp(maps, landed), -1, 0)
+    return inverse, trust
+
+
 def _add_view(
     sums: tuple[_Sums, ...],
     points: jax.Array,
@@ -166,10 +174,8 @@ def _add_view(
     sources, pyramid = reader.sources, reader.pyramid
     source = camera_at(sources.cameras, view)
     landed, depth = points_to_pixels(source, points)
-    maps = jnp.stack([sources.inverse_depth[view], sources.trust[view]], axis=-1)
-    inverse, trust = jnp.moveaxis(backward_warp(maps, landed), -1, 0)
+    inverse, trust = _read_maps(sources, view, landed)
     known = (side > 0) & (depth > 0)
-
     # log2 of the footprint of the finest level's pixel, and of the finest that is read.
     size = jnp.log2(jnp.where(known, depth, 1) / jnp.where(side > 0, side, 1))
     size = size - jnp.log2(mean_focal(pyramid.intrinsics[view][0]))

@@ -9,7 +9,7 @@ import pytest
 from tiny_runs import TINY, TINY_SURFELS
 
 from jaxcloseup.app.sweep.arm_training import order_arms
-from jaxcloseup.app.sweep.arms import make_arm
+from jaxcloseup.app.sweep.named_arms import make_arm
 from jaxcloseup.labels.config import pseudo_settings
 
 

@@ -24,7 +24,7 @@ from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.methods.settings import plain_config, settings_of
 from jaxcloseup.app.run.scene_input import load
 from jaxcloseup.app.run.stage_names import ARMS
-from jaxcloseup.app.sweep.arms import KINDS
+from jaxcloseup.app.sweep.named_arms import KINDS
 from jaxcloseup.fields.splats.config import AdaptiveConfig
 from jaxcloseup.labels.rules import LABEL_RULES
 from jaxcloseup.photos.scene import SceneError

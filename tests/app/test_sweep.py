@@ -31,7 +31,7 @@ from jaxcloseup.app.run.states import initial_points
 from jaxcloseup.app.run.step_data import CloseupData, TrainData
 from jaxcloseup.app.sweep import arm_training as sweep_stages
 from jaxcloseup.app.sweep.arm_training import join_arms, run_sweep
-from jaxcloseup.app.sweep.arms import make_arm
+from jaxcloseup.app.sweep.named_arms import make_arm
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.training.state import init_state
 

@@ -30,7 +30,7 @@ def main(_: list[str]) -> None:
             write_comparison,
         )
         from jaxcloseup.app.report.finished_runs import read_finished
-        from jaxcloseup.app.report.table import print_tables
+        from jaxcloseup.app.report.record_table import print_tables
         from jaxcloseup.app.store.stored_run import RunError
 
     with in_one_sentence("compare", RunError, OSError):

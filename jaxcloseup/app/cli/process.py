@@ -21,7 +21,7 @@ from jaxcloseup.app.cli.invocation import program_command
 from jaxcloseup.app.cli.output_folder import check_unused, lock_output_dir, remove_unfinished
 from jaxcloseup.app.cli.start import in_one_sentence, loading, set_up
 from jaxcloseup.app.cli.topics import share
-from jaxcloseup.app.process.choices import COUNT, FEWEST, LENSES, MOST_EXHAUSTIVE, PAIRINGS
+from jaxcloseup.app.process.options import COUNT, FEWEST, LENSES, MOST_EXHAUSTIVE, PAIRINGS
 
 
 if TYPE_CHECKING:

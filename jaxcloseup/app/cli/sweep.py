@@ -102,11 +102,7 @@ def _sweep() -> None:
             check_tensorboard()
         preset = preset_from_flags()
         _check_flags(preset)
-        output_dir = pathlib.Path(FLAGS.output_dir or "")
-        if first:
-            output_dir = choose_output_dir(
-                FLAGS.output_dir, "sweep", FLAGS.method, resume=FLAGS.resume
-            )
+        output_dir = _output_dir(first)
         prepare_to_stop(output_dir, "sweep")
         perceptual = find_perceptual(FLAGS.lpips_weights)
         load_options = load_options_from_flags(preset)
@@ -133,15 +129,27 @@ def _sweep() -> None:
                 first=first,
             )
     except (TrainingError, CheckpointError, SceneError, OSError) as error:
-        sentence = f"{program_name('sweep')}: {error}"
-        if hosts is None:
-            sys.exit(sentence)
-        # The others would wait for this one at the end: without it they are told to stop.
-        print(sentence, file=sys.stderr, flush=True)
-        os._exit(1)
+        _stop(error, alone=hosts is None)
     if first:
         print_sweep(found)
         print(f"report: {output_dir / 'report.html'}")
+
+
+def _stop(error: Exception, *, alone: bool) -> None:
+    """End this host with one sentence."""
+    sentence = f"{program_name('sweep')}: {error}"
+    if alone:
+        sys.exit(sentence)
+    # The others would wait for this one at the end: without it they are told to stop.
+    print(sentence, file=sys.stderr, flush=True)
+    os._exit(1)
+
+
+def _output_dir(first: bool) -> pathlib.Path:
+    """Return the output folder; the first host checks it."""
+    if not first:
+        return pathlib.Path(FLAGS.output_dir or "")
+    return choose_output_dir(FLAGS.output_dir, "sweep", FLAGS.method, resume=FLAGS.resume)
 
 
 def _hosts() -> tuple[str, int, int] | None:
@@ -165,7 +173,7 @@ def _check_flags(preset: "Preset") -> None:
     Raises:
       ValueError: one sentence that names the flag.
     """
-    from jaxcloseup.app.sweep.arms import make_arm
+    from jaxcloseup.app.sweep.named_arms import make_arm
     from jaxcloseup.labels.rules import LABEL_RULES, pool_label_loss
 
     for flag in ("scenes", "arms"):

@@ -14,7 +14,7 @@ from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection
 from matplotlib.ticker import MaxNLocator
 
-from jaxcloseup.app.process.choices import FEWEST
+from jaxcloseup.app.process.options import FEWEST
 from jaxcloseup.captures.colmap import read_colmap
 from jaxcloseup.io.files import write_file
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxcloseup.app.process.choices import MOST_EXHAUSTIVE
+from jaxcloseup.app.process.options import MOST_EXHAUSTIVE
 
 
 _NEIGHBORS = 10  # on each side in a video

@@ -15,8 +15,8 @@ import PIL.Image
 import PIL.ImageOps
 from PIL.ExifTags import IFD, Base
 
-from jaxcloseup.app.process.choices import FEWEST
 from jaxcloseup.app.process.counting import progress
+from jaxcloseup.app.process.options import FEWEST
 from jaxcloseup.app.process.solver_process import ProcessingError
 from jaxcloseup.artifacts.images import encode_png
 from jaxcloseup.captures.photo_files import ENDINGS, read_file, read_image

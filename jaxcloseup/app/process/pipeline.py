@@ -10,7 +10,7 @@ from typing import Any
 
 from jaxcloseup.app.process.capture_stages import Stages
 from jaxcloseup.app.process.capture_summary import draw_from_above, other_models, why_left_out
-from jaxcloseup.app.process.choices import LENSES
+from jaxcloseup.app.process.options import LENSES
 from jaxcloseup.app.process.pairs import choose_pairing
 from jaxcloseup.app.process.photo_folder import Copied, copy_photographs, list_files
 from jaxcloseup.app.process.solver_process import ProcessingError, run_job
@@ -67,11 +67,6 @@ class Request:
 
 def make_capture(request: Request, folder: pathlib.Path, stages: Stages) -> dict[str, Any]:
     """Make a capture, or continue one, and return the summary that `process.json` keeps.
-
-    Args:
-      request: its sources and settings.
-      folder: folder of the capture.
-      stages: the finished stages of the capture.
 
     Raises:
       ProcessingError: the photographs give no model; the message says why.

@@ -24,7 +24,7 @@ from typing import Any
 
 import pycolmap
 
-from jaxcloseup.app.process.choices import FEWEST
+from jaxcloseup.app.process.options import FEWEST
 from jaxcloseup.app.process.pairs import pairs_to_match
 
 

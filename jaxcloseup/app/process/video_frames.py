@@ -8,8 +8,8 @@ from collections.abc import Iterator, Sequence
 import cv2
 import numpy as np
 
-from jaxcloseup.app.process.choices import FEWEST
 from jaxcloseup.app.process.counting import progress
+from jaxcloseup.app.process.options import FEWEST
 from jaxcloseup.app.process.photo_folder import Copied
 from jaxcloseup.app.process.solver_process import ProcessingError
 from jaxcloseup.io.files import check_file, write_file

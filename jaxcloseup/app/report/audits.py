@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from jaxcloseup.app.report.plots import Curve, gains_over, line_plot, zoom_curves
-from jaxcloseup.app.report.table import Table
+from jaxcloseup.app.report.record_table import Table
 from jaxcloseup.app.score.metrics_text import format_metric
 
 

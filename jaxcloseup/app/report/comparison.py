@@ -12,8 +12,8 @@ from jaxcloseup.app.report.audits import zoom_plots
 from jaxcloseup.app.report.finished_runs import Finished
 from jaxcloseup.app.report.headline import all_scores, compare_psnr, score_tables
 from jaxcloseup.app.report.page import fill_page
+from jaxcloseup.app.report.record_table import Table
 from jaxcloseup.app.report.showcase import best_middle_worst
-from jaxcloseup.app.report.table import Table
 from jaxcloseup.app.score.metrics_text import FINER, SPLIT_TITLES
 from jaxcloseup.app.store.stored_run import RunError
 from jaxcloseup.io.files import write_file, write_json

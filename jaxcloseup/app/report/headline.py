@@ -3,7 +3,7 @@
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
-from jaxcloseup.app.report.table import Table, print_tables
+from jaxcloseup.app.report.record_table import Table, print_tables
 from jaxcloseup.app.score.metrics_text import COLUMNS, FINER, SPLIT_TITLES, format_metric
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxcloseup.app.report.table import Table, format_number, markdown
+from jaxcloseup.app.report.record_table import Table, format_number, markdown
 from jaxcloseup.app.run.manifest import NAME as MANIFEST
 from jaxcloseup.app.score.ladder import PREFIX, rungs_of
 from jaxcloseup.app.score.metrics_text import SPLIT_TITLES

@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxcloseup.app.report.page import Picture, by_section, fill_page
 from jaxcloseup.app.report.plots import Curve, line_plot
-from jaxcloseup.app.report.table import Table, format_number, markdown, print_tables
+from jaxcloseup.app.report.record_table import Table, format_number, markdown, print_tables
 from jaxcloseup.app.score.ladder import MAGNIFICATIONS, PREFIX
 from jaxcloseup.app.score.metrics_text import SPLIT_TITLES
 from jaxcloseup.io.files import write_file, write_json

@@ -12,7 +12,7 @@ from jaxcloseup.app.run.scoring import HeldOut
 from jaxcloseup.app.score.metrics_text import SPLIT_TITLES
 from jaxcloseup.app.score.scores import Perceptual, evaluate
 from jaxcloseup.app.score.targets import Target
-from jaxcloseup.app.sweep.arms import Arm
+from jaxcloseup.app.sweep.named_arms import Arm
 from jaxcloseup.training.state import TrainState
 
 

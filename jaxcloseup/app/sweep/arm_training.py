@@ -23,8 +23,8 @@ from jaxcloseup.app.run.states import say_which_points_fit, train_baseline
 from jaxcloseup.app.run.step_data import ArmsData, LabeledData
 from jaxcloseup.app.score.scores import NO_PERCEPTUAL, Perceptual
 from jaxcloseup.app.sweep.arm_scoring import ArmScorer, SweepOutcome
-from jaxcloseup.app.sweep.arms import Arm, describe, make_arm, why_not
 from jaxcloseup.app.sweep.ceilings import labels_with_better_depth, true_close_ups
+from jaxcloseup.app.sweep.named_arms import Arm, describe, make_arm, why_not
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.labels.make import LabelSources, PseudoSettings
 from jaxcloseup.photos.scene import Scene

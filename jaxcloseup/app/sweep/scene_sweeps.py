@@ -31,24 +31,10 @@ def sweep_scenes(
     resume: bool,
     first: bool,
 ) -> dict[str, Any]:
-    """Sweep scene by scene; the first host writes tables, pictures and the report after each.
+    """Sweep scene by scene and return the scores of `run_sweep` by scene.
 
-    Args:
-      scenes: what was photographed.
-      preset: how it is trained.
-      output_dir: an empty folder, or with `resume` that of the same sweep.
-      arms: names of the arms.
-      seeds: number of random seeds.
-      names: "method" and "preset" by name, for the report.
-      load_options: what `load_scene` took, for the manifest.
-      perceptual: networks of LPIPS.
-      max_parallel: arms and seeds trained at once.
-      tensorboard: whether to write event files.
-      resume: whether the sweep was begun before.
-      first: whether this is the first host.
-
-    Returns:
-      The scores of `run_sweep` by scene.
+    The first host writes tables, pictures and the report after each scene. `names` has "method" and
+    "preset"; `load_options` is what `load_scene` took; `max_parallel` arms and seeds train at once.
     """
     about = {**names, "config": plain_config(preset), "versions": versions()}
     manifest = about | {"seeds": list(range(seeds)), "arms": list(arms)}

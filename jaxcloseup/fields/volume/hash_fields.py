@@ -101,10 +101,8 @@ def hash_field(
         rgb = apply_colors(part["color"], raw, rays, config.direction_octaves)
         return Samples(density=densities(raw, edges), rgb=rgb)
 
-    rounds = [
-        Round(count, functools.partial(propose, index))
-        for index, count in enumerate(proposal_counts(config))
-    ]
+    counts = enumerate(proposal_counts(config))
+    rounds = [Round(count, functools.partial(propose, index)) for index, count in counts]
     return interval_field(
         IntervalConfig(config.spacing, config.background, config.chunk),
         extent,

@@ -120,9 +120,7 @@ def ray_field(
     loss: Callable[..., tuple[jax.Array, dict[str, jax.Array]]] | None = None,
     supervision: DepthSupervision | None = None,
 ) -> RadianceField:
-    """Return a radiance field that renders by tracing rays.
-
-    A field that keeps `buffers` up to date adds its own `adapt` with `_replace`.
+    """Return a field that traces rays; one that keeps `buffers` up to date replaces its `adapt`.
 
     Args:
       extent: the field's coordinates.
