@@ -2,18 +2,15 @@
 
 import dataclasses
 
-from jaxcloseup.app.methods.method import Preset, WindowConfig
 from jaxcloseup.app.methods.volumes import (
-    QUICK_LABELS,
-    QUICK_TARGETS,
     AdamConfig,
     DepthConfig,
+    paper_preset,
+    quick_preset,
     volumetric,
 )
 from jaxcloseup.fields.volume.config import MipNerfConfig
-from jaxcloseup.labels.config import LabelConfig
 from jaxcloseup.lazy import lazy_function
-from jaxcloseup.training.config import TrainConfig
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,17 +22,12 @@ class MipNerfTrainingConfig(MipNerfConfig, DepthConfig, AdamConfig):
     lr_decay_steps: int = 1_000_000
 
 
-PAPER = Preset(
-    method="mipnerf",
-    field=MipNerfTrainingConfig(),
-    train=TrainConfig(num_rays=4096, num_label_rays=4096),
-    labels=LabelConfig(),
-    baseline_steps=1_000_000,
-    closeup_steps=10_000,
+PAPER = paper_preset(
+    "mipnerf", MipNerfTrainingConfig(), rays=4096, steps=1_000_000, closeup_steps=10_000
 )
 
-QUICK = Preset(
-    method="mipnerf",
+QUICK = quick_preset(
+    "mipnerf",
     field=MipNerfTrainingConfig(
         depth=4,
         width=64,
@@ -48,14 +40,10 @@ QUICK = Preset(
         lr_decay=0.1,
         lr_decay_steps=1600,
     ),
-    train=TrainConfig(num_rays=512, num_label_rays=512, label_rule="pooled"),
-    labels=QUICK_LABELS,
-    targets=QUICK_TARGETS,
-    baseline_steps=1000,
-    closeup_steps=200,
-    downscale=8,
+    rays=512,
+    steps=1000,
     # The network is too small for the detail of larger photographs, as a NeRF's is.
-    windows=WindowConfig(finest=8),
+    finest=8,
 )
 
 METHOD = volumetric(

@@ -2,13 +2,12 @@
 
 import dataclasses
 
-from jaxcloseup.app.methods.method import Preset, WindowConfig
+from jaxcloseup.app.methods.method import Preset
 from jaxcloseup.app.methods.volumes import (
     NETWORK_ADAM,
-    QUICK_LABELS,
-    QUICK_TARGETS,
     AdamConfig,
     DepthConfig,
+    quick_preset,
     volumetric,
 )
 from jaxcloseup.fields.volume.config import NerfConfig
@@ -51,8 +50,8 @@ RELEASED = dataclasses.replace(
     ),
 )
 
-QUICK = Preset(
-    method="nerf",
+QUICK = quick_preset(
+    "nerf",
     field=NerfTrainingConfig(
         depth=4,
         width=64,
@@ -64,14 +63,10 @@ QUICK = Preset(
         lr_decay_steps=1600,
         normalize=True,
     ),
-    train=TrainConfig(num_rays=512, num_label_rays=512, label_rule="pooled"),
-    labels=QUICK_LABELS,
-    targets=QUICK_TARGETS,
-    baseline_steps=1000,
-    closeup_steps=200,
-    downscale=8,
+    rays=512,
+    steps=1000,
     # The network is too small for the detail of larger photographs: windows.finest=1 wins nothing.
-    windows=WindowConfig(finest=8),
+    finest=8,
 )
 
 METHOD = volumetric(

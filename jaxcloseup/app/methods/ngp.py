@@ -2,18 +2,15 @@
 
 import dataclasses
 
-from jaxcloseup.app.methods.method import Preset, WindowConfig
 from jaxcloseup.app.methods.volumes import (
-    QUICK_LABELS,
-    QUICK_TARGETS,
     AdamConfig,
     DepthConfig,
+    paper_preset,
+    quick_preset,
     volumetric,
 )
 from jaxcloseup.fields.volume.config import HashGridConfig, NgpConfig
-from jaxcloseup.labels.config import LabelConfig
 from jaxcloseup.lazy import lazy_function
-from jaxcloseup.training.config import TrainConfig
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,17 +18,10 @@ class NgpTrainingConfig(NgpConfig, DepthConfig, AdamConfig):
     """Instant-NGP and its training."""
 
 
-PAPER = Preset(
-    method="ngp",
-    field=NgpTrainingConfig(),
-    train=TrainConfig(num_rays=2**13, num_label_rays=2**13),
-    labels=LabelConfig(),
-    baseline_steps=30_000,
-    closeup_steps=500,
-)
+PAPER = paper_preset("ngp", NgpTrainingConfig(), rays=2**13, steps=30_000, closeup_steps=500)
 
-QUICK = Preset(
-    method="ngp",
+QUICK = quick_preset(
+    "ngp",
     field=NgpTrainingConfig(
         grid=HashGridConfig(levels=8, features=2, log2_entries=17, coarsest=16, finest=1024),
         proposal=HashGridConfig(levels=4, features=2, log2_entries=14, coarsest=8, finest=128),
@@ -47,13 +37,8 @@ QUICK = Preset(
         lr_decay_steps=2700,
         chunk=2048,
     ),
-    train=TrainConfig(num_rays=1024, num_label_rays=1024, label_rule="pooled"),
-    labels=QUICK_LABELS,
-    targets=QUICK_TARGETS,
-    baseline_steps=2500,
-    closeup_steps=200,
-    downscale=8,
-    windows=WindowConfig(),
+    rays=1024,
+    steps=2500,
 )
 
 METHOD = volumetric(

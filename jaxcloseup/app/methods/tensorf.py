@@ -2,18 +2,15 @@
 
 import dataclasses
 
-from jaxcloseup.app.methods.method import Preset, WindowConfig
 from jaxcloseup.app.methods.volumes import (
-    QUICK_LABELS,
-    QUICK_TARGETS,
     AdamConfig,
     DepthConfig,
+    paper_preset,
+    quick_preset,
     volumetric,
 )
 from jaxcloseup.fields.volume.config import TensorfConfig
-from jaxcloseup.labels.config import LabelConfig
 from jaxcloseup.lazy import lazy_function
-from jaxcloseup.training.config import TrainConfig
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,17 +20,16 @@ class TensorfTrainingConfig(TensorfConfig, DepthConfig, AdamConfig):
     initial_lr: float = 2e-2
 
 
-PAPER = Preset(
-    method="tensorf",
-    field=TensorfTrainingConfig(lr_decay_steps=30_000),
-    train=TrainConfig(num_rays=4096, num_label_rays=4096),
-    labels=LabelConfig(),
-    baseline_steps=30_000,
+PAPER = paper_preset(
+    "tensorf",
+    TensorfTrainingConfig(lr_decay_steps=30_000),
+    rays=4096,
+    steps=30_000,
     closeup_steps=500,
 )
 
-QUICK = Preset(
-    method="tensorf",
+QUICK = quick_preset(
+    "tensorf",
     field=TensorfTrainingConfig(
         coarsest=32,
         finest=128,
@@ -53,13 +49,8 @@ QUICK = Preset(
         lr_decay_steps=4200,
         chunk=1024,
     ),
-    train=TrainConfig(num_rays=512, num_label_rays=512, label_rule="pooled"),
-    labels=QUICK_LABELS,
-    targets=QUICK_TARGETS,
-    baseline_steps=4000,
-    closeup_steps=200,
-    downscale=8,
-    windows=WindowConfig(),
+    rays=512,
+    steps=4000,
 )
 
 METHOD = volumetric(

@@ -4,10 +4,11 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from jaxcloseup.app.methods.method import Method, Preset, TargetConfig
+from jaxcloseup.app.methods.method import Method, Preset, TargetConfig, WindowConfig
 from jaxcloseup.labels.config import LabelConfig
 from jaxcloseup.lazy import lazy_function
 from jaxcloseup.setting import setting
+from jaxcloseup.training.config import TrainConfig
 
 
 TRAINING = "jaxcloseup.app.methods.shared.volume_training"
@@ -48,16 +49,10 @@ def volumetric(
     make_optimizer: Callable[..., Any] = GRID_ADAM,
     normalize: Callable[[Any], bool] = lambda config: True,
 ) -> Method:
-    """Return the method of a volumetric field.
+    """Return the method of a volumetric field, as `build_field` takes it.
 
-    Args:
-      field: as in `build_field`.
-      help: as in `Method`.
-      presets: as in `Method`.
-      make_optimizer: as in `Method`.
-      normalize: `(config) -> bool`, whether to scale the scene to the unit cube.
+    `normalize(config)` says whether to scale the scene to the unit cube.
     """
-
     build_field = lazy_function(TRAINING, "build_field")
 
     def make_field(config: Any, scene: Any, growth: int) -> Any:
@@ -81,3 +76,30 @@ QUICK_LABELS = LabelConfig(
 )
 # Target views learn from renders with detail instead, whose weights say how far to trust them.
 QUICK_TARGETS = TargetConfig("residual", lr_scale=3.0)
+
+
+def paper_preset(method: str, field: Any, *, rays: int, steps: int, closeup_steps: int) -> Preset:
+    """Return a preset with a paper's field and length, and as many rays with labels as without."""
+    return Preset(
+        method=method,
+        field=field,
+        train=TrainConfig(num_rays=rays, num_label_rays=rays),
+        labels=LabelConfig(),
+        baseline_steps=steps,
+        closeup_steps=closeup_steps,
+    )
+
+
+def quick_preset(method: str, field: Any, *, rays: int, steps: int, finest: int = 1) -> Preset:
+    """Return a short training on photographs reduced eightfold, with windows up to `finest`."""
+    return Preset(
+        method=method,
+        field=field,
+        train=TrainConfig(num_rays=rays, num_label_rays=rays, label_rule="pooled"),
+        labels=QUICK_LABELS,
+        targets=QUICK_TARGETS,
+        baseline_steps=steps,
+        closeup_steps=200,
+        downscale=8,
+        windows=WindowConfig(finest=finest),
+    )

@@ -2,18 +2,15 @@
 
 import dataclasses
 
-from jaxcloseup.app.methods.method import Preset, WindowConfig
 from jaxcloseup.app.methods.volumes import (
-    QUICK_LABELS,
-    QUICK_TARGETS,
     AdamConfig,
     DepthConfig,
+    paper_preset,
+    quick_preset,
     volumetric,
 )
 from jaxcloseup.fields.volume.config import HashGridConfig, ZipNerfConfig
-from jaxcloseup.labels.config import LabelConfig
 from jaxcloseup.lazy import lazy_function
-from jaxcloseup.training.config import TrainConfig
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,17 +18,16 @@ class ZipNerfTrainingConfig(ZipNerfConfig, DepthConfig, AdamConfig):
     """A Zip-NeRF and its training."""
 
 
-PAPER = Preset(
-    method="zipnerf",
-    field=ZipNerfTrainingConfig(lr_decay_steps=25_000),
-    train=TrainConfig(num_rays=2**14, num_label_rays=2**14),
-    labels=LabelConfig(),
-    baseline_steps=25_000,
+PAPER = paper_preset(
+    "zipnerf",
+    ZipNerfTrainingConfig(lr_decay_steps=25_000),
+    rays=2**14,
+    steps=25_000,
     closeup_steps=500,
 )
 
-QUICK = Preset(
-    method="zipnerf",
+QUICK = quick_preset(
+    "zipnerf",
     field=ZipNerfTrainingConfig(
         grid=HashGridConfig(levels=8, features=2, log2_entries=17, coarsest=16, finest=1024),
         proposal=HashGridConfig(levels=4, features=2, log2_entries=14, coarsest=8, finest=128),
@@ -51,13 +47,8 @@ QUICK = Preset(
         lr_decay_steps=3200,
         chunk=1024,
     ),
-    train=TrainConfig(num_rays=1024, num_label_rays=1024, label_rule="pooled"),
-    labels=QUICK_LABELS,
-    targets=QUICK_TARGETS,
-    baseline_steps=3000,
-    closeup_steps=200,
-    downscale=8,
-    windows=WindowConfig(),
+    rays=1024,
+    steps=3000,
 )
 
 METHOD = volumetric(
