@@ -6,6 +6,7 @@ works from any folder.
 """
 
 import importlib
+import os
 import sys
 
 from jaxcloseup.app.cli.interrupt import end_at_ctrl_c
@@ -28,11 +29,7 @@ def main() -> None:
     """Run the program that the command line names."""
     name, *rest = sys.argv[1:] or ["--help"]
     if name in ("-h", "--help", "help"):
-        width = max(map(len, PROGRAMS))
-        print(
-            "usage: jaxcloseup PROGRAM [--flag=value ...]; `jaxcloseup PROGRAM --help` has flags\n"
-        )
-        print("\n".join(f"  {program:{width}}  {what}" for program, what in PROGRAMS.items()))
+        _print_usage()
         return
     if name not in PROGRAMS:
         sys.exit(f"jaxcloseup: {name} is not a program: choose {', '.join(PROGRAMS)}")
@@ -42,3 +39,13 @@ def main() -> None:
     program = importlib.import_module(f"jaxcloseup.app.cli.{name}")
     sys.argv = [f"jaxcloseup {name}", *rest]
     start(program)
+
+
+def _print_usage() -> None:
+    width = max(map(len, PROGRAMS))
+    usage = "usage: jaxcloseup PROGRAM [--flag=value ...]; `jaxcloseup PROGRAM --help` has flags\n"
+    programs = [f"  {program:{width}}  {what}" for program, what in PROGRAMS.items()]
+    try:
+        print("\n".join([usage, *programs]), flush=True)
+    except BrokenPipeError:  # `--help | head`: Python would write the rest when it ends
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
