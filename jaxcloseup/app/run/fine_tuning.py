@@ -59,13 +59,8 @@ def prepare_target_views(
 ) -> TargetTraining:
     """Label target views, and prepare what a state learns from for them.
 
-    Args:
-      programs: the run's.
-      start: the state, and the photographs with its depths.
-      cameras: stacked `[Q]`, of the target views.
-      labels: says what labels are.
-      settings: of warps, after the gate, and of the steps.
-      get_detail: returns the detail of the state; called if labels need it.
+    `settings` are of warps, after the gate, and of the steps.
+    `get_detail` is called if labels need it.
     """
     method, field, state = programs.method, programs.preset.field, start.state
     photographs, render = programs.photographs, functools.partial(programs.render, state)
@@ -97,11 +92,7 @@ def _is_larger(cameras: Camera, size: tuple[int, int]) -> bool:
 def tuned_detail(programs: Programs, state: TrainState, cameras: Camera, detail: Detail) -> Detail:
     """Return the detail of a fine-tuned state, of the photographs that its target views need.
 
-    Args:
-      programs: the run's.
-      state: the state after fine-tuning.
-      cameras: stacked `[Q]`, of the target views.
-      detail: of the state before fine-tuning.
+    `detail` is of the state before fine-tuning.
     """
     shares = np.stack(
         [
@@ -150,13 +141,7 @@ def fine_tune(
     Where the preset has a gate, it weighs warped labels again. Without labels the state stays as it
     is.
 
-    Args:
-      programs: the run's.
-      start: the state, and the photographs with its depths.
-      cameras: stacked `[Q]`, of the target views.
-      get_detail: returns the detail of the state; called if labels need it.
-      most: the largest number of steps in all; by default the method's.
-      report: called ten times with the number of steps done, and of all steps.
+    `most` bounds the steps; `report(done, steps)` is called ten times.
 
     Raises:
       TrainingError: no step was finite.

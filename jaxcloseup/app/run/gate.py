@@ -74,11 +74,6 @@ def weigh_labels(
 ) -> dict[str, Any]:
     """Measure how well labels agree on left-out photographs, and derive their weight.
 
-    Args:
-      sources: the training photographs with their depths.
-      render: `camera -> Rendering` of the model.
-      settings: settings of the labels.
-
     Returns:
       A record for JSON. `weight`: a factor on `label_loss_weight`, in [0, 1]. `agreement`: share of
       the pixels of left-out photographs on which labels agree closely. `left_out`: for each pair of

@@ -66,10 +66,7 @@ def find_detail(
 ) -> tuple[Detail, dict[str, Any]]:
     """Return the detail of a state from the file that keeps it, or make it and keep it there.
 
-    Args:
-      programs: the run's.
-      state: the state that is rendered.
-      path: the file, such as `detail_path` of a run; None keeps nothing.
+    Without a path nothing is kept.
 
     Returns:
       The detail, and a record for JSON: `divisor` of the photographs' size that the finest level
@@ -119,11 +116,7 @@ def refresh_detail(
 ) -> Detail:
     """Return the detail of a state that was trained on from another, of some photographs alone.
 
-    Args:
-      programs: the run's.
-      state: the state that is rendered.
-      detail: of the other state, whose weights stay.
-      views: the photographs.
+    The weights of `detail`, which is of the other state, stay.
     """
     pyramid, _ = programs.pyramid()
     shown, depths = render_residuals(programs, state, pyramid, views)

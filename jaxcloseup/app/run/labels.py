@@ -39,14 +39,7 @@ class LabelStart(NamedTuple):
 def start_labels(
     programs: Programs, state: Any, keys: RunKeys, *, expected_depth: bool | None = None
 ) -> LabelStart:
-    """Return the state whose depth labels are made from, and the photographs with its depths.
-
-    Args:
-      programs: what is compiled.
-      state: the baseline's.
-      keys: the run's.
-      expected_depth: see `LabelConfig`.
-    """
+    """Return the state whose depth labels are made from, and the photographs with its depths."""
     if expected_depth is not None:
         assert programs.method.with_expected_depth is not None  # settings are checked before
         buffers = programs.method.with_expected_depth(state.buffers, expected_depth)
@@ -74,14 +67,8 @@ def rendered_depths(
 ) -> jax.Array:
     """Render the depths `[V, H, W]` of stacked cameras, for labels and anchors.
 
-    Args:
-      render: `(camera, key) -> Rendering`.
-      cameras: stacked `[V]`.
-      scene: limits depths to its `far`.
-      near: smallest depth; 0 by default, because close-ups may be nearer to the surface than any
-        photograph.
-      key: consumed by the renderings; None renders deterministically.
-      depth: that of a `LabelRule`.
+    `near` is 0 by default, because close-ups may be nearer to the surface than any photograph.
+    Without a key, rendering is deterministic; `depth` is that of a `LabelRule`.
     """
     return render_depths(
         render,
@@ -104,14 +91,8 @@ def label_target_views(
 ) -> Views:
     """Label target views, or other views that are labeled before the first step.
 
-    Args:
-      programs: the run's.
-      start: what fine-tuning begins with.
-      cameras: stacked `[Q]`.
-      labels: says what labels are.
-      settings: of warps, after the gate.
-      get_detail: returns the detail of the state that fine-tuning begins with; called if labels
-        need it.
+    `settings` are of warps, after the gate. `get_detail` returns the detail of the state that
+    fine-tuning begins with, and is called if labels need it.
     """
     if labels.label == "residual":
         detail, _ = get_detail()
@@ -124,15 +105,7 @@ def label_target_views(
 def label_closeups(
     programs: Programs, start: LabelStart, labels: LabelConfig, keys: RunKeys, get_detail: GetDetail
 ) -> Views:
-    """Label random close-ups with detail, all before the first step: each costs a render.
-
-    Args:
-      programs: the run's.
-      start: what fine-tuning begins with.
-      labels: says how close-ups are drawn.
-      keys: the run's.
-      get_detail: as in `label_target_views`.
-    """
+    """Label random close-ups with detail, all before the first step: each costs a render."""
     settings = pseudo_settings(labels)
     count = min(programs.preset.closeup_steps, _MOST_CLOSEUPS)
     draw = jax.jit(lambda key: sample_closeups(key, start.sources, settings, count))

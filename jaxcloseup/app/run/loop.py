@@ -49,13 +49,6 @@ def train_stage(
 
     Resumes from the stage's newest checkpoint, if there is one, with the same next steps.
 
-    Args:
-      training: what is compiled; keeps checkpoints, and gets the stage's history and seconds.
-      stage: name of the stage.
-      state: the state before the first step.
-      data: what the steps learn from.
-      steps: how many.
-
     Returns:
       The state after the last step.
 

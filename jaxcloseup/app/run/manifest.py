@@ -33,11 +33,8 @@ def write_manifest(
 
     A run that another commit continues prints a warning.
 
-    Args:
-      folder: folder of the run.
-      about: configuration, versions (including the device), seeds and scenes.
-      seconds: wall time of each stage since the run started or resumed, by scene for a sweep; None
-        while the run is not finished.
+    `seconds` has the wall time of each stage since the run started or resumed, by scene for a
+    sweep; None while the run is not finished.
     """
     commit, changed = git_commit(pathlib.Path(jaxcloseup.__file__).parent)
     before = None
@@ -56,12 +53,7 @@ def write_manifest(
 
 
 def about_scene(scene: Scene, load_options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return how to load a scene again, and a hash of the loaded data.
-
-    Args:
-      scene: the scene that `load_scene` returned.
-      load_options: options that `load_scene` took beside the name or path.
-    """
+    """Return how to load a scene again, and a hash of the loaded data."""
     path = scene.metadata.get("path")
     return {
         "scene": scene.name if path is None else str(pathlib.Path(path).resolve()),
@@ -74,10 +66,7 @@ def about_scene(scene: Scene, load_options: Mapping[str, Any]) -> dict[str, Any]
 def identity_of(scene: Scene, preset: Preset, names: Mapping[str, str]) -> dict[str, Any]:
     """Return what tells one training from another, as JSON; programs add entries of their own.
 
-    Args:
-      scene: what is trained.
-      preset: how.
-      names: "method" and "preset" by name.
+    `names` has "method" and "preset".
     """
     size = scene.train.cameras
     return {
@@ -97,10 +86,6 @@ def write_dataparser_transforms(folder: pathlib.Path, scene: Scene) -> None:
     Training and exports use the scene's world. `transform` and `scale` lead to it from the
     capture's original world: they are the `applied_transform` and `applied_scale` of the capture's
     `transforms.json`.
-
-    Args:
-      folder: folder of the run.
-      scene: the scene of the run.
     """
     applied = scene.metadata.get("applied_transform")
     transform = np.eye(3, 4) if applied is None else applied

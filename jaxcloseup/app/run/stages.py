@@ -119,12 +119,7 @@ def run_stages(
 ) -> Outcome:
     """Train and score the stages of one seed.
 
-    Args:
-      training: what trains.
-      seed: random seed.
-      output_dir: folder for renders and exports.
-      to_run: names of stages; `baseline` always runs.
-      perceptual: networks of LPIPS.
+    `baseline` always runs; `output_dir` gets renders and exports.
     """
     run = train_baseline_stage(training, run_keys(seed), output_dir, perceptual)
     preset, baseline = run.programs.preset, run.state

@@ -49,17 +49,9 @@ def run_sweep(
 ) -> SweepOutcome:
     """Train and score all arms on one scene.
 
-    Args:
-      scene: what was photographed.
-      preset: how stage 1 trains, and all that an arm does not change.
-      arms: their names.
-      seeds: how many.
-      folder: for checkpoints; the same sweep resumes from those it holds.
-      names: "method" and "preset" by name.
-      max_parallel: arms and seeds trained at once.
-      perceptual: networks of LPIPS.
-      seconds: filled with the wall time of each stage.
-      log: gets every report.
+    `folder` keeps checkpoints, from which the same sweep resumes; `names` has "method" and
+    "preset".
+    `max_parallel` arms and seeds train at once. `seconds` gets the wall time of each stage.
     """
     scene = dataclasses.replace(scene, train=jax.device_put(scene.train))
     chosen = choose_arms(arms, preset, scene)
@@ -171,12 +163,6 @@ def join_arms(
     """Return the states of arms and what they learn from, as `Programs.run` takes them.
 
     The last arm is repeated until each device has as many.
-
-    Args:
-      settings: of each arm's labels.
-      starts: what each arm begins with.
-      photographs: what all arms read.
-      devices: how many there are.
     """
     fill = -len(starts) % devices
     starts, settings = [*starts, *[starts[-1]] * fill], [*settings, *[settings[-1]] * fill]

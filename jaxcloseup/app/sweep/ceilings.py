@@ -35,13 +35,7 @@ def true_close_ups(
     This is an upper bound for labels, because no photograph has so much detail. `blurred` lowers
     the bound to the detail of the photograph with the smallest footprint.
 
-    Args:
-      key: random key.
-      scene: a scene with `surface`.
-      sources: the training photographs with their depths, for sampling cameras.
-      exact: `[V, H, W]` exact depths of the training views.
-      settings: settings of poses.
-      blurred: whether to blur the true pixels to the detail of the photographs.
+    The scene has a `surface`; `exact` are `[V, H, W]` depths of the training views.
 
     Returns:
       `CEILING_VIEWS` close-ups; weight 0 where no photograph sees the surface.
@@ -71,14 +65,8 @@ def labels_with_better_depth(
 
     They show what better geometry would bring.
 
-    Args:
-      key: random key.
-      scene: a scene with `surface`.
-      sources: the training photographs with their trained depths.
-      exact: `[V, H, W]` exact depths of the training views.
-      render_depths: function from stacked cameras `[Q]` to their trained depths `[Q, H, W]`.
-      settings: settings of poses and labels.
-      share: share of the depth error that remains: 1 is the trained depth, 0 the exact depth.
+    `render_depths` maps stacked cameras `[Q]` to their trained depths `[Q, H, W]`; `share` of the
+    depth error remains: 1 is the trained depth, 0 the exact depth `[V, H, W]`.
 
     Returns:
       `CEILING_VIEWS` labeled close-ups.
