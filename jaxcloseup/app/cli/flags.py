@@ -42,8 +42,8 @@ with topic("What is trained") as _TRAINED:
     flags.DEFINE_integer(
         "windows",
         None,
-        "windows of photographs that a step learns from, and pseudo-labels, shared out among "
-        "devices, or among the cores of a CPU; default: the preset's",
+        "number of photographs' windows, and of pseudo-labels, in a training step; devices or CPU "
+        "cores share them; default: the preset's",
         lower_bound=1,
     )
 with topic("What is trained") as _SET:
@@ -51,16 +51,15 @@ with topic("What is trained") as _SET:
         "set",
         [],
         "name=value changes a setting of the preset, as in --set label_loss_weight=0.1 or --set "
-        "magnification=2:4; repeatable; --set=help lists all settings with the values that they "
-        "have",
+        "magnification=2:4; repeatable; --set=help lists all settings and their values",
     )
 with topic("The capture") as _CAPTURE:
     flags.DEFINE_enum(
         "format",
         None,
         list(FORMATS),
-        "read this from the capture's folder: transforms*.json, a COLMAP model or LLFF's "
-        "poses_bounds.npy; default: the first of them that the folder holds",
+        "format of the capture: transforms*.json, a COLMAP model or LLFF's poses_bounds.npy; "
+        "default: the first of these in the folder",
     )
     flags.DEFINE_enum(
         "split",
@@ -80,16 +79,15 @@ with topic("The capture") as _CAPTURE:
     flags.DEFINE_integer(
         "photographs",
         None,
-        "learn from so many of the training photographs, evenly spread over their order; default: "
-        "all",
+        "number of training photographs to use, evenly spread over their order; default: all",
         lower_bound=2,
     )
-    flags.DEFINE_bool("invert_masks", False, "masks are white where photographs do not count")
+    flags.DEFINE_bool("invert_masks", False, "read white in masks as pixels to ignore")
     flags.DEFINE_enum(
         "alpha_mode",
         "blend",
         list(ALPHA_MODES),
-        "blend: transparent pixels show a white background; mask: they weigh as a mask does",
+        "how to read transparent pixels: blend: over a white background; mask: as masked pixels",
     )
 with topic("The capture") as _PIXELS:
     flags.DEFINE_bool(

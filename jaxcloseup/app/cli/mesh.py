@@ -39,8 +39,8 @@ flags.DEFINE_float("voxel", None, "side of a voxel in world units, in place of -
 flags.DEFINE_list(
     "region",
     None,
-    "x0,y0,z0,x1,y1,z1: smallest and largest coordinates of the mesh; default: of what the "
-    "training views see, but for the farthest 0.5 % on each side",
+    "x0,y0,z0,x1,y1,z1: smallest and largest coordinates of the mesh; default: the bounds of "
+    "what the training views see, without the farthest 0.5 % on each side",
 )
 flags.DEFINE_integer(
     "min_views",

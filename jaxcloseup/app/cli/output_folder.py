@@ -113,9 +113,7 @@ def lock_output_dir(folder: pathlib.Path) -> contextlib.AbstractContextManager[A
 def prepare_to_stop(folder: pathlib.Path, program: str | None = None) -> None:
     """Let Ctrl-C remove unfinished files from an output folder, and print how to resume.
 
-    Args:
-      folder: the output folder.
-      program: name of a program that resumes training in it; None cannot be resumed.
+    `program` resumes training in the folder; None cannot be resumed.
     """
     arguments = sys.argv[1:]
     if FLAGS.output_dir is None:

@@ -28,11 +28,7 @@ _COMPILED_FOR_SPEED = (
 
 
 def start(program: types.ModuleType) -> None:
-    """Run a program; `--help` and `-h` print its flags, and a wrong flag or word is one sentence.
-
-    Args:
-      program: its module: flags, docstring and `main`, which imports what needs JAX.
-    """
+    """Run a program's module; `--help` prints its flags, and a wrong flag is one sentence."""
     if {"-h", "--help"} & set(sys.argv[1:]):
         with contextlib.suppress(BrokenPipeError):  # `--help | head`
             print(_describe_program(program), flush=True)
@@ -142,8 +138,7 @@ def set_up() -> None:
 def set_up_compilation_cache(folder: str | None) -> None:
     """Keep compiled programs on disk, so that the next run starts faster.
 
-    Args:
-      folder: cache folder; None for the default one, empty for no cache.
+    None takes the default folder; an empty name turns the cache off.
     """
     if folder is None:
         folder = str(cache_folder() / "jaxcloseup" / "xla")
