@@ -13,21 +13,13 @@ from jaxcloseup.training.state import TrainState
 
 
 class TrainedRun(NamedTuple):
-    """A stored run with the state of one stage.
-
-    Attributes:
-      folder: folder of the run.
-      stage: name of the stage.
-      scene: the scene that the run was trained on.
-      programs: the run's compiled programs.
-      state: the newest state of the stage.
-    """
+    """A stored run with the state of one stage."""
 
     folder: pathlib.Path
     stage: str
-    scene: Scene
-    programs: Programs
-    state: TrainState
+    scene: Scene  # the scene that the run was trained on
+    programs: Programs  # the run's compiled programs
+    state: TrainState  # the newest state of the stage
 
     def detail(self) -> Detail:
         """Return the detail of the state, which the run's folder keeps."""

@@ -24,12 +24,8 @@ def finished_runs(
 ) -> dict[str, Results]:
     """Return the results of runs by the name of their scene.
 
-    Args:
-      folders: folders of finished runs. Without any, `root/<scene>` of each scene is read, and runs
-        that are not finished there are made, or resumed.
-      root: folder of the runs to make.
-      scenes: names of drawn scenes and folders of captures.
-      *arguments: further flags of `experiments.run`.
+    Without `folders`, read `root/<scene>` of each scene; make or resume runs that are not finished
+    there, with `arguments` as further flags of `experiments.run`.
 
     Raises:
       CalledProcessError: a run fails.

@@ -103,40 +103,36 @@ class Method:
     """A radiance field and its training: plain values, and functions that import JAX when called.
 
     `config` below is the `field` of a preset.
-
-    Attributes:
-      help: a line for `--help`, with the paper.
-      presets: by name; `quick`, the default, is the smallest run that shows the method honestly.
-      make_field: `(config, scene, growth) -> RadianceField`; `growth` multiplies the capacity of a
-        field whose renderings overflow.
-      make_optimizer: `(config, scene) -> optax.GradientTransformation`.
-      renders_pixels: whether the field renders single pixels, or whole images alone.
-      target_steps: `(config, count) -> int`, steps in all on `count` target views.
-      max_points: `(config) -> int | None`, how many initial points fit; None: any number.
-      with_expected_depth: `(buffers, expected) -> buffers` of a field that renders its expected
-        depth (true) or its median depth (false) as depth; None for fields without a choice.
-      export: `(folder, stage, params, buffers) -> None` writes a stage's state for other programs.
-      gaussians: `(params, buffers, position) -> Gaussians`, what viewers draw, with the colors that
-        are seen from `position[3]`; None: they draw the scene's points.
-      background: `(config) -> float`, gray level in [0, 1] behind the scene.
-      refine: `(key, config, params, buffers, render, scene, pyramid) -> (params, buffers)` gives
-        what `CoarseConfig` trained the room and the detail of `config`; `render(params, buffers,
-        camera)` renders a state with this room, `pyramid` holds the scene's training photographs.
-        None for methods without `coarse`.
-      add_for_targets: `(key, config, state, labels, render, scene) -> state` with what `labels` of
-        target views show and `render(camera)` of the state does not.
     """
 
-    help: str
+    help: str  # a line for `--help`, with the paper
+    # By name; `quick`, the default, is the smallest run that shows the method honestly.
     presets: Mapping[str, Preset]
+    # `(config, scene, growth) -> RadianceField`; `growth` multiplies the capacity of a field whose
+    # renderings overflow.
     make_field: "Callable[[Any, Scene, int], RadianceField]"
+    # `(config, scene) -> optax.GradientTransformation`.
     make_optimizer: "Callable[[Any, Scene], optax.GradientTransformation]"
-    renders_pixels: bool
+    renders_pixels: bool  # whether the field renders single pixels, or whole images alone
+    # `(config, count) -> int`, steps in all on `count` target views.
     target_steps: Callable[[Any, int], int]
+    # `(config) -> int | None`, how many initial points fit; None: any number.
     max_points: Callable[[Any], int | None] = lambda config: None
+    # `(buffers, expected) -> buffers` of a field that renders its expected depth (true) or its
+    # median depth (false) as depth; None for fields without a choice.
     with_expected_depth: Callable[[Any, bool], Any] | None = None
+    # `(folder, stage, params, buffers) -> None` writes a stage's state for other programs.
     export: Callable[[pathlib.Path, str, Any, Any], None] = lambda *state: None
+    # `(params, buffers, position) -> Gaussians`, what viewers draw, with the colors that are seen
+    # from `position[3]`; None: they draw the scene's points.
     gaussians: "Callable[[Any, Any, Any], Gaussians] | None" = None
+    # `(config) -> float`, gray level in [0, 1] behind the scene.
     background: Callable[[Any], float] = lambda config: 0.0
+    # `(key, config, params, buffers, render, scene, pyramid) -> (params, buffers)` gives what
+    # `CoarseConfig` trained the room and the detail of `config`; `render(params, buffers, camera)`
+    # renders a state with this room, `pyramid` holds the scene's training photographs. None for
+    # methods without `coarse`.
     refine: Callable[..., tuple[Any, Any]] | None = None
+    # `(key, config, state, labels, render, scene) -> state` with what `labels` of target views show
+    # and `render(camera)` of the state does not.
     add_for_targets: "Callable[..., TrainState]" = lambda key, config, state, *data: state

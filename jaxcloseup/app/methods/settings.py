@@ -26,19 +26,12 @@ _TRUTH = {"true": True, "1": True, "false": False, "0": False}
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """One setting of a preset.
+    """One setting of a preset."""
 
-    Attributes:
-      path: names of the fields that lead to it.
-      kind: its type: int, float, bool, str, a tuple of two floats, or one of these or None.
-      limits: what it may be, and its help.
-      value: what the preset says.
-    """
-
-    path: tuple[str, ...]
-    kind: Any
-    limits: Limits
-    value: Any
+    path: tuple[str, ...]  # names of the fields that lead to it
+    kind: Any  # its type: int, float, bool, str, a tuple of two floats, or one of these or None
+    limits: Limits  # what it may be, and its help
+    value: Any  # what the preset says
 
     @property
     def name(self) -> str:
@@ -58,10 +51,7 @@ class Setting:
 def settings_of(preset: Preset, method: Method | None = None) -> dict[str, Setting]:
     """Return the settings of a preset by name.
 
-    Args:
-      preset: holds them.
-      method: the preset's own by default. A method that renders whole images alone has no settings
-        of single pixels.
+    The method is the preset's by default; one that renders whole images has no settings of pixels.
     """
     method = METHODS[preset.method] if method is None else method
     found = {}
@@ -99,10 +89,7 @@ def _choices(kind: Any) -> tuple[Any, ...]:
 def with_settings(preset: Preset, given: Sequence[str], *, flag: str = "--set=") -> Preset:
     """Return the preset with other values.
 
-    Args:
-      preset: what is changed.
-      given: texts such as `rgb_tolerance=0.02` and `magnification=2:4`.
-      flag: what an error begins with, before the text.
+    `given` has texts such as `rgb_tolerance=0.02`; errors begin with `flag` and the text.
 
     Raises:
       ValueError: one sentence that names the setting and says what it may be.
@@ -156,11 +143,6 @@ def _parse(text: str, kind: Any) -> Any:
 
 def check_value(value: Any, kind: Any, limits: Limits) -> Any:
     """Return the value of a setting, with whole numbers as floats where these are wanted.
-
-    Args:
-      value: as `--set` or the JSON of a stored run gives it.
-      kind: as in `Setting`.
-      limits: as in `Setting`.
 
     Raises:
       ValueError: the setting has no such value; the message says what it must be.

@@ -34,19 +34,12 @@ _TOGETHER = 8  # numbers of photographs are multiples of this, so that few shape
 
 
 class TargetTraining(NamedTuple):
-    """What training for target views begins with and learns from.
+    """What training for target views begins with and learns from."""
 
-    Attributes:
-      state: the first state, with what the method adds to it for these labels.
-      data: what the steps learn from.
-      steps: how many.
-      coverage: share of the target views' pixels that have labels.
-    """
-
-    state: TrainState
-    data: LabeledData
+    state: TrainState  # the first state, with what the method adds to it for these labels
+    data: LabeledData  # what the steps learn from
     steps: int
-    coverage: float
+    coverage: float  # share of the target views' pixels that have labels
 
 
 def prepare_target_views(

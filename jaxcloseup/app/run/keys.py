@@ -6,25 +6,16 @@ from flax import struct
 
 @struct.dataclass
 class RunKeys:
-    """A key for each use of random numbers, all from the seed of a run.
+    """A key for each use of random numbers, all from the seed of a run."""
 
-    Attributes:
-      init: draws the initial parameters, and from there the steps of all stages.
-      depths: renders the depths of photographs, where the label rule asks for sampling noise.
-      points: draws initial points.
-      closeups: draws the cameras of close-ups that are labeled before the first step.
-      audit: draws the close-ups of the audit of labels.
-      pictures: draws the close-ups that the report shows.
-      ceilings: draws the close-ups of a sweep's upper bounds.
-    """
-
-    init: jax.Array
+    init: jax.Array  # draws the initial parameters, and from there the steps of all stages
+    # Renders the depths of photographs, where the label rule asks for sampling noise.
     depths: jax.Array
-    points: jax.Array
-    closeups: jax.Array
-    audit: jax.Array
-    pictures: jax.Array
-    ceilings: jax.Array
+    points: jax.Array  # draws initial points
+    closeups: jax.Array  # draws the cameras of close-ups that are labeled before the first step
+    audit: jax.Array  # draws the close-ups of the audit of labels
+    pictures: jax.Array  # draws the close-ups that the report shows
+    ceilings: jax.Array  # draws the close-ups of a sweep's upper bounds
 
 
 def run_keys(seed: int) -> RunKeys:

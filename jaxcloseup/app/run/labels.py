@@ -25,15 +25,10 @@ _MOST_CLOSEUPS = 200  # that are labeled before the first step
 
 
 class LabelStart(NamedTuple):
-    """What fine-tuning on labels begins with.
+    """What fine-tuning on labels begins with."""
 
-    Attributes:
-      state: that of the baseline, rendering the depth that labels are made from.
-      sources: the training photographs with this state's depths.
-    """
-
-    state: TrainState
-    sources: LabelSources
+    state: TrainState  # that of the baseline, rendering the depth that labels are made from
+    sources: LabelSources  # the training photographs with this state's depths
 
 
 def start_labels(

@@ -36,10 +36,7 @@ class TrainLog:
     in the stage so far. The last two are null for a chunk whose line was lost.
     `tb/<scene>/<stage>` has the same values, and evaluations, as event files.
 
-    Args:
-      folder: folder of the run or the sweep.
-      scene: name of the scene in a sweep; empty for a run.
-      tensorboard: whether to write event files.
+    `scene` names the scene in a sweep, and is empty for a run.
     """
 
     def __init__(self, folder: pathlib.Path, scene: str = "", *, tensorboard: bool = False) -> None:
@@ -94,10 +91,7 @@ class TrainLog:
 
         A stage that took no steps uses the step of the stage before it.
 
-        Args:
-          stage: name of the stage.
-          splits: metrics of the stage, by split.
-          images: images to show, by tag.
+        `splits` has metrics by split, and `images` has images by tag.
         """
         if stage != self._stage:
             self._open(stage)

@@ -22,23 +22,16 @@ class TrainingError(Exception):
 
 @dataclasses.dataclass
 class Training:
-    """Training on one scene with one preset.
-
-    Attributes:
-      programs: what is compiled.
-      checkpoints: keep the states of every stage.
-      log: gets every report; None keeps none.
-      save_every: steps between checkpoints.
-      seconds: filled with the wall time of each part.
-      history: filled with the metrics of each stage, for each chunk of steps with `step`, counted
-        within the stage.
-    """
+    """Training on one scene with one preset."""
 
     programs: Programs
-    checkpoints: Checkpoints
-    log: TrainLog | None = None
-    save_every: int = 1000
+    checkpoints: Checkpoints  # keep the states of every stage
+    log: TrainLog | None = None  # gets every report; None keeps none
+    save_every: int = 1000  # steps between checkpoints
+    # Filled with the wall time of each part.
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+    # Filled with the metrics of each stage, for each chunk of steps with `step`, counted within the
+    # stage.
     history: dict[str, list[dict[str, Any]]] = dataclasses.field(default_factory=dict)
 
 

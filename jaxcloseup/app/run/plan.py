@@ -42,13 +42,7 @@ _WORDS = {
 
 
 def plan_run(preset: Preset, scene: Scene, to_run: Sequence[str]) -> dict[str, float]:
-    """Return typical seconds of the parts of a run by name, in order.
-
-    Args:
-      preset: how the scene is trained.
-      scene: what is trained.
-      to_run: names of stages.
-    """
+    """Return typical seconds of the parts of a run by name, in order."""
     method = METHODS[preset.method]
     steps = {"baseline": preset.baseline_steps}
     parts = ["coarse_baseline", "refine_baseline"] if preset.coarse is not None else []

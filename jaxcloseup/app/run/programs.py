@@ -104,8 +104,7 @@ class Programs:
 
         They are read once.
 
-        Args:
-          finest: smallest divisor of their own size.
+        `finest` is the smallest divisor of their size.
         """
         if finest not in self._pyramids:
             scene = self.scene
@@ -170,10 +169,7 @@ class Programs:
     ) -> tuple[TrainState, dict[str, Any]]:
         """Take `count` steps of the kind that learns from `data`.
 
-        Args:
-          state: what is trained; for `ArmsData` stacked by `stack_states`.
-          data: what the steps learn from.
-          count: how many steps.
+        For `ArmsData`, the state is one that `stack_states` made.
 
         Returns:
           The next state and the means of the steps' metrics, over arms too; `skipped` counts the

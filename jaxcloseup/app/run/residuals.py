@@ -29,12 +29,8 @@ def render_residuals(
 ) -> Residuals:
     """Render photographs' views, and subtract the renders from the photographs at every level.
 
-    Args:
-      programs: the run's.
-      state: the state to render at levels up to `FINER` (or `FINER_RAYS`) times the reduced
-        photographs' size.
-      pyramid: photographs with their weights.
-      views: indices of the photographs; None takes all.
+    The levels go up to `FINER` (or `FINER_RAYS`) times the reduced photographs' size. `views` are
+    indices of photographs, all by default.
     """
     scene = programs.scene
     most = FINER_RAYS if programs.method.renders_pixels else FINER

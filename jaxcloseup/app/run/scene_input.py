@@ -11,10 +11,6 @@ from jaxcloseup.photos.scene import Scene, SceneError
 def load(name: str, options: Mapping[str, Any]) -> Scene:
     """Return a built-in scene or a capture; print notes about what was read.
 
-    Args:
-      name: of a built-in scene, or a folder.
-      options: of `load_scene`.
-
     Raises:
       SceneError: one sentence that says what to do, also for photographs too small for SSIM.
     """

@@ -23,17 +23,12 @@ from jaxcloseup.training.state import TrainState
 
 
 class HeldOut(NamedTuple):
-    """The views that stages are scored on.
+    """The views that stages are scored on."""
 
-    Attributes:
-      targets: held-out views by split.
-      ladder: views of the zoom ladder by rung; none where the exact scene is not known.
-      exact: `[V, H, W]` exact depths of the training views, or None.
-    """
-
-    targets: Mapping[str, Sequence[Target]]
+    targets: Mapping[str, Sequence[Target]]  # held-out views by split
+    # Views of the zoom ladder by rung; none where the exact scene is not known.
     ladder: Mapping[str, Sequence[Target]]
-    exact: jax.Array | None
+    exact: jax.Array | None  # `[V, H, W]` exact depths of the training views, or None
 
     @property
     def all(self) -> dict[str, Sequence[Target]]:
@@ -78,10 +73,7 @@ class Scorer:
     ) -> None:
         """Render, score and keep one stage.
 
-        Args:
-          stage: its name.
-          state: its state.
-          render: `camera -> Rendering`; default: the state's, which is exported too.
+        By default the state renders, and is exported too.
         """
         programs, log = self._training.programs, self._training.log
         if render is None:

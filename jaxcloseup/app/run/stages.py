@@ -37,53 +37,34 @@ Render = Callable[[Camera], Rendering]
 
 
 class Outcome(NamedTuple):
-    """Everything that the report of a run needs from its stages.
+    """Everything that the report of a run needs from its stages."""
 
-    Attributes:
-      start: what fine-tuning began with.
-      settings: how labels are made, after the gate.
-      held_out: the views that were scored.
-      scores: by stage and split.
-      images: renders of held-out views, by stage and split, then by name.
-      evidence: for JSON. `labels`: labels against the truth, by the depth they are made from, empty
-        on captures. `left_out`: `error_curve` of labels of left-out photographs. `gate`: see
-        `weigh`. `detail`: see `add_detail_stage`; None without.
-      render: `camera -> Rendering` as the last stage renders.
-    """
-
-    start: LabelStart
-    settings: PseudoSettings
-    held_out: HeldOut
-    scores: Mapping[str, Mapping[str, Any]]
+    start: LabelStart  # what fine-tuning began with
+    settings: PseudoSettings  # how labels are made, after the gate
+    held_out: HeldOut  # the views that were scored
+    scores: Mapping[str, Mapping[str, Any]]  # by stage and split
+    # Renders of held-out views, by stage and split, then by name.
     images: Mapping[tuple[str, str], Mapping[str, np.ndarray]]
+    # For JSON. `labels`: labels against the truth, by the depth they are made from, empty on
+    # captures. `left_out`: `error_curve` of labels of left-out photographs. `gate`: see `weigh`.
+    # `detail`: see `add_detail_stage`; None without.
     evidence: Mapping[str, Any]
-    render: Render
+    render: Render  # `camera -> Rendering` as the last stage renders
 
 
 @dataclasses.dataclass
 class Run:
-    """What the stages of a run share.
-
-    Attributes:
-      training: what trains.
-      keys: random keys.
-      folder: the run's folder.
-      start: what fine-tuning begins with.
-      scorer: scores the stages.
-      gate: the evidence of the left-out photographs, or None without a gate.
-      settings: how close-ups are labeled, after the gate.
-      stage: name of the latest stage that trained.
-      state: its state.
-    """
+    """What the stages of a run share."""
 
     training: Training
     keys: RunKeys
     folder: pathlib.Path
-    start: LabelStart
+    start: LabelStart  # what fine-tuning begins with
     scorer: Scorer
+    # The evidence of the left-out photographs, or None without a gate.
     gate: Mapping[str, Any] | None
-    settings: PseudoSettings
-    stage: str
+    settings: PseudoSettings  # how close-ups are labeled, after the gate
+    stage: str  # name of the latest stage that trained
     state: TrainState
 
     @property

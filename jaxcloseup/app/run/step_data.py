@@ -14,15 +14,10 @@ from jaxcloseup.training.steps import closeup_step, labeled_step, train_step
 
 @struct.dataclass
 class TrainData:
-    """Photographs alone, for `train_step`.
+    """Photographs alone, for `train_step`."""
 
-    Attributes:
-      views: training photographs, or windows of finer ones.
-      lr_scale: `[]` factor on the learning rates; None: 1.
-    """
-
-    views: Views | Windows
-    lr_scale: jax.Array | None = None
+    views: Views | Windows  # training photographs, or windows of finer ones
+    lr_scale: jax.Array | None = None  # `[]` factor on the learning rates; None: 1
 
     def step(self, state: TrainState, **static: Any) -> tuple[TrainState, Metrics]:
         """Take one step; `static` are the static arguments of `train_step`."""
@@ -31,17 +26,11 @@ class TrainData:
 
 @struct.dataclass
 class CloseupData:
-    """Photographs and random close-ups that each step labels anew, for `closeup_step`.
+    """Photographs and random close-ups that each step labels anew, for `closeup_step`."""
 
-    Attributes:
-      views: training photographs, or windows of finer ones.
-      sources: what labels are made from.
-      settings: how close-ups are drawn and labeled.
-    """
-
-    views: Views | Windows
-    sources: LabelSources
-    settings: PseudoSettings
+    views: Views | Windows  # training photographs, or windows of finer ones
+    sources: LabelSources  # what labels are made from
+    settings: PseudoSettings  # how close-ups are drawn and labeled
 
     def step(self, state: TrainState, **static: Any) -> tuple[TrainState, Metrics]:
         """Take one step; `static` are the static arguments of `closeup_step`."""
@@ -50,17 +39,11 @@ class CloseupData:
 
 @struct.dataclass
 class LabeledData:
-    """Photographs and views that were labeled once, such as target views, for `labeled_step`.
+    """Photographs and views that were labeled once, such as target views, for `labeled_step`."""
 
-    Attributes:
-      views: training photographs, or windows of finer ones.
-      labels: the labeled views, or windows of them.
-      settings: the weight of labels and the learning rates.
-    """
-
-    views: Views | Windows
-    labels: Views | Windows
-    settings: PseudoSettings
+    views: Views | Windows  # training photographs, or windows of finer ones
+    labels: Views | Windows  # the labeled views, or windows of them
+    settings: PseudoSettings  # the weight of labels and the learning rates
 
     def step(self, state: TrainState, **static: Any) -> tuple[TrainState, Metrics]:
         """Take one step; `static` are the static arguments of `labeled_step`."""
@@ -69,17 +52,11 @@ class LabeledData:
 
 @struct.dataclass
 class ArmsData:
-    """What all arms of a sweep learn from together, as `run_arms` takes it.
+    """What all arms of a sweep learn from together, as `run_arms` takes it."""
 
-    Attributes:
-      views: training photographs, which all arms share.
-      sources: as in `CloseupData`; depths and blocks have a leading axis of arms.
-      settings: as in `CloseupData`, with a leading axis of arms.
-    """
-
-    views: Views | Windows
-    sources: LabelSources
-    settings: PseudoSettings
+    views: Views | Windows  # training photographs, which all arms share
+    sources: LabelSources  # as in `CloseupData`; depths and blocks have a leading axis of arms
+    settings: PseudoSettings  # as in `CloseupData`, with a leading axis of arms
 
 
 StepData = TrainData | CloseupData | LabeledData

@@ -20,16 +20,12 @@ SHOWN = 2  # views of a split
 
 
 class SweepOutcome(NamedTuple):
-    """The results of a sweep on one scene.
+    """The results of a sweep on one scene."""
 
-    Attributes:
-      scores: for each arm, then seed, `skipped` steps and the metrics of each split in `splits`.
-      shown: the first held-out views of each split.
-      images: the first seed's renders of these, by arm and split, then by name.
-    """
-
+    # For each arm, then seed, `skipped` steps and the metrics of each split in `splits`.
     scores: dict[str, dict[str, Any]]
-    shown: dict[str, Sequence[Target]]
+    shown: dict[str, Sequence[Target]]  # the first held-out views of each split
+    # The first seed's renders of these, by arm and split, then by name.
     images: dict[tuple[str, str], dict[str, np.ndarray]]
 
 

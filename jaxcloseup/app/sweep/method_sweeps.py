@@ -21,11 +21,8 @@ def sweep_methods(
 ) -> list[str]:
     """Sweep method by method, scene by scene, and write the tables after each.
 
-    Args:
-      folder: for `<method>/<scene>`, each a sweep's folder, and for the tables.
-      methods: names of the methods.
-      scenes: what `--scenes` takes, by name.
-      command: words that start a sweep, with the flags that all of them share.
+    `folder` gets the tables and a sweep's folder `<method>/<scene>` each. `scenes` has values of
+    `--scenes` by name. `command` starts a sweep, with the flags that all of them share.
 
     Returns:
       What failed, as method and scene.

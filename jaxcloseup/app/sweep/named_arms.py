@@ -27,19 +27,12 @@ _LABEL_SETTINGS = frozenset(LabelConfig.__dataclass_fields__)
 
 
 class Arm(NamedTuple):
-    """One arm.
+    """One arm."""
 
-    Attributes:
-      name: as the user wrote it.
-      kind: what it is before its settings change: `baseline`, `diverse`, one in turn, ...
-      labels: how its close-ups are drawn and labeled.
-      depth_error: share of the depth's error that its labels keep; None: labels from rendered
-        depth as it is.
-    """
-
-    name: str
-    kind: str
-    labels: LabelConfig
+    name: str  # as the user wrote it
+    kind: str  # what it is before its settings change: `baseline`, `diverse`, one in turn, ...
+    labels: LabelConfig  # how its close-ups are drawn and labeled
+    # Share of the depth's error that its labels keep; None: labels from rendered depth as it is.
     depth_error: float | None = None
 
     @property
