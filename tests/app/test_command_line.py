@@ -95,6 +95,15 @@ def test_a_new_flag_is_one_line(tmp_path):
     assert done.stderr == "jaxcloseup trial: --trial=1 must be a whole number of at least 2\n"
 
 
+def test_usage_ends_quietly_where_nobody_reads():
+    read, write = os.pipe()
+    os.close(read)
+    usage = [sys.executable, "-m", "jaxcloseup", "--help"]
+    ended = subprocess.run(usage, stdout=write, stderr=subprocess.PIPE)
+    os.close(write)
+    assert (ended.returncode, ended.stderr) == (0, b"")
+
+
 def test_help_shows_each_shared_flag_under_one_topic():
     keys = flags.FLAGS.key_flags_by_module_dict()
     for module in (program, sweep):
