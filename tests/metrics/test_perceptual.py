@@ -128,16 +128,29 @@ def test_what_a_file_says_is_no_command_to_the_terminal(tmp_path):
         read_tensors(path)
 
 
-def test_a_file_cannot_run_code(tmp_path):
-    path = tmp_path / "evil.pth"
+def zipped(path, pickled, storage=b""):
+    """Write a file in PyTorch's format of today."""
     with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("evil/data.pkl", b"cos\nsystem\n(S'true'\ntR.")
-    with pytest.raises(TorchFileError, match=r"it holds os\.system"):
-        read_tensors(path)
+        archive.writestr("archive/data.pkl", pickled)
+        archive.writestr("archive/data/0", storage)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (b"cos\nsystem\n(S'true'\ntR.", r"it holds os\.system"),
+        # NumPy's integers, as strides, would wrap around in the check of bounds.
+        (b"ctorch\nLongStorage\n(I4611686018427387905\ntR.", "not callable"),
+    ],
+)
+def test_a_pickle_calls_nothing_but_what_rebuilds_tensors(tmp_path, call, message):
+    with pytest.raises(TorchFileError, match=message):
+        read_tensors(zipped(tmp_path / "evil.pth", call))
 
 
 def tensor_file(path, arguments, *, name="weight", size=6):
-    """A file of one tensor of `size` numbers, rebuilt with these arguments after its storage."""
+    """Write a file of one tensor of `size` numbers, rebuilt with `arguments` after its storage."""
 
     class Storage(str):
         pass
@@ -155,10 +168,7 @@ def tensor_file(path, arguments, *, name="weight", size=6):
     data = io.BytesIO()
     with mock.patch.dict(sys.modules, {"torch": module, "torch._utils": utils}):
         Pickler(data, protocol=2).dump({name: Rebuilt()})
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("archive/data.pkl", data.getvalue())
-        archive.writestr("archive/data/0", np.arange(size, dtype=np.float32).tobytes())
-    return path
+    return zipped(path, data.getvalue(), np.arange(size, dtype=np.float32).tobytes())
 
 
 def test_no_tensor_reaches_beyond_its_storage(tmp_path):
@@ -180,16 +190,6 @@ def test_no_tensor_reaches_beyond_its_storage(tmp_path):
             read_tensors(tensor_file(path, arguments))
 
 
-def test_a_pickle_cannot_call_the_types_of_storages(tmp_path):
-    """NumPy's integers, as strides, would wrap around in the check of bounds."""
-    path = tmp_path / "evil.pth"
-    with zipfile.ZipFile(path, "w") as archive:
-        call = b"ctorch\nLongStorage\n(I4611686018427387905\ntR."
-        archive.writestr("evil/data.pkl", call)
-    with pytest.raises(TorchFileError, match="not callable"):
-        read_tensors(path)
-
-
 def test_a_pickle_cannot_change_a_tensor_after_its_check(tmp_path):
     path = tensor_file(tmp_path / "weights.pth", (0, (2,), (1,)))
     with zipfile.ZipFile(path) as archive:
@@ -197,11 +197,8 @@ def test_a_pickle_cannot_change_a_tensor_after_its_check(tmp_path):
     assert data.count(b"Rq") == 1  # the call that makes the tensor; then its state is set
     place = data.index(b"Rq") + 1
     data = data[:place] + b"}(U\x06offsetJ\xf0\xff\xff\xffub" + data[place:]
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("archive/data.pkl", data)
-        archive.writestr("archive/data/0", bytes(24))
     with pytest.raises(TorchFileError, match="not of whole numbers"):
-        read_tensors(path)
+        read_tensors(zipped(path, data, bytes(24)))
 
 
 def test_files_without_end_or_with_strange_names_are_refused(tmp_path, monkeypatch):
