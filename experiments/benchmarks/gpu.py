@@ -41,39 +41,27 @@ from jaxcloseup.fields.volume.config import NerfConfig
 
 @dataclasses.dataclass(frozen=True)
 class Size:
-    """Sizes of all parts.
+    """Sizes of all parts."""
 
-    Attributes:
-      cases: numbers of splats, and the heights and widths of their images; smallest first.
-      side: of the matrices whose product is a ceiling.
-      numbers: that are added and copied; so many that starting a program costs little beside it.
-      nerf: the NeRF whose step is timed.
-      rays: in such a step.
-      scene: name or folder of what is trained on.
-      preset: of the surfels that are trained.
-      stages: of that training, beside the baseline.
-      training_seconds: of their baseline and fine-tuning.
-      arms: presets of the sweeps whose steps are timed, by method.
-      warmup: steps before these.
-      most_seconds: after which no other part begins.
-    """
-
+    # numbers of splats, and the heights and widths of their images; smallest first
     cases: tuple[gpu_splats.Case, ...] = (
         (20_000, (270, 480)),
         (100_000, (540, 960)),
         (500_000, (1080, 1920)),
     )
-    side: int = 16_384
+    side: int = 16_384  # of the matrices whose product is a ceiling
+    # that are added and copied; so many that starting a program costs little beside it
     numbers: int = 2**28
-    nerf: NerfConfig = nerf.FULL
-    rays: int = 4096
-    scene: str = "table"
-    preset: Preset = surfels.PAPER
-    stages: tuple[str, ...] = STAGES
-    training_seconds: float = 60
+    nerf: NerfConfig = nerf.FULL  # the NeRF whose step is timed
+    rays: int = 4096  # in such a step
+    scene: str = "table"  # name or folder of what is trained on
+    preset: Preset = surfels.PAPER  # of the surfels that are trained
+    stages: tuple[str, ...] = STAGES  # of that training, beside the baseline
+    training_seconds: float = 60  # of their baseline and fine-tuning
+    # presets of the sweeps whose steps are timed, by method
     arms: tuple[Preset, ...] = (surfels.REDUCED, NERF_QUICK)
-    warmup: int = 100
-    most_seconds: float = 600
+    warmup: int = 100  # steps before these
+    most_seconds: float = 600  # after which no other part begins
 
 
 def run(size: Size | None = None, path: pathlib.Path | None = None) -> dict[str, Any]:

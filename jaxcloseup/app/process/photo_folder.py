@@ -33,16 +33,11 @@ _NEEDS_CONVERSION = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", 
 
 
 class Copied(NamedTuple):
-    """A photograph in the capture.
+    """A photograph in the capture."""
 
-    Attributes:
-      name: its name in the folder `images`.
-      source: name of the file that it was made from.
-      lens: identifies the lens: size in pixels and, if EXIF has them, camera and focal length.
-    """
-
-    name: str
-    source: str
+    name: str  # its name in the folder `images`
+    source: str  # name of the file that it was made from
+    # identifies the lens: size in pixels and, if EXIF has them, camera and focal length
     lens: list[Any]
 
 

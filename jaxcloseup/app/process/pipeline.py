@@ -25,21 +25,13 @@ _WORK, _DATABASE = "colmap", "colmap/database.db"
 
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """Sources and settings of a capture.
+    """Sources and settings of a capture."""
 
-    Attributes:
-      images: folder of photographs, or None.
-      video: a video file, or None; exactly one of both is given.
-      count: largest number of frames of the video.
-      lens: a key of `choices.LENSES`.
-      pairs: which photographs are matched: `auto` or one of `choices.PAIRINGS`.
-    """
-
-    images: pathlib.Path | None
-    video: pathlib.Path | None
-    count: int
-    lens: str
-    pairs: str
+    images: pathlib.Path | None  # folder of photographs, or None
+    video: pathlib.Path | None  # a video file, or None; exactly one of both is given
+    count: int  # largest number of frames of the video
+    lens: str  # a key of `choices.LENSES`
+    pairs: str  # which photographs are matched: `auto` or one of `choices.PAIRINGS`
 
     def identity(self) -> dict[str, Any]:
         """Return all that determines the capture, for JSON.

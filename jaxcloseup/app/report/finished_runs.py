@@ -27,23 +27,14 @@ _RESULTS: dict[str, type] = {
 
 
 class Finished(NamedTuple):
-    """A finished run.
+    """A finished run."""
 
-    Attributes:
-      name: the part of its path that differs from the other runs'.
-      folder: its folder.
-      results: its `results.json`.
-      photographs: hash of its training data.
-      stage: the stage that is compared.
-      scores: scores of that stage by split.
-    """
-
-    name: str
-    folder: pathlib.Path
-    results: Mapping[str, Any]
-    photographs: str
-    stage: str
-    scores: Mapping[str, Any]
+    name: str  # the part of its path that differs from the other runs'
+    folder: pathlib.Path  # its folder
+    results: Mapping[str, Any]  # its `results.json`
+    photographs: str  # hash of its training data
+    stage: str  # the stage that is compared
+    scores: Mapping[str, Any]  # scores of that stage by split
 
     def psnr(self, split: str) -> dict[str, float]:
         """Return PSNR by view, where it is known."""

@@ -21,17 +21,11 @@ _TEMPLATES.filters["webp"] = lambda image, quality: webp_data_uri(image, quality
 
 
 class Picture(NamedTuple):
-    """A picture on a page.
+    """A picture on a page."""
 
-    Attributes:
-      section: heading that groups pictures.
-      caption: text below the picture.
-      image: uint8 `[H, W, 3]`, a row of panels.
-    """
-
-    section: str
-    caption: str
-    image: np.ndarray
+    section: str  # heading that groups pictures
+    caption: str  # text below the picture
+    image: np.ndarray  # uint8 `[H, W, 3]`, a row of panels
 
 
 def fill_page(template: str, *, title: str, **data: Any) -> bytes:

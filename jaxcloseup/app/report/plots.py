@@ -18,21 +18,13 @@ _STYLE = {"svg.hashsalt": "jaxcloseup", "svg.fonttype": "none", "font.size": 10}
 
 
 class Curve(NamedTuple):
-    """One line of a plot.
+    """One line of a plot."""
 
-    Attributes:
-      name: name in the legend.
-      x: x coordinates of its points.
-      y: y coordinates of its points.
-      low: lower ends of an interval at each point, or None.
-      high: upper ends of an interval at each point, or None.
-    """
-
-    name: str
-    x: Sequence[float]
-    y: Sequence[float]
-    low: Sequence[float] | None = None
-    high: Sequence[float] | None = None
+    name: str  # name in the legend
+    x: Sequence[float]  # x coordinates of its points
+    y: Sequence[float]  # y coordinates of its points
+    low: Sequence[float] | None = None  # lower ends of an interval at each point, or None
+    high: Sequence[float] | None = None  # upper ends of an interval at each point, or None
 
 
 def line_plot(

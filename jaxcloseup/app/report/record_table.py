@@ -9,19 +9,12 @@ from rich.markup import escape
 
 
 class Table(NamedTuple):
-    """A table of text.
+    """A table of text."""
 
-    Attributes:
-      title: what it shows.
-      header: its first row.
-      rows: the other rows.
-      names: number of columns at the left, 1 or 2, that hold no numbers.
-    """
-
-    title: str
-    header: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    names: int = 1
+    title: str  # what it shows
+    header: Sequence[str]  # its first row
+    rows: Sequence[Sequence[str]]  # the other rows
+    names: int = 1  # number of columns at the left, 1 or 2, that hold no numbers
 
 
 def format_number(value: float | None, pattern: str = "{:.2f}") -> str:

@@ -17,26 +17,17 @@ from jaxcloseup.photos.views import camera_at
 
 
 class Exhibit(NamedTuple):
-    """A close-up: its true image, its render, and a photograph of the same place.
+    """A close-up: its true image, its render, and a photograph of the same place."""
 
-    Attributes:
-      name: name of the held-out view.
-      psnr: PSNR of its render, in dB.
-      render: uint8 `[H, W, 3]`.
-      truth: uint8 `[H, W, 3]`.
-      photograph: name of the training photograph that shows most of it.
-      cutout: uint8 `[H, W, 3]`, the part of that photograph that shows the same; None where no
-        similarity fits.
-      pixel: side of that photograph's pixels, in pixels of the close-up.
-    """
-
-    name: str
-    psnr: float
-    render: np.ndarray
-    truth: np.ndarray
-    photograph: str
+    name: str  # name of the held-out view
+    psnr: float  # PSNR of its render, in dB
+    render: np.ndarray  # uint8 `[H, W, 3]`
+    truth: np.ndarray  # uint8 `[H, W, 3]`
+    photograph: str  # name of the training photograph that shows most of it
+    # uint8 `[H, W, 3]`, the part of that photograph that shows the same; None where no similarity
+    # fits
     cutout: np.ndarray | None
-    pixel: float
+    pixel: float  # side of that photograph's pixels, in pixels of the close-up
 
     @property
     def pixel_size(self) -> str:

@@ -28,34 +28,21 @@ Scenes = Mapping[str, Mapping[str, Any]]  # scores of `run_sweep` by scene
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One arm on one split.
+    """One arm on one split."""
 
-    Attributes:
-      arm: name of the arm.
-      split: name of the split.
-      psnr: mean PSNR over scenes, seeds and views, in dB.
-      spread: standard deviation over seeds of the mean PSNR over scenes and views; only seeds with
-        all views count. None for one seed.
-      ssim: mean SSIM.
-      lpips: mean LPIPS with VGG.
-      gain: mean difference of PSNR from control in dB, or None without control.
-      low: lower end of the 95 % interval of `gain`, or None for a single view.
-      high: upper end of that interval.
-      count: number of images in the means, over scenes, seeds and views.
-      skipped: number of steps that were not finite, over seeds and scenes.
-    """
-
-    arm: str
-    split: str
-    psnr: float
+    arm: str  # name of the arm
+    split: str  # name of the split
+    psnr: float  # mean PSNR over scenes, seeds and views, in dB
+    # standard deviation over seeds of the mean PSNR over scenes and views; only seeds with all
+    # views count. None for one seed
     spread: float | None
-    ssim: float | None
-    lpips: float | None
-    gain: float | None
-    low: float | None
-    high: float | None
-    count: int
-    skipped: int
+    ssim: float | None  # mean SSIM
+    lpips: float | None  # mean LPIPS with VGG
+    gain: float | None  # mean difference of PSNR from control in dB, or None without control
+    low: float | None  # lower end of the 95 % interval of `gain`, or None for a single view
+    high: float | None  # upper end of that interval
+    count: int  # number of images in the means, over scenes, seeds and views
+    skipped: int  # number of steps that were not finite, over seeds and scenes
 
 
 def paired_bootstrap(

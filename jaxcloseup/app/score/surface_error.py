@@ -14,17 +14,11 @@ from jaxcloseup.photos.scene import Surface
 
 
 class Landmarks(NamedTuple):
-    """Points of a capture that are visible in a view.
+    """Points of a capture that are visible in a view."""
 
-    Attributes:
-      row: `[P]` pixel row of each point.
-      column: `[P]` pixel column of each point.
-      depth: `[P]` z-depth of each point.
-    """
-
-    row: np.ndarray
-    column: np.ndarray
-    depth: np.ndarray
+    row: np.ndarray  # `[P]` pixel row of each point
+    column: np.ndarray  # `[P]` pixel column of each point
+    depth: np.ndarray  # `[P]` z-depth of each point
 
 
 _CELLS = 24  # cells across the image; the nearest point in a cell hides the points behind it

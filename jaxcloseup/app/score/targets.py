@@ -19,25 +19,17 @@ from jaxcloseup.photos.windows import in_quarters
 
 
 class Target(NamedTuple):
-    """A held-out view of `[H, W]` pixels, the size of its photograph.
+    """A held-out view of `[H, W]` pixels, the size of its photograph."""
 
-    Attributes:
-      name: name of its photograph.
-      camera: its camera, padded at the right and the bottom to the size of its split, so that all
-        views of a split share compiled programs.
-      rgb: `[H, W, 3]` the photograph, float in [0, 1].
-      weight: `[H, W]` weights.
-      seen: `[H, W]` number of training photographs that saw the surface at each pixel.
-      surface: the exact surface, or None where it is unknown.
-      landmarks: visible points of the capture, or None where the exact surface is known.
-    """
-
-    name: str
+    name: str  # name of its photograph
+    # its camera, padded at the right and the bottom to the size of its split, so that all views of
+    # a split share compiled programs
     camera: Camera
-    rgb: jax.Array
-    weight: jax.Array
-    seen: jax.Array
-    surface: Surface | None = None
+    rgb: jax.Array  # `[H, W, 3]` the photograph, float in [0, 1]
+    weight: jax.Array  # `[H, W]` weights
+    seen: jax.Array  # `[H, W]` number of training photographs that saw the surface at each pixel
+    surface: Surface | None = None  # the exact surface, or None where it is unknown
+    # visible points of the capture, or None where the exact surface is known
     landmarks: Landmarks | None = None
 
 

@@ -44,23 +44,14 @@ class RunError(Exception):
 
 @dataclasses.dataclass(frozen=True)
 class StoredRun:
-    """Content of a run's folder.
+    """Content of a run's folder."""
 
-    Attributes:
-      folder: the run's folder.
-      manifest: its `manifest.json`.
-      identity: its `checkpoints/run.json`.
-      trained: preset of its training.
-      preset: the same preset with the settings that the user changes.
-      stages: stages that have a state.
-    """
-
-    folder: pathlib.Path
-    manifest: Mapping[str, Any]
-    identity: Mapping[str, Any]
-    trained: Preset
-    preset: Preset
-    stages: list[str]
+    folder: pathlib.Path  # the run's folder
+    manifest: Mapping[str, Any]  # its `manifest.json`
+    identity: Mapping[str, Any]  # its `checkpoints/run.json`
+    trained: Preset  # preset of its training
+    preset: Preset  # the same preset with the settings that the user changes
+    stages: list[str]  # stages that have a state
 
 
 def read_run(folder: pathlib.Path) -> StoredRun:

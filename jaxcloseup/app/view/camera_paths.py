@@ -33,18 +33,12 @@ class CameraError(Exception):
 
 
 class Shots(NamedTuple):
-    """Cameras to render.
+    """Cameras to render."""
 
-    Attributes:
-      cameras: `[Q]` stacked cameras.
-      names: file name of each camera's images, without ending.
-      fps: frames per second that the camera path asks for, or None.
-      sizes: width and height of each photograph without its padding; None if no image is padded.
-    """
-
-    cameras: Camera
-    names: list[str]
-    fps: float | None = None
+    cameras: Camera  # `[Q]` stacked cameras
+    names: list[str]  # file name of each camera's images, without ending
+    fps: float | None = None  # frames per second that the camera path asks for, or None
+    # width and height of each photograph without its padding; None if no image is padded
     sizes: list[tuple[int, int]] | None = None
 
 

@@ -32,29 +32,19 @@ _fuse, _depth_maps, _count_seen = jax.jit(fuse), jax.jit(prepare_depth_maps), ja
 
 
 class Maps(NamedTuple):
-    """Rendered training views.
+    """Rendered training views."""
 
-    Attributes:
-      views: the rendered colors, uint8, and weights, which are 0 where the surface is unknown.
-      depths: `[V, H, W]` z-depth, 0 where undefined.
-    """
-
+    # the rendered colors, uint8, and weights, which are 0 where the surface is unknown
     views: Views
-    depths: jax.Array
+    depths: jax.Array  # `[V, H, W]` z-depth, 0 where undefined
 
 
 class Grid(NamedTuple):
-    """Grid for fused distances.
+    """Grid for fused distances."""
 
-    Attributes:
-      corner: `[3]` first point, in the world.
-      voxel: distance between neighbors, in world units.
-      shape: number of points along each axis.
-    """
-
-    corner: np.ndarray
-    voxel: float
-    shape: tuple[int, int, int]
+    corner: np.ndarray  # `[3]` first point, in the world
+    voxel: float  # distance between neighbors, in world units
+    shape: tuple[int, int, int]  # number of points along each axis
 
 
 def rendered_view(programs: Programs, state: TrainState) -> Callable[[Camera], tuple]:
