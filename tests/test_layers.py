@@ -1,4 +1,4 @@
-"""Imports point one way only, modules stay short, and only methods know types of fields."""
+"""Imports point one way only, and only methods know types of fields."""
 
 import ast
 import pathlib
@@ -41,7 +41,7 @@ ROOMS = {
     },
 }
 LIBRARIES_OF_GEOMETRY = {"jax", "chex", "flax", "typing", "collections", "jaxcloseup"}
-LONGEST_MODULE, LONGEST_FUNCTION, MOST_PROGRAMS, MOST_ROOMS = 400, 80, 10, 14
+MOST_PROGRAMS, MOST_ROOMS = 10, 14
 # What tells one type of field from another.
 FIELD_TYPES = re.compile(
     r"isinstance\([^)]*(Surfel|Nerf|Mcmc|Adaptive|Buffers|Aux)"
@@ -98,17 +98,6 @@ def test_only_methods_and_their_fields_know_types_of_fields():
         if not {"fields", "methods", "benchmarks"} & set(path.parts):
             found = FIELD_TYPES.findall(path.read_text(encoding="utf-8"))
             assert not found, f"{path} asks what type a field is: {found}"
-
-
-def test_modules_and_functions_stay_short():
-    for path in MODULES:
-        text = path.read_text(encoding="utf-8")
-        assert len(text.splitlines()) <= LONGEST_MODULE, f"{path} is too long"
-        if "app" in path.parts or path.is_relative_to(EXPERIMENTS):
-            for node in ast.walk(ast.parse(text)):
-                if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-                    lines = node.end_lineno - node.lineno + 1
-                    assert lines < LONGEST_FUNCTION, f"{path}: {node.name} has {lines} lines"
 
 
 def test_programs_stay_few():
