@@ -72,7 +72,7 @@ def _has_ffmpeg() -> bool:
 
 
 class _Mp4:
-    """H.264 by FFmpeg, at a quality that eyes do not tell from the frames."""
+    """H.264 by FFmpeg, at a quality that looks like the frames."""
 
     def __init__(self, path: pathlib.Path, shape: tuple[int, ...], fps: float) -> None:
         # Otherwise imageio-ffmpeg forks, which JAX's threads forbid.

@@ -44,7 +44,7 @@ def read_colmap(
     Returns:
       The file that lists the images; the images that have a pose, sorted by name; the points
       `[P, 3]` with their colors `[P, 3]` in [0, 1], float32, sorted by id; and the points' mean
-      reprojection errors `[P]` in pixels of the images, NaN where the model does not tell.
+      reprojection errors `[P]` in pixels of the images, NaN where unknown.
 
     Raises:
       SceneError: names the file and the record in it, and says what to do.

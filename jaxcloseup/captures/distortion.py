@@ -27,29 +27,19 @@ COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
 class Distortion(NamedTuple):
-    """Lens distortion as a hashable record.
+    """Lens distortion as a hashable record."""
 
-    Attributes:
-      fisheye: whether the image radius follows the angle off the axis rather than its tangent.
-      coefficients: in OpenCV's order k1, k2, p1, p2, k3, k4, k5, k6; for a fisheye k1, k2, k3, k4.
-    """
-
-    fisheye: bool
+    fisheye: bool  # True if the image radius follows the angle off the axis, not its tangent
+    # in OpenCV's order k1, k2, p1, p2, k3, k4, k5, k6; for a fisheye k1, k2, k3, k4
     coefficients: tuple[float, ...]
 
 
 class Remap(NamedTuple):
-    """For each pinhole pixel `[H, W]`, its position in the distorted photograph.
+    """For each pinhole pixel `[H, W]`, its position in the distorted photograph."""
 
-    Attributes:
-      x: float32 columns; pixel centers are integers, as in OpenCV.
-      y: float32 rows, likewise.
-      inside: bool, whether the distorted photograph shows the pixel.
-    """
-
-    x: np.ndarray
-    y: np.ndarray
-    inside: np.ndarray
+    x: np.ndarray  # float32 columns; pixel centers are integers, as in OpenCV
+    y: np.ndarray  # float32 rows, likewise
+    inside: np.ndarray  # bool, whether the distorted photograph shows the pixel
 
 
 def read_distortion(label: str, lens: dict[str, Any]) -> Distortion | None:

@@ -27,7 +27,7 @@ from jaxcloseup.photos.views import Views
 
 
 _UP = (0.0, 0.0, 1.0)
-_MEASURED_SIDE = 800  # pixels of photographs whose features tell how near they are
+_MEASURED_SIDE = 800  # pixels of photographs whose features measure how near they are
 _MIN_POINTS = 100  # fewer triangulated points say too little about where the scene is
 
 _log = logging.getLogger(__name__)

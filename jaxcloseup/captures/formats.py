@@ -38,31 +38,19 @@ _MODELS = ("sparse/0", "sparse", "colmap/sparse/0")
 
 
 class Listing(NamedTuple):
-    """The photographs, points and fields that a capture's files list.
+    """The photographs, points and fields that a capture's files list."""
 
-    Attributes:
-      format: one of `FORMATS`.
-      folder: folder of the capture.
-      file: main file of the capture, which error messages name.
-      fields: fields of the main file.
-      frames: photographs of each split present, `train` first.
-      points: `[P, 3]` float32 world points; P may be 0.
-      rgb: `[P, 3]` float32 colors of the points in [0, 1].
-      notes: sentences on what was read and how it was split.
-      times_nearer: see `splits.Division`.
-      errors: `[P]` mean reprojection errors of the points, in pixels of the photographs' own size,
-        NaN where unknown; None if the format has none.
-    """
-
-    format: str
-    folder: pathlib.Path
-    file: pathlib.Path
-    fields: dict[str, Any]
-    frames: dict[str, list[Frame]]
-    points: np.ndarray
-    rgb: np.ndarray
-    notes: tuple[str, ...]
-    times_nearer: tuple[float, ...] | None
+    format: str  # one of `FORMATS`
+    folder: pathlib.Path  # folder of the capture
+    file: pathlib.Path  # main file of the capture, which error messages name
+    fields: dict[str, Any]  # fields of the main file
+    frames: dict[str, list[Frame]]  # photographs of each split present, `train` first
+    points: np.ndarray  # `[P, 3]` float32 world points; P may be 0
+    rgb: np.ndarray  # `[P, 3]` float32 colors of the points in [0, 1]
+    notes: tuple[str, ...]  # sentences on what was read and how it was split
+    times_nearer: tuple[float, ...] | None  # see `splits.Division`
+    # `[P]` mean reprojection errors of the points, in pixels of the photographs' own size, NaN
+    # where unknown; None if the format has none
     errors: np.ndarray | None
 
 

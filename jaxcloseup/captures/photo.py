@@ -30,23 +30,15 @@ class Reading(NamedTuple):
 
 
 class Photo(NamedTuple):
-    """A photograph after downscaling, or a crop of it.
+    """A photograph after downscaling, or a crop of it."""
 
-    Attributes:
-      frame: frame that was read.
-      rgb: `[H, W, 3]` uint8 colors.
-      mask: `[H, W]` uint8 weights, 255 where the pixel counts fully.
-      stored_size: (width, height) of the file's image.
-      scaled: (width, height) of the whole photograph at this scale, before trimming; may be
-        fractional.
-      corner: (x, y) of the crop's first pixel in the whole photograph at this scale.
-    """
-
-    frame: Frame
-    rgb: np.ndarray
-    mask: np.ndarray
-    stored_size: tuple[int, int]
+    frame: Frame  # frame that was read
+    rgb: np.ndarray  # `[H, W, 3]` uint8 colors
+    mask: np.ndarray  # `[H, W]` uint8 weights, 255 where the pixel counts fully
+    stored_size: tuple[int, int]  # (width, height) of the file's image
+    # (width, height) of the whole photograph at this scale, before trimming; may be fractional
     scaled: tuple[float, float]
+    # (x, y) of the crop's first pixel in the whole photograph at this scale
     corner: tuple[int, int] = (0, 0)
 
     @property

@@ -17,7 +17,7 @@ FOCAL = (0.01, 1e4)  # focal length in multiples of the photograph's longer side
 CENTER = 100  # distance of the principal point from the middle, likewise
 LENGTH = 1e12  # any distance, and 1 / the smallest one: squares and cubes stay finite
 ORIGIN = 1e4  # distance of cameras from the origin, in multiples of the scene's size
-STRAY = 1e5  # distance of points from the cameras, in multiples of what is usual
+STRAY = 1e5  # distance of points from the cameras, in multiples of the cameras' spread or median
 
 
 def check_lens(label: str, intrinsics: np.ndarray, width: int, height: int) -> None:

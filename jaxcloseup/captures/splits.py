@@ -21,22 +21,17 @@ _LISTS = {"train": "train_filenames", "test": "test_filenames", "test_far": "val
 _SPLIT_FILE_KEYS = {"train", "test", "test_far", "unused"}
 
 
-# Returns frames that tell which points they show, and these points `[P, 3]`.
+# Returns frames that list the points they show, and these points `[P, 3]`.
 FindPoints = Callable[[Sequence[Frame]], tuple[list[Frame], np.ndarray]]
 
 
 class Division(NamedTuple):
-    """The photographs of a capture by split.
+    """The photographs of a capture by split."""
 
-    Attributes:
-      frames: photographs of each split present, `train` first.
-      notes: sentences on how they were split.
-      times_nearer: for `closest`, how many times nearer each `test` photograph is than the median
-        `train` one; for `zoom`, how many times finer each close-up is; otherwise None.
-    """
-
-    frames: dict[str, list[Frame]]
-    notes: tuple[str, ...] = ()
+    frames: dict[str, list[Frame]]  # photographs of each split present, `train` first
+    notes: tuple[str, ...] = ()  # sentences on how they were split
+    # for `closest`, how many times nearer each `test` photograph is than the median `train` one;
+    # for `zoom`, how many times finer each close-up is; otherwise None
     times_nearer: tuple[float, ...] | None = None
 
 

@@ -22,17 +22,11 @@ _MIN_ANGLE = np.radians(1.5)  # between rays; below it, depth is unreliable
 
 
 class Triangulated(NamedTuple):
-    """Points that two photographs both show; P may be 0.
+    """Points that two photographs both show; P may be 0."""
 
-    Attributes:
-      points: `[P, 3]` float32 world points.
-      rgb: `[P, 3]` float32 colors in [0, 1].
-      views: `[P, 2]` indices of the photographs.
-    """
-
-    points: np.ndarray
-    rgb: np.ndarray
-    views: np.ndarray
+    points: np.ndarray  # `[P, 3]` float32 world points
+    rgb: np.ndarray  # `[P, 3]` float32 colors in [0, 1]
+    views: np.ndarray  # `[P, 2]` indices of the photographs
 
 
 class _Features(NamedTuple):

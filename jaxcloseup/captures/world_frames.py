@@ -13,31 +13,21 @@ from jaxcloseup.photos.scene import SceneError
 
 
 class Frame(NamedTuple):
-    """A listed photograph that is not decoded yet.
+    """A listed photograph that is not decoded yet."""
 
-    Attributes:
-      source: file that lists the photograph.
-      listed: path of the photograph as written in `source`.
-      file: path of the image.
-      mask: path of the mask, or None.
-      camtoworld: `[3, 4]` float64 OpenCV pose.
-      size: (width, height) that the intrinsics refer to; None means the image's own size.
-      lens: lens fields of this frame, then those of the whole file.
-      distortion: lens distortion, or None for a pinhole.
-      seen: indices of the capture's points that the photograph shows; None if the format does not
-        tell.
-      reduced: path of an already shrunk copy to read instead of `file`, or None.
-    """
-
-    source: pathlib.Path
-    listed: str
-    file: pathlib.Path
-    mask: pathlib.Path | None
-    camtoworld: np.ndarray
+    source: pathlib.Path  # file that lists the photograph
+    listed: str  # path of the photograph as written in `source`
+    file: pathlib.Path  # path of the image
+    mask: pathlib.Path | None  # path of the mask
+    camtoworld: np.ndarray  # `[3, 4]` float64 OpenCV pose
+    # (width, height) that the intrinsics refer to; None means the image's own size
     size: tuple[int, int] | None
+    # lens fields of this frame, then those of the whole file
     lens: tuple[dict[str, Any], dict[str, Any]]
-    distortion: Distortion | None = None
+    distortion: Distortion | None = None  # None for a pinhole
+    # indices of the capture's points that the photograph shows; None if unknown
     seen: np.ndarray | None = None
+    # path of an already shrunk copy to read instead of `file`, or None
     reduced: pathlib.Path | None = None
 
     @property

@@ -66,7 +66,7 @@ def make_evidence(candidates: Candidates, missing: jax.Array, weight: jax.Array)
 def learn_weights(
     scenes: Mapping[str, Sequence[Evidence]], *, steps: tuple[int, int] = (600, 1500)
 ) -> DetailWeights:
-    """Train the networks to predict what is really there, and how far colors are off.
+    """Train the networks to predict missing colors and their expected errors.
 
     A mixture g and its share s minimize |m - s g|^2 for the missing colors m, where every view has
     the same total weight. An expected error b minimizes log b + |m - s g| / b, whose least mean is

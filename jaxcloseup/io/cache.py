@@ -25,15 +25,10 @@ _T = TypeVar("_T")
 
 
 class Stored(NamedTuple):
-    """The content of a file.
+    """The content of a file."""
 
-    Attributes:
-      arrays: arrays by name.
-      record: any JSON value.
-    """
-
-    arrays: Mapping[str, np.ndarray]
-    record: Any = None
+    arrays: Mapping[str, np.ndarray]  # arrays by name
+    record: Any = None  # any JSON value
 
 
 def cached(

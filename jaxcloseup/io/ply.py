@@ -42,7 +42,7 @@ def read_vertices(path: str | pathlib.Path) -> np.ndarray:
     start = data.find(b"\n", end) + 1 or len(data)
     dtype = np.dtype([(name, _ORDERS[encoding] + kind) for name, kind in properties])
     short = f"{path} ends before its {count} vertices do: copy or export it again."
-    # Text has at least a digit and a separator for each number, but for the last.
+    # Text has at least a digit and a separator for each number, except the last.
     smallest = 2 * count * len(properties) - 1 if encoding == "ascii" else count * dtype.itemsize
     if len(data) - start < smallest:
         raise PlyError(short)

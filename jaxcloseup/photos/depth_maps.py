@@ -216,19 +216,12 @@ def _fuse_block(
 
 
 class _Sums(NamedTuple):
-    """Sums over views at points `[N]`.
+    """Sums over views at points `[N]`."""
 
-    Attributes:
-      distance: `[N]` weighted distances.
-      weight: `[N]` weights of the distances.
-      near: `[N]` weights of the values, which fall with the distance from the surface.
-      values: `[N, C]` weighted values.
-    """
-
-    distance: jax.Array
-    weight: jax.Array
-    near: jax.Array
-    values: jax.Array
+    distance: jax.Array  # `[N]` weighted distances
+    weight: jax.Array  # `[N]` weights of the distances
+    near: jax.Array  # `[N]` weights of the values, which fall with the distance from the surface
+    values: jax.Array  # `[N, C]` weighted values
 
 
 def _add_view(

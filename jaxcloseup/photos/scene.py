@@ -80,7 +80,7 @@ class Scene:
       names: for each split present, the names of its photographs in order.
       metadata: extra facts from the loader, such as source paths and downscale; `seen`, for each
         training photograph the indices of the points that it shows, and `point_errors`, their mean
-        reprojection errors `[P]` in pixels of the photographs' own size, where the files tell.
+        reprojection errors `[P]` in pixels of the photographs' own size, where the files list them.
       surface: renders a `Camera` to its exact `Surface`; None for photographed scenes.
       photographs_at: reads the photographs of a split again at 1 / n of their own size, given n
         and the split, "train" by default, and returns `Views` and what `sizes` says of these; None

@@ -64,8 +64,8 @@ def run_arms(
       step: `(state, views, sources, settings) -> (state, metrics)` of one arm, such as
         `closeup_step` with its static arguments bound, or `pseudo_step`, whose `sources` are the
         photographs' depths.
-      states: `[A, ...]` from `stack_states`. All arms change what is due at a step together, such
-        as the number of splats, because they share the count of steps.
+      states: `[A, ...]` from `stack_states`. All arms make scheduled changes, such as of the number
+        of splats, at the same steps, because they share the count of steps.
       views: training photographs, which all arms share.
       sources: what labels read, shared by all arms, or stacked: depths `[A, V, H, W]`, or
         `LabelSources` whose depths and blocks, but not photographs, have the axis of arms.

@@ -51,7 +51,7 @@ def init_state(
       key: random key.
       points: `[P, 3]` initial points, for fields that start from them.
       rgb: `[P, 3]` their colors.
-      field: static; what is trained.
+      field: static; field to train.
       optimizer: static.
     """
     key_init, key_steps = jax.random.split(key)
@@ -73,7 +73,7 @@ def update_state(
     """Take one optimizer step along the mean gradient of the draws' losses.
 
     Args:
-      state: what is trained.
+      state: training state.
       loss: loss and metrics of one draw.
       data: what all draws read; passed to `loss`.
       field: static; its `adapt` follows the update.

@@ -41,10 +41,10 @@ def train_step(
     """Take one step on training photographs alone.
 
     Args:
-      state: what is trained.
+      state: training state.
       views: training photographs.
       lr_scale: `[]` factor on the optimizer's updates; None: 1.
-      field: static; what is trained.
+      field: static; field to train.
       optimizer: static.
       config: static.
       spread: how several draws are taken.
@@ -111,11 +111,11 @@ def closeup_step(
     `train_step` at the same count of steps, so that a control is paired.
 
     Args:
-      state: what is trained.
+      state: training state.
       views: training photographs.
       sources: the training photographs, from `label_sources`.
       settings: virtual poses and masks.
-      field: static; what is trained.
+      field: static; field to train.
       optimizer: static.
       config: static.
       spread: how several draws are taken.
@@ -186,13 +186,13 @@ def labeled_step(
     spread: Spread = in_a_loop,
     sequential: bool = False,
 ) -> tuple[TrainState, Metrics]:
-    """Take one step on training photographs and on views that were labeled once.
+    """Take one step on training photographs and on views labeled once, such as target views.
 
-    Such are target views. The losses are added as in the paper, never pooled. The step draws the
-    same photographs as `train_step`.
+    The losses are added as in the paper, never pooled. The step draws the same photographs as
+    `train_step`.
 
     Args:
-      state: what is trained.
+      state: training state.
       views: training photographs.
       labels: from `label_views`, or windows of such views.
       settings: `label_loss_weight` and `lr_scale` count.
@@ -246,7 +246,7 @@ def run_steps(
     Args:
       step: a step with everything but the state bound, such as
         `lambda state: train_step(state, views, field=field, optimizer=optimizer, config=config)`.
-      state: what is trained.
+      state: training state.
       count: how many steps.
     """
     step = jax.jit(step)  # is traced once, though called twice

@@ -38,15 +38,10 @@ class OffsetSurfels(Surfels):
 
 
 class ImageGradientState(struct.PyTreeNode):
-    """The 2-D gradient that surfels accumulated since the last refinement.
+    """The 2-D gradient that surfels accumulated since the last refinement."""
 
-    Attributes:
-      total: `[N]` sum of the norms of the image offset's gradient.
-      views: `[N]` number of views in which that gradient was not 0.
-    """
-
-    total: jax.Array
-    views: jax.Array
+    total: jax.Array  # `[N]` sum of the norms of the image offset's gradient
+    views: jax.Array  # `[N]` number of views in which that gradient was not 0
 
 
 def adaptive_control(

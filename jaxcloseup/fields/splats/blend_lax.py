@@ -65,21 +65,14 @@ def _pass_chunk(
 
 
 class _ForwardState(struct.PyTreeNode):
-    """State of the forward loop.
+    """State of the forward loop."""
 
-    Attributes:
-      queue: of tiles.
-      product: `[B, P]` product of 1 - alpha so far, also behind a finished pixel's last splat.
-      walk: of the pixels of tiles at work.
-      sums: so far, of the same pixels.
-      ended: `[T + 1, C, P]` pixels of tiles whose lists have ended, see `pixel_rows`.
-    """
-
-    queue: Queue
+    queue: Queue  # tiles at work and waiting
+    # `[B, P]` product of 1 - alpha so far, also behind a finished pixel's last splat
     product: jax.Array
-    walk: Walk
-    sums: Channels
-    ended: jax.Array
+    walk: Walk  # position of each pixel of the tiles at work
+    sums: Channels  # partial sums of the same pixels
+    ended: jax.Array  # `[T + 1, C, P]` pixels of tiles whose lists have ended, see `pixel_rows`
 
 
 def forward(
@@ -144,19 +137,12 @@ def forward(
 
 
 class _BackwardState(struct.PyTreeNode):
-    """State of the backward loop.
+    """State of the backward loop."""
 
-    Attributes:
-      queue: of tiles; its steps count chunks from the back.
-      behind: `[B, P]` sum of weight times worth of the splats behind the chunk.
-      after: `[B, P]` transmittance behind the chunk.
-      table_bar: `[N, C]` cotangent so far.
-    """
-
-    queue: Queue
-    behind: jax.Array
-    after: jax.Array
-    table_bar: jax.Array
+    queue: Queue  # tiles at work and waiting; steps count chunks from the back
+    behind: jax.Array  # `[B, P]` sum of weight times worth of the splats behind the chunk
+    after: jax.Array  # `[B, P]` transmittance behind the chunk
+    table_bar: jax.Array  # `[N, C]` partial cotangent of the table
 
 
 def backward(
@@ -183,7 +169,7 @@ def backward(
         axis=1,
     )
     of_pixel = jnp.pad(of_pixel, ((0, 1), (0, 0), (0, 0)))
-    # Splats behind the one that finished the last pixel count for nothing.
+    # Splats behind the one that finished the last pixel contribute nothing.
     counted = jnp.minimum(trace.stop.max(axis=-1), lists.counts)
     chunks = jnp.pad(-(-counted // chunk), (0, 1))
 
@@ -207,17 +193,11 @@ def backward(
 
 
 class _Grid(struct.PyTreeNode):
-    """Pixels of a tile.
+    """Pixels of a tile."""
 
-    Attributes:
-      x: `[1, 1, P]` centers.
-      y: the same.
-      basis: `[P, 3]` of moments: 1, x and y about the middle of the tile.
-    """
-
-    x: jax.Array
-    y: jax.Array
-    basis: jax.Array
+    x: jax.Array  # `[1, 1, P]` columns of the pixel centers
+    y: jax.Array  # `[1, 1, P]` rows of the pixel centers
+    basis: jax.Array  # `[P, 3]` factors of the moments: 1, and x and y about the tile's middle
 
 
 def _grid(tile: int, dtype: jnp.dtype) -> _Grid:

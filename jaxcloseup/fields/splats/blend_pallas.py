@@ -119,19 +119,12 @@ def _column(table: Ref, splat: jax.Array, origin: list[jax.Array]) -> Column:
 
 
 class _ForwardState(struct.PyTreeNode):
-    """State of a tile's forward loop.
+    """State of a tile's forward loop."""
 
-    Attributes:
-      position: `[]` of the next splat in the list.
-      before: `[P]` product of 1 - alpha so far.
-      walk: of the pixels.
-      sums: so far.
-    """
-
-    position: jax.Array
-    before: jax.Array
-    walk: Walk
-    sums: Channels
+    position: jax.Array  # `[]` index of the next splat in the list
+    before: jax.Array  # `[P]` product of 1 - alpha so far
+    walk: Walk  # position of each pixel
+    sums: Channels  # partial sums
 
 
 def _forward_tile(plan: RasterPlan, features: int, *refs: Ref) -> None:
@@ -172,17 +165,11 @@ def _forward_tile(plan: RasterPlan, features: int, *refs: Ref) -> None:
 
 
 class _BackwardState(struct.PyTreeNode):
-    """State of a tile's backward loop.
+    """State of a tile's backward loop."""
 
-    Attributes:
-      position: `[]` of the next splat in front.
-      behind: `[P]` sum of weight times worth of the splats behind it.
-      after: `[P]` transmittance behind it.
-    """
-
-    position: jax.Array
-    behind: jax.Array
-    after: jax.Array
+    position: jax.Array  # `[]` index of the next splat in front
+    behind: jax.Array  # `[P]` sum of weight times worth of the splats behind it
+    after: jax.Array  # `[P]` transmittance behind it
 
 
 def _backward_tile(plan: RasterPlan, features: int, *refs: Ref) -> None:

@@ -108,27 +108,16 @@ class RasterizeConfig:
 
 @dataclasses.dataclass(frozen=True)
 class RasterPlan:
-    """A `RasterizeConfig` for one image, with nothing left open; see `plan_raster`.
+    """A `RasterizeConfig` for one image, with nothing left open; see `plan_raster`."""
 
-    Attributes:
-      capacity: largest number of pairs of splats and tiles.
-      near: z-depth before which nothing is drawn.
-      tile: side of a tile in pixels.
-      chunk: number of a tile's splats that loops evaluate at once.
-      block: largest number of tiles that loops evaluate at once.
-      pairs_at_once: largest number of pairs that are listed at once.
-      compositor: one of `COMPOSITORS` but "auto".
-      interpret: whether kernels are interpreted.
-    """
-
-    capacity: int
-    near: float
-    tile: int
-    chunk: int = 8
-    block: int = 256
-    pairs_at_once: int = 2**14
-    compositor: str = "loops"
-    interpret: bool = False
+    capacity: int  # largest number of pairs of splats and tiles
+    near: float  # z-depth before which nothing is drawn
+    tile: int  # side of a tile in pixels
+    chunk: int = 8  # number of a tile's splats that loops evaluate at once
+    block: int = 256  # largest number of tiles that loops evaluate at once
+    pairs_at_once: int = 2**14  # largest number of pairs that are listed at once
+    compositor: str = "loops"  # one of `COMPOSITORS` except "auto"
+    interpret: bool = False  # whether kernels are interpreted
 
 
 @dataclasses.dataclass(frozen=True)

@@ -163,7 +163,7 @@ def _map_parts_backward(
 
     bars = jax.tree.map(lambda bar: _split(bar, parts.shape), cotangents)
     trained_bar, picked_bar = lax.scan(pull_back, _zeros(trained), (parts, bars))
-    # Where each item is among those that are shown.
+    # Rank of each item among the visible ones.
     place = jnp.cumsum(shown, dtype=jnp.int32) - 1
     items_bar = _only(shown, _pick(jax.tree.map(_flat, picked_bar), place))
     return items_bar, trained_bar, None

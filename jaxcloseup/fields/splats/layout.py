@@ -74,23 +74,16 @@ def pack(footprints: Footprints) -> jax.Array:
 
 
 class Channels(struct.PyTreeNode):
-    """What the weights of splats multiply, the sums of that over a pixel, or their cotangents.
+    """Values that splat weights multiply, their sums over a pixel, or the cotangents of these.
 
     The fields come in the order of the channels of every array of sums `[..., F + MOMENTS, P]`.
-
-    Attributes:
-      payload: F arrays, such as colors and normals.
-      depth: z.
-      alpha: 1, so that its sum is the accumulated opacity.
-      first: 1 / z minus that of the pixel's first drawn splat.
-      second: the square of `first`.
     """
 
-    payload: tuple[jax.Array, ...]
-    depth: jax.Array
-    alpha: jax.Array
-    first: jax.Array
-    second: jax.Array
+    payload: tuple[jax.Array, ...]  # F arrays, such as colors and normals
+    depth: jax.Array  # z-depth
+    alpha: jax.Array  # 1, so that its sum is the accumulated opacity
+    first: jax.Array  # 1 / z minus that of the pixel's first drawn splat
+    second: jax.Array  # the square of `first`
 
     @classmethod
     def of(cls, channels: Sequence[jax.Array]) -> "Channels":
@@ -104,23 +97,14 @@ class Channels(struct.PyTreeNode):
 
 
 class PixelRows(NamedTuple):
-    """Rows of an array `[T, F + MOMENTS + 4, P]` that holds all about the pixels of tiles.
+    """Row numbers of the array `[T, F + MOMENTS + 4, P]` that stores the pixels of tiles."""
 
-    Attributes:
-      sums: rows of `Channels`.
-      median: row of the median depth.
-      transmittance: row of `Trace.transmittance`.
-      stop: row of `Trace.stop`, which a float holds exactly.
-      reference: row of `Trace.reference`.
-      total: number of rows.
-    """
-
-    sums: slice
-    median: int
-    transmittance: int
-    stop: int
-    reference: int
-    total: int
+    sums: slice  # rows of `Channels`
+    median: int  # row of the median depth
+    transmittance: int  # row of `Trace.transmittance`
+    stop: int  # row of `Trace.stop`, which a float holds exactly
+    reference: int  # row of `Trace.reference`
+    total: int  # number of rows
 
 
 def pixel_rows(features: int) -> PixelRows:
@@ -130,14 +114,8 @@ def pixel_rows(features: int) -> PixelRows:
 
 
 class Trace(struct.PyTreeNode):
-    """What the forward pass keeps for the derivative, per pixel of all tiles `[T, P]`.
+    """Residuals of the forward pass for the derivative, per pixel of all tiles `[T, P]`."""
 
-    Attributes:
-      transmittance: behind the last drawn splat.
-      stop: int32 position in the list at which the pixel was finished.
-      reference: inverse depth of the first drawn splat.
-    """
-
-    transmittance: jax.Array
-    stop: jax.Array
-    reference: jax.Array
+    transmittance: jax.Array  # transmittance behind the last drawn splat
+    stop: jax.Array  # int32 position in the list at which the pixel was finished
+    reference: jax.Array  # inverse depth of the first drawn splat

@@ -148,7 +148,7 @@ def project_discs(
     homography, edge_on = _homographies(discs, anchor, centered, inverse_depth, focal, principal)
     vectors = scaled(discs.scales[0], discs.tangent_u), scaled(discs.scales[1], discs.tangent_v)
     if antialias:
-        # Before the box: it bounds what is drawn, which the filter makes larger and fainter.
+        # Filter first: the box must bound the filtered splat, which is larger and fainter.
         spread = pixel_spread(homography, depth, centered & ~edge_on)
         homography, vectors = widen(homography, vectors, spread)
         opacity = opacity / (spread[0] * spread[2])

@@ -22,7 +22,7 @@ _CACHED_PAIRS = 2**14  # pairs whose data fit into a core's cache
 
 
 def plan_raster(config: RasterizeConfig, *, height: int, width: int) -> RasterPlan:
-    """Settle what a configuration leaves open by what is fastest for an image on its platform.
+    """Fill in the open options of a configuration with the fastest for an image and platform.
 
     Small tiles evaluate fewer splats in vain, but more pairs have to be sorted; docs/log/speed.md
     has the times on a CPU. Small tiles that are chosen here get three times the `capacity`, since

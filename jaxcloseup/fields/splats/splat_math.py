@@ -36,27 +36,16 @@ TRANSMITTANCE_MIN = 1e-4  # a pixel is finished before its transmittance falls b
 
 
 class Shade(struct.PyTreeNode):
-    """Splats at pixels.
+    """Splats at pixels."""
 
-    Attributes:
-      alpha: opacity, 0 where not drawn.
-      inverse_depth: 1 / z, clipped to the disc's range where the low-pass determines rho.
-      z: its inverse.
-      u_numerator: u / z.
-      v_numerator: v / z.
-      rho: squared distance from the center in standard deviations.
-      on_plane: bool, True where the disc, not the low-pass, determines rho.
-      clipped: bool, True where `inverse_depth` is a limit of the disc's range.
-    """
-
-    alpha: jax.Array
-    inverse_depth: jax.Array
-    z: jax.Array
-    u_numerator: jax.Array
-    v_numerator: jax.Array
-    rho: jax.Array
-    on_plane: jax.Array
-    clipped: jax.Array
+    alpha: jax.Array  # opacity, 0 where not drawn
+    inverse_depth: jax.Array  # 1 / z, clipped to the disc's range where the low-pass determines rho
+    z: jax.Array  # z-depth, the inverse of `inverse_depth`
+    u_numerator: jax.Array  # u / z
+    v_numerator: jax.Array  # v / z
+    rho: jax.Array  # squared distance from the center in standard deviations
+    on_plane: jax.Array  # bool, True where the disc, not the low-pass, determines rho
+    clipped: jax.Array  # bool, True where `inverse_depth` is a limit of the disc's range
 
 
 def shade(column: Column, x: jax.Array, y: jax.Array, near: float) -> Shade:
@@ -84,19 +73,12 @@ def shade(column: Column, x: jax.Array, y: jax.Array, near: float) -> Shade:
 
 
 class Walk(struct.PyTreeNode):
-    """Where pixels are on their way through a list, front to back.
+    """State of pixels after part of a list of splats, front to back."""
 
-    Attributes:
-      remaining: transmittance behind the last drawn splat.
-      stop: position behind it.
-      reference: inverse depth of the first drawn splat.
-      median: median depth so far.
-    """
-
-    remaining: jax.Array
-    stop: jax.Array
-    reference: jax.Array
-    median: jax.Array
+    remaining: jax.Array  # transmittance behind the last drawn splat
+    stop: jax.Array  # list position behind the last drawn splat
+    reference: jax.Array  # inverse depth of the first drawn splat
+    median: jax.Array  # median depth so far
 
 
 def pass_splat(
@@ -163,23 +145,14 @@ def worth(column: Column, seen: Shade, reference: jax.Array, sums_bar: Channels)
 
 
 class Pulled(struct.PyTreeNode):
-    """Cotangents of splats at pixels.
+    """Cotangents of splats at pixels."""
 
-    Attributes:
-      u: of the homography's first row, the numerator of u.
-      v: of the second row.
-      w: of the third row, 1 / z.
-      low_pass: of -rho / 2 where the low-pass determines it.
-      clip: of the depth at the anchor, where the depth is clipped.
-      scaled: of log(alpha).
-    """
-
-    u: jax.Array
-    v: jax.Array
-    w: jax.Array
-    low_pass: jax.Array
-    clip: jax.Array
-    scaled: jax.Array
+    u: jax.Array  # cotangent of the homography's first row, the numerator of u
+    v: jax.Array  # cotangent of its second row, the numerator of v
+    w: jax.Array  # cotangent of its third row, 1 / z
+    low_pass: jax.Array  # cotangent of -rho / 2 where the low-pass determines rho
+    clip: jax.Array  # cotangent of the depth at the anchor, where the depth is clipped
+    scaled: jax.Array  # cotangent of log(alpha)
 
 
 # Sums over pixels of values times 1, x and y: three arrays, or one of them stacked.

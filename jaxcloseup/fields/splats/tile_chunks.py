@@ -17,19 +17,12 @@ States = tuple[jax.Array, ...]
 
 
 class Queue(struct.PyTreeNode):
-    """Which tiles are at work, and which come next.
+    """The tiles at work, and the tiles that wait."""
 
-    Attributes:
-      waiting: `[T + B]` tiles in the order in which they begin; `T` ends them.
-      next: `[]` place of the next one.
-      tile: `[B]` tiles at work, `T` where there is none.
-      step: `[B]` chunks that they have behind them.
-    """
-
-    waiting: jax.Array
-    next: jax.Array
-    tile: jax.Array
-    step: jax.Array
+    waiting: jax.Array  # `[T + B]` tiles in the order in which they begin; `T` ends them
+    next: jax.Array  # `[]` index into `waiting` of the next tile
+    tile: jax.Array  # `[B]` tiles at work, `T` where there is none
+    step: jax.Array  # `[B]` chunks that each of these tiles has finished
 
 
 def lanes_of(plan: RasterPlan, tiles: int) -> int:
@@ -83,21 +76,13 @@ def with_none(lists: TileLists) -> Tiles:
 
 
 class Chunk(struct.PyTreeNode):
-    """Splats `[B, K]` at the places of a chunk in their tiles' lists.
+    """Splats `[B, K]` at the places of a chunk in their tiles' lists."""
 
-    Attributes:
-      rows: `[B, K, C]` of the table.
-      index: which splats they are.
-      place: in the lists.
-      inside: bool; False past a list's end.
-      origins: `[B, 2]` first pixels of the tiles.
-    """
-
-    rows: jax.Array
-    index: jax.Array
-    place: jax.Array
-    inside: jax.Array
-    origins: jax.Array
+    rows: jax.Array  # `[B, K, C]` rows of the table
+    index: jax.Array  # `[B, K]` indices of the splats in the table
+    place: jax.Array  # `[B, K]` positions in the tiles' lists
+    inside: jax.Array  # `[B, K]` bool, False past a list's end
+    origins: jax.Array  # `[B, 2]` first pixels of the tiles
 
     def column(self, i: int) -> jax.Array:
         """Return a column `[B, K, 1]`; anchors are local to tiles, and opacity ends with lists."""

@@ -21,21 +21,14 @@ _FEW = 2**12  # splats that are worth a shortcut
 
 
 class TileLists(struct.PyTreeNode):
-    """The lists of all `T` tiles, in row-major order.
+    """The lists of all `T` tiles, in row-major order."""
 
-    Attributes:
-      splats: `[capacity]` indices of splats, tile after tile, each tile's nearest first.
-      starts: `[T]` index into `splats` at which a tile's list starts.
-      counts: `[T]` length of a tile's list.
-      origins: `[T, 2]` x and y of a tile's first pixel.
-      overflow: `[]` int32 number of pairs that did not fit, which are those of the farthest splats;
-        `LARGEST` where the number of pairs may exceed int32.
-    """
-
-    splats: jax.Array
-    starts: jax.Array
-    counts: jax.Array
-    origins: jax.Array
+    splats: jax.Array  # `[capacity]` indices of splats, tile after tile, each tile's nearest first
+    starts: jax.Array  # `[T]` index into `splats` at which a tile's list starts
+    counts: jax.Array  # `[T]` length of a tile's list
+    origins: jax.Array  # `[T, 2]` x and y of a tile's first pixel
+    # `[]` int32 number of pairs that did not fit, always the farthest splats; `LARGEST` where the
+    # number of pairs may exceed int32
     overflow: jax.Array
 
 
@@ -117,7 +110,7 @@ def _nearest_first_shown(order: jax.Array, pairs: jax.Array) -> jax.Array:
     few = count // 4
     if few < _FEW:
         return _nearest_first(order)
-    # Of many splats that a window leaves out, those that show come first.
+    # Where a window leaves out many splats, visible ones come first: sort only the head.
     index = jnp.arange(count, dtype=jnp.int32)
     after = jnp.max(jnp.where(pairs > 0, index, -1), initial=-1)  # the last splat that shows
 
