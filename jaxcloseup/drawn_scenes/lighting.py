@@ -19,29 +19,18 @@ _ROUNDS = 2  # each casts _SAMPLES directions around an entry
 
 
 class Lamp(NamedTuple):
-    """A spherical lamp.
+    """A spherical lamp."""
 
-    Attributes:
-      position: center of the lamp in meters.
-      radius: radius of the lamp in meters.
-      power: RGB irradiance at one meter.
-    """
-
-    position: tuple[float, float, float]
-    radius: float
-    power: tuple[float, float, float]
+    position: tuple[float, float, float]  # center of the lamp in meters
+    radius: float  # radius of the lamp in meters
+    power: tuple[float, float, float]  # RGB irradiance at one meter
 
 
 class Ambience(NamedTuple):
-    """Light from all directions.
+    """Light from all directions."""
 
-    Attributes:
-      irradiance: RGB irradiance of an unoccluded point.
-      reach: distance in meters over which the occlusion by an obstacle fades.
-    """
-
-    irradiance: tuple[float, float, float]
-    reach: float
+    irradiance: tuple[float, float, float]  # RGB irradiance of an unoccluded point
+    reach: float  # distance in meters over which the occlusion by an obstacle fades
 
 
 def bake_light(

@@ -14,68 +14,41 @@ from jaxcloseup.drawn_scenes.raycast import BOX, CYLINDER, FACES_OF, PLANE, SPHE
 
 
 class Finish(NamedTuple):
-    """The material of a face.
+    """The material of a face."""
 
-    Attributes:
-      texture: name of the color texture.
-      size: meters per repeat of the texture; None stretches `region` once over the face.
-      detail: name of the texture of fine structure.
-      detail_size: meters per repeat of the detail.
-      tint: RGB factor on the color.
-      gloss: strength of the highlight.
-      grain: whether to align the texture with the longer side of the face.
-      shines: whether the face shows its own color, without light or shadow.
-      region: (left, top, right, bottom) part of the texture, in [0, 1].
-    """
-
-    texture: str
+    texture: str  # name of the color texture
+    # meters per repeat of the texture; None stretches `region` once over the face
     size: float | None = None
-    detail: str = "plain"
-    detail_size: float = 0.2
-    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    gloss: float = 0.0
-    grain: bool = False
-    shines: bool = False
+    detail: str = "plain"  # name of the texture of fine structure
+    detail_size: float = 0.2  # meters per repeat of the detail
+    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)  # RGB factor on the color
+    gloss: float = 0.0  # strength of the highlight
+    grain: bool = False  # whether to align the texture with the longer side of the face
+    shines: bool = False  # whether the face shows its own color, without light or shadow
+    # (left, top, right, bottom) part of the texture, in [0, 1]
     region: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
 
 
 class Solid(NamedTuple):
-    """A solid before assembly.
+    """A solid before assembly."""
 
-    Attributes:
-      kind: PLANE, BOX, SPHERE or CYLINDER.
-      center: `[3]` center in the world.
-      size: `[3]` full extents in meters.
-      rotation: `[3, 3]` rotation from the solid to the world.
-      taper: growth of a cylinder's radius with local z, in (-1, 1).
-      finishes: finish of each face.
-      texel: side of a baked light texel in meters.
-    """
-
-    kind: int
-    center: np.ndarray
-    size: np.ndarray
-    rotation: np.ndarray
-    taper: float
-    finishes: tuple[Finish, ...]
-    texel: float
+    kind: int  # PLANE, BOX, SPHERE or CYLINDER
+    center: np.ndarray  # `[3]` center in the world
+    size: np.ndarray  # `[3]` full extents in meters
+    rotation: np.ndarray  # `[3, 3]` rotation from the solid to the world
+    taper: float  # growth of a cylinder's radius with local z, in (-1, 1)
+    finishes: tuple[Finish, ...]  # finish of each face
+    texel: float  # side of a baked light texel in meters
 
 
 class Rig(NamedTuple):
-    """The positions of the far cameras, and the subjects of close-ups.
+    """The positions of the far cameras, and the subjects of close-ups."""
 
-    Attributes:
-      target: (x, y, z) point that the far cameras look at.
-      distance: (lo, hi) meters between the cameras and the target.
-      azimuth: (lo, hi) degrees about z; 0 is straight in front, at -y.
-      elevation: (lo, hi) degrees above the horizon.
-      interests: (x, y, z, radius) balls that hold the subjects of close-ups.
-    """
-
-    target: tuple[float, float, float]
-    distance: tuple[float, float]
-    azimuth: tuple[float, float]
-    elevation: tuple[float, float]
+    target: tuple[float, float, float]  # (x, y, z) point that the far cameras look at
+    distance: tuple[float, float]  # (lo, hi) meters between the cameras and the target
+    azimuth: tuple[float, float]  # (lo, hi) degrees about z; 0 is straight in front, at -y
+    elevation: tuple[float, float]  # (lo, hi) degrees above the horizon
+    # (x, y, z, radius) balls that hold the subjects of close-ups
     interests: tuple[tuple[float, float, float, float], ...]
 
 

@@ -17,17 +17,12 @@ _CANDIDATES = 48
 
 
 class Closeups(NamedTuple):
-    """Close-up test views.
+    """Close-up test views."""
 
-    Attributes:
-      poses: `[V, 3, 4]` poses.
-      subjects: `[V, 3]` surface point that each view looks at.
-      magnification: `[V]` distance from the nearest training camera to the subject, over the
-        distance from the close-up to the subject.
-    """
-
-    poses: np.ndarray
-    subjects: np.ndarray
+    poses: np.ndarray  # `[V, 3, 4]` poses
+    subjects: np.ndarray  # `[V, 3]` surface point that each view looks at
+    # `[V]` distance from the nearest training camera to the subject, over the distance from the
+    # close-up to the subject
     magnification: np.ndarray
 
 

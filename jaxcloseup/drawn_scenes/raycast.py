@@ -25,39 +25,23 @@ FACES_OF = (1, 6, 1, 3)  # box: -x +x -y +y -z +z; cylinder: side, bottom, top
 
 
 class Solids(struct.PyTreeNode):
-    """Solids sorted by kind, followed by padding.
+    """Solids sorted by kind, followed by padding."""
 
-    Attributes:
-      to_local: `[N, 3, 4]` affine map from the world to the unit solid.
-      bound: `[N, 3, 4]` half axes (columns) and center of a bounding box, in the world.
-      taper: `[N]` growth of a cylinder's radius with local z, in (-1, 1).
-      kind: `[N]` int32 kind: PLANE, BOX, SPHERE or CYLINDER.
-      first_face: `[N]` int32 number of the solid's first face.
-      bounds: `[5]` int32; solids i of kind k satisfy bounds[k] <= i < bounds[k + 1].
-    """
-
-    to_local: jax.Array
-    bound: jax.Array
-    taper: jax.Array
-    kind: jax.Array
-    first_face: jax.Array
-    bounds: jax.Array
+    to_local: jax.Array  # `[N, 3, 4]` affine map from the world to the unit solid
+    bound: jax.Array  # `[N, 3, 4]` half axes (columns) and center of a bounding box, in the world
+    taper: jax.Array  # `[N]` growth of a cylinder's radius with local z, in (-1, 1)
+    kind: jax.Array  # `[N]` int32 kind: PLANE, BOX, SPHERE or CYLINDER
+    first_face: jax.Array  # `[N]` int32 number of the solid's first face
+    bounds: jax.Array  # `[5]` int32; solids i of kind k satisfy bounds[k] <= i < bounds[k + 1]
 
 
 class Hit(NamedTuple):
-    """The first crossing of a ray with a solid.
+    """The first crossing of a ray with a solid."""
 
-    Attributes:
-      depth: ray parameter (z-depth for camera rays); inf if the ray hits nothing.
-      normal: `[3]` unit world normal on the ray's side; 0 if the ray hits nothing.
-      face: int32 face number; 0 if the ray hits nothing.
-      chart: `[2]` position on the face, in [0, 1].
-    """
-
-    depth: jax.Array
-    normal: jax.Array
-    face: jax.Array
-    chart: jax.Array
+    depth: jax.Array  # ray parameter (z-depth for camera rays); inf if the ray hits nothing
+    normal: jax.Array  # `[3]` unit world normal on the ray's side; 0 if the ray hits nothing
+    face: jax.Array  # int32 face number; 0 if the ray hits nothing
+    chart: jax.Array  # `[2]` position on the face, in [0, 1]
 
 
 def make_solids(

@@ -29,50 +29,30 @@ _TILE = 24  # side in pixels of image tiles that share a list of solids
 
 
 class Faces(struct.PyTreeNode):
-    """The appearance of each face.
+    """The appearance of each face."""
 
-    Attributes:
-      texture: `[F]` int32 index of the color texture.
-      detail: `[F]` int32 index of the detail texture; twice its value multiplies the color.
-      uv: `[F, 2, 3]` affine map from the chart to texture repeats.
-      detail_uv: `[F, 2, 3]` the same map for the detail texture.
-      pitch: `[F, 2]` repeats per world unit of texture and detail.
-      tint: `[F, 3]` factor on the color.
-      gloss: `[F]` strength of the highlight.
-      emission: `[F]` 1 if the face shows its own color, unlit; else 0.
-      tile: `[F, 3]` int32 first entry, width and height of the face's tile of light.
-      wraps: `[F]` 1 if the tile is periodic in its first coordinate, else 0.
-    """
-
-    texture: jax.Array
+    texture: jax.Array  # `[F]` int32 index of the color texture
+    # `[F]` int32 index of the detail texture; twice its value multiplies the color
     detail: jax.Array
-    uv: jax.Array
-    detail_uv: jax.Array
-    pitch: jax.Array
-    tint: jax.Array
-    gloss: jax.Array
-    emission: jax.Array
-    tile: jax.Array
-    wraps: jax.Array
+    uv: jax.Array  # `[F, 2, 3]` affine map from the chart to texture repeats
+    detail_uv: jax.Array  # `[F, 2, 3]` the same map for the detail texture
+    pitch: jax.Array  # `[F, 2]` repeats per world unit of texture and detail
+    tint: jax.Array  # `[F, 3]` factor on the color
+    gloss: jax.Array  # `[F]` strength of the highlight
+    emission: jax.Array  # `[F]` 1 if the face shows its own color, unlit; else 0
+    tile: jax.Array  # `[F, 3]` int32 first entry, width and height of the face's tile of light
+    wraps: jax.Array  # `[F]` 1 if the tile is periodic in its first coordinate, else 0
 
 
 class World(struct.PyTreeNode):
-    """A scene ready for rendering.
+    """A scene ready for rendering."""
 
-    Attributes:
-      solids: shapes of the scene.
-      faces: appearance of their faces.
-      texels: `[K, M]` uint32 packed RGB, the pyramids of K periodic textures.
-      light: `[L, 4]` baked RGB light in the encoding of images, and the visible fraction of the
-        first lamp.
-      lamp: `[3]` position of the first lamp, which makes the highlights.
-    """
-
-    solids: Solids
-    faces: Faces
-    texels: jax.Array
+    solids: Solids  # shapes of the scene
+    faces: Faces  # appearance of their faces
+    texels: jax.Array  # `[K, M]` uint32 packed RGB, the pyramids of K periodic textures
+    # `[L, 4]` baked RGB light in the encoding of images, and the visible fraction of the first lamp
     light: jax.Array
-    lamp: jax.Array
+    lamp: jax.Array  # `[3]` position of the first lamp, which makes the highlights
 
 
 def pack_pyramid(image: np.ndarray) -> np.ndarray:
