@@ -111,6 +111,7 @@ class Camera(struct.PyTreeNode):
           width: image width in pixels.
           vertical: whether `fov` is the angle between the top and bottom edges instead.
         """
+        chex.assert_rank(_floats(camtoworld), 2)
         focal = (height if vertical else width) / (2 * jnp.tan(_floats(fov) / 2))
         center = jnp.array([width / 2, height / 2], focal.dtype)
         intrinsics = jnp.concatenate([jnp.stack([focal, focal]), center])

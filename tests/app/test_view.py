@@ -77,9 +77,9 @@ def serve(viser):
 def test_a_closeup_is_chosen_and_rendered_in_a_browser(serve, kept, monkeypatch):
     told = []
 
-    def darker(programs, start, cameras, find, *, tell):
+    def darker(programs, start, cameras, find, *, report):
         state = start.state
-        tell(3, 10)
+        report(3, 10)
         told.extend(visitor._status.content for visitor in serve.visitors.values())
         assert start.sources.depths.shape == programs.scene.train.weight.shape
         assert cameras.intrinsics.shape == (1, 4)
