@@ -4,6 +4,7 @@ So `import jaxcloseup` is cheap, and configurations can be read without importin
 """
 
 import importlib
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -23,7 +24,9 @@ def lazy_names(
     def load(name: str) -> Any:
         if name not in module_of:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(importlib.import_module(f"{package}.{module_of[name]}"), name)
+        value = getattr(importlib.import_module(f"{package}.{module_of[name]}"), name)
+        setattr(sys.modules[package], name, value)  # so it is looked up here only once
+        return value
 
     return sorted(module_of), load, lambda: sorted(module_of)
 
