@@ -13,9 +13,10 @@ from absl import flags
 
 from jaxcloseup.app.cli import main as command
 from jaxcloseup.app.cli.start import start
-from jaxcloseup.app.cli.topics import flags_by_topic
+from jaxcloseup.app.cli.topics import describe_flag, flags_by_topic
 from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.methods.settings import settings_of
+from jaxcloseup.app.report.record_table import Table, markdown
 
 
 DOCUMENT = pathlib.Path(__file__).parents[2] / "docs" / "programs.md"
@@ -25,20 +26,20 @@ _CHECK = flags.DEFINE_bool("check", False, "fail if the document's tables are no
 
 def tables() -> dict[str, str]:
     """Return each table in Markdown by the name that stands in its comment."""
-    rows = [f"| `{name}` | {what} |" for name, what in command.PROGRAMS.items()]
+    rows = [(f"`{name}`", what) for name, what in command.PROGRAMS.items()]
     found = {"programs": _table("program", rows)}
     described: set[str] = set()
     for name in command.PROGRAMS:
         module = importlib.import_module(f"jaxcloseup.app.cli.{name}")
         found[f"flags {name}"] = _flag_table(module, described)
     rows = [
-        f"| `{name}` | {method.help}; presets {', '.join(f'`{one}`' for one in method.presets)} |"
+        (f"`{name}`", f"{method.help}; presets {', '.join(f'`{one}`' for one in method.presets)}")
         for name, method in METHODS.items()
     ]
     found["methods"] = _table("method", rows)
     settings = settings_of(METHODS["surfels"].presets["quick"]).values()
     rows = [
-        f"| `{setting.name}` | {setting.limits.help} |"
+        (f"`{setting.name}`", setting.limits.help)
         for setting in settings
         if setting.path[0] in ("labels", "targets")
     ]
@@ -55,16 +56,16 @@ def _flag_table(program: types.ModuleType, described: set[str]) -> str:
                 again.append(f"`--{flag.name}`")
                 continue
             described.add(flag.name)
-            text = re.sub(r"^<.*?>: |;\s+repeat this option .*", "", flag.help).replace("|", "\\|")
+            text = describe_flag(flag).replace("|", "\\|")
             text = text.split(": ")[0] + ", see below" if flag.name in _TOLD_BELOW else text
             shown = f"`--[no]{flag.name}`" if flag.boolean else f"`--{flag.name}`"
-            rows.append(f"| {shown} | {' '.join(text.split())} |")
+            rows.append((shown, " ".join(text.split())))
     table = _table("flag", rows)
     return f"{table}\nand, as above, {', '.join(again)}\n" if again else table
 
 
-def _table(title: str, rows: list[str]) -> str:
-    return "\n".join([f"| {title} | |", "|---|---|", *rows]) + "\n"
+def _table(title: str, rows: list[tuple[str, str]]) -> str:
+    return markdown(Table(title, [title, ""], rows))
 
 
 def main(_: list[str]) -> None:

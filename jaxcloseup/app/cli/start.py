@@ -14,7 +14,7 @@ from absl import app, flags
 
 from jaxcloseup.app import progress
 from jaxcloseup.app.cli.invocation import program_name
-from jaxcloseup.app.cli.topics import flags_by_topic
+from jaxcloseup.app.cli.topics import describe_flag, flags_by_topic
 from jaxcloseup.io.files import cache_folder
 from jaxcloseup.io.memory import reuse_freed_memory
 from jaxcloseup.io.messages import describe_option
@@ -116,7 +116,7 @@ def _describe_flag(flag: flags.Flag) -> str:
     else:
         values = flag.default if isinstance(flag.default, list) else [flag.default]
         shown = f"--{flag.name}=" + ",".join("..." if v is None else str(v) for v in values)
-    text = re.sub(r"^<.*?>: |;\s+repeat this option .*", "", flag.help)  # as absl says it
+    text = describe_flag(flag)
     choices = getattr(flag.parser, "enum_values", ())
     if not all(choice in text for choice in choices):
         text += f"; one of {', '.join(choices)}"

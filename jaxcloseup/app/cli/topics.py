@@ -2,6 +2,7 @@
 
 import contextlib
 import itertools
+import re
 from collections.abc import Iterable, Iterator
 
 from absl import flags
@@ -25,6 +26,11 @@ def share(*groups: list[str]) -> None:
     """Show flags of other modules in the `--help` of the module that calls this."""
     for name in itertools.chain(*groups):
         flags.declare_key_flag(name)
+
+
+def describe_flag(flag: flags.Flag) -> str:
+    """Return what a flag does, without what absl adds to its help."""
+    return re.sub(r"^<.*?>: |;\s+repeat this option .*", "", flag.help)
 
 
 def flags_by_topic(shown: Iterable[flags.Flag]) -> dict[str, list[flags.Flag]]:
