@@ -4,15 +4,20 @@ from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 from jaxcloseup.app.report.record_table import Table, print_tables
-from jaxcloseup.app.score.metrics_text import COLUMNS, FINER, SPLIT_TITLES, format_metric
+from jaxcloseup.app.score.metrics_text import (
+    COLUMNS,
+    DEPTH_ERRORS,
+    FINER,
+    SPLIT_TITLES,
+    format_metric,
+)
 
 
 Splits = Mapping[str, Mapping[str, Any]]  # metrics by split
 
-_DEPTH = ("depth_error_median", "point_depth_error_median")
 # Perceptual distances where their networks are available, else PSNR of corrected colors.
 _LAST = ("lpips_vgg", "lpips_alex", "cc_psnr")
-_SHORT = {"cc_psnr": "color-corrected"} | dict.fromkeys(_DEPTH, "depth off by")
+_SHORT = {"cc_psnr": "color-corrected"} | dict.fromkeys(DEPTH_ERRORS, "depth off by")
 
 
 def best_stage(stages: Iterable[str]) -> str:
@@ -112,7 +117,7 @@ def score_tables(
         if finer_size and _known(finer.values(), ["psnr"]):
             columns.append((f"at {finer_size[0]} x {finer_size[1]}", "psnr", finer))
         columns.append((COLUMNS["ssim"], "ssim", scores))
-        for keys in (_LAST, _DEPTH):
+        for keys in (_LAST, DEPTH_ERRORS):
             known = _known(scores.values(), keys)[:1]
             columns += [(_SHORT.get(key, COLUMNS[key]), key, scores) for key in known]
         body = [
@@ -149,6 +154,6 @@ def _known(scores: Collection[Mapping[str, Any]], keys: Iterable[str]) -> list[s
 
 
 def _cell(key: str, value: float | None) -> str:
-    if key in _DEPTH and value is not None:
+    if key in DEPTH_ERRORS and value is not None:
         return f"{value:.2%}"
     return format_metric(key, value)

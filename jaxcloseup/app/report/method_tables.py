@@ -9,13 +9,12 @@ import numpy as np
 from jaxcloseup.app.report.record_table import Table, format_number, markdown
 from jaxcloseup.app.run.manifest import NAME as MANIFEST
 from jaxcloseup.app.score.ladder import PREFIX, rungs_of
-from jaxcloseup.app.score.metrics_text import SPLIT_TITLES
+from jaxcloseup.app.score.metrics_text import DEPTH_ERRORS, SPLIT_TITLES
 from jaxcloseup.io.files import read_object, write_file, write_json
 
 
 Record = Mapping[str, Any]  # of a method on a scene, as `read_method` returns it
 
-_DEPTHS = ("depth_error_median", "point_depth_error_median")  # exact, or at a capture's points
 _SPLITS = ("test", "test_far")
 
 
@@ -29,14 +28,15 @@ def read_method(folder: pathlib.Path) -> dict[str, Any]:
     ((_, scores),) = read_object(folder / "sweep.json")["scenes"].items()
     arms: dict[str, dict[str, Any]] = {}
     for arm, seeds in scores.items():
-        runs = [result["splits"] for result in seeds.values()]
-        arms[arm] = {
-            split: {
-                "psnr": _mean([splits[split]["psnr"] for splits in runs]),
-                "depth": _mean([_depth(splits[split]) for splits in runs]),
-            }
-            for split in (runs[0] if runs else ())
-        }
+        arms[arm] = _mean_scores(
+            [
+                {
+                    split: {"psnr": scored["psnr"], "depth": _depth(scored)}
+                    for split, scored in result["splits"].items()
+                }
+                for result in seeds.values()
+            ]
+        )
     manifest = read_object(folder / MANIFEST)
     cost = {name: manifest.get(name) for name in ("core_seconds", "peak_bytes")}
     return {"arms": arms, **cost}
@@ -115,7 +115,7 @@ def _get(record: Record, arm: str, split: str, metric: str) -> float | None:
 
 
 def _depth(scores: Mapping[str, float | None]) -> float | None:
-    return next((scores[name] for name in _DEPTHS if scores.get(name) is not None), None)
+    return next((scores[name] for name in DEPTH_ERRORS if scores.get(name) is not None), None)
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
@@ -123,18 +123,21 @@ def _mean(values: Sequence[float | None]) -> float | None:
     return float(np.mean(known)) if known else None
 
 
+def _mean_scores(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the mean PSNR and depth error of every split that all runs have."""
+    shared = [split for split in (runs[0] if runs else ()) if all(split in run for run in runs)]
+    return {
+        split: {key: _mean([run[split][key] for run in runs]) for key in ("psnr", "depth")}
+        for split in shared
+    }
+
+
 def _mean_of(records: Sequence[Record]) -> dict[str, Any]:
     """Return means over scenes of everything that all scenes have, and the largest memory."""
-    arms: dict[str, dict[str, Any]] = {}
-    for arm in records[0]["arms"]:
-        runs = [record["arms"].get(arm, {}) for record in records]
-        arms[arm] = {
-            split: {
-                key: _mean([splits[split][key] for splits in runs]) for key in ("psnr", "depth")
-            }
-            for split in runs[0]
-            if all(split in splits for splits in runs)
-        }
+    arms = {
+        arm: _mean_scores([record["arms"].get(arm, {}) for record in records])
+        for arm in records[0]["arms"]
+    }
     peaks = [record["peak_bytes"] for record in records if record["peak_bytes"] is not None]
     seconds = _mean([record["core_seconds"] for record in records])
     return {"arms": arms, "core_seconds": seconds, "peak_bytes": max(peaks, default=None)}

@@ -27,12 +27,14 @@ COLUMNS = {
     "point_depth_error_median": "median depth error at the capture's points (relative)",
     "point_depth_error_p90": "90th percentile depth error at the capture's points (relative)",
 }
+# Median errors of depth: against the exact surface, or at the points of a capture.
+DEPTH_ERRORS = ("depth_error_median", "point_depth_error_median")
 
 
 def describe_split(split: Mapping[str, Any]) -> str:
     """Return a split's PSNR and median relative depth error as one line."""
     text = f"PSNR {format_metric('psnr', split['psnr'])} dB"
-    for key in ("depth_error_median", "point_depth_error_median"):
+    for key in DEPTH_ERRORS:
         if split.get(key) is not None:
             text += f", depth off by {split[key]:.2%}"
     return text
