@@ -7,8 +7,8 @@ from jaxcloseup.setting import setting
 
 
 @dataclasses.dataclass(frozen=True)
-class NerfConfig:
-    """The network and its sampling; the defaults are the original's."""
+class _TrunkConfig:
+    """The network that NeRF and mip-NeRF share."""
 
     depth: int = setting(8, "layers of the trunk", low=1, high=64)
     width: int = setting(256, "width of the trunk's layers", low=1)
@@ -20,6 +20,12 @@ class NerfConfig:
         4, "octaves of the positional encoding of view directions", high=64
     )
     direction_width: int = setting(128, "width of the layer that sees the view direction", low=1)
+
+
+@dataclasses.dataclass(frozen=True)
+class NerfConfig(_TrunkConfig):
+    """The network and its sampling; the defaults are the original's."""
+
     num_coarse: int = setting(64, "stratified samples per ray of the coarse network", low=1)
     num_fine: int = setting(
         64, "importance samples per ray; the fine network sees these and the coarse ones", low=1
@@ -37,19 +43,10 @@ class NerfConfig:
 
 
 @dataclasses.dataclass(frozen=True)
-class MipNerfConfig:
+class MipNerfConfig(_TrunkConfig):
     """The network and its samples; the defaults are the paper's."""
 
-    depth: int = setting(8, "layers of the trunk", low=1, high=64)
-    width: int = setting(256, "width of the trunk's layers", low=1)
-    skip_after: int = setting(
-        4, "index of the trunk's layer after which the encoded position enters again"
-    )
     position_octaves: int = setting(16, "octaves of the integrated positional encoding", high=64)
-    direction_octaves: int = setting(
-        4, "octaves of the positional encoding of view directions", high=64
-    )
-    direction_width: int = setting(128, "width of the layer that sees the view direction", low=1)
     num_coarse: int = setting(128, "intervals per ray of the coarse pass", low=1)
     num_fine: int = setting(128, "intervals per ray of the fine pass", low=1)
     coarse_weight: float = setting(0.1, "weight of the coarse colors in the loss")
