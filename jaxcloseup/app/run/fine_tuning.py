@@ -12,7 +12,7 @@ from jaxcloseup.app import progress
 from jaxcloseup.app.run.gate import gated, uses_labels, weigh
 from jaxcloseup.app.run.kept_detail import GetDetail, refresh_detail
 from jaxcloseup.app.run.labels import LabelStart, label_target_views, rendered_depths
-from jaxcloseup.app.run.loop import TrainingError
+from jaxcloseup.app.run.loop import TrainingError, describe_means
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.step_data import LabeledData
 from jaxcloseup.detail.add import Detail
@@ -166,6 +166,5 @@ def fine_tune(
             progress.count("fine-tuning", done, steps)
     if skipped == steps:
         raise TrainingError(f"loss or gradient was not finite in each of {steps} steps for them")
-    numbers = {key: value for key, value in metrics.items() if isinstance(value, float)}
-    print("  ".join(f"{key} {value:.4g}" for key, value in numbers.items()))
+    print("  ".join(describe_means(metrics)))
     return state

@@ -79,9 +79,12 @@ def train_stage(
 
 def report_steps(stage: str, done: int, steps: int, metrics: dict[str, Any]) -> None:
     """Print how far a stage is, and the means of its newest steps."""
-    numbers = {key: value for key, value in metrics.items() if isinstance(value, float)}
-    shown = (f"{key} {value:.4g}" for key, value in numbers.items())
-    print("  ".join([progress.count(stage, done, steps), *shown]), flush=True)
+    print("  ".join([progress.count(stage, done, steps), *describe_means(metrics)]), flush=True)
+
+
+def describe_means(metrics: dict[str, Any]) -> list[str]:
+    """Format the means among the metrics of steps; counts are left out."""
+    return [f"{key} {value:.4g}" for key, value in metrics.items() if isinstance(value, float)]
 
 
 def _resume(
