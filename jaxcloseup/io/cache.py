@@ -97,12 +97,13 @@ def load(path: str | pathlib.Path, key: str, *, most: int = LARGEST) -> Stored |
       Exception: the file is damaged, foreign, or has more than `most` bytes.
     """
     try:
-        content = memoryview(read_bytes(path, most=most))
+        data = read_bytes(path, most=most)
     except (FileNotFoundError, NotADirectoryError):
         return None
-    if hashlib.sha256(content[_DIGEST:]).digest() != content[:_DIGEST]:
+    if hashlib.sha256(memoryview(data)[_DIGEST:]).digest() != data[:_DIGEST]:
         raise ValueError("the hash of the file is another one")
-    with zipfile.ZipFile(io.BytesIO(content[_DIGEST:])) as archive:
+    # An archive may stand behind other bytes, so the file is not copied without the hash.
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
         if sum(entry.file_size for entry in archive.infolist()) > most:
             raise ValueError(f"unpacked, the file has more than {most} bytes")
         about = json.loads(archive.read(_ABOUT))
