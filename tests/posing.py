@@ -10,8 +10,7 @@ from absl.testing import flagsaver
 
 from jaxcloseup.app.cli import process as program
 from jaxcloseup.captures.load import load_scene
-from jaxcloseup.drawn_scenes import assembly, planning
-from jaxcloseup.drawn_scenes import drawn as loading
+from jaxcloseup.drawn_scenes import assembly, drawn, planning
 from jaxcloseup.drawn_scenes.builtin import SCENES
 from jaxcloseup.photos.views import camera_at
 
@@ -24,10 +23,10 @@ FOCAL_IN_EXIF = 31  # in mm of a frame 36 mm x 24 mm
 def photograph(name, poses):
     """Render photographs `[V, H, W, 3]` of a drawn scene in flat light, which needs no baking."""
     world = assembly.build_world(SCENES[name](), lambda *scene: np.ones((len(scene[3]), 4)))
-    cameras = loading._cameras(poses, WIDTH, HEIGHT)
+    cameras = drawn._cameras(poses, WIDTH, HEIGHT)
     with jax.numpy_dtype_promotion("standard"):
         rgb = [
-            np.asarray(loading._render_rgb(world, camera_at(cameras, i), samples=2))
+            np.asarray(drawn._render_rgb(world, camera_at(cameras, i), samples=2))
             for i in range(len(poses))
         ]
     return np.rint(np.stack(rgb) * 255).astype(np.uint8)

@@ -29,7 +29,7 @@ from jaxcloseup.app.run.labels import start_labels
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.states import initial_points
 from jaxcloseup.app.run.step_data import CloseupData, TrainData
-from jaxcloseup.app.sweep import arm_training as sweep_stages
+from jaxcloseup.app.sweep import arm_training
 from jaxcloseup.app.sweep.arm_training import join_arms, run_sweep
 from jaxcloseup.app.sweep.named_arms import make_arm
 from jaxcloseup.captures.load import load_scene
@@ -123,7 +123,7 @@ def sweep_tiny(scene, folder, arms=("baseline", "control", "diverse", "test_time
 def test_a_sweep_cut_off_and_resumed_ends_the_same(capture_folder, tmp_path, monkeypatch, capsys):
     scene = load_scene(str(capture_folder))
     programs = Programs(TINY_STEPS, scene)  # compiled once for both
-    monkeypatch.setattr(sweep_stages, "Programs", lambda preset, scene: programs)
+    monkeypatch.setattr(arm_training, "Programs", lambda preset, scene: programs)
     render, rendered_by = programs.render, set()
 
     def render_and_note(state, *camera):

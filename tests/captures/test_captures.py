@@ -18,7 +18,7 @@ from tiny_capture import (
     write_ply,
 )
 
-from jaxcloseup.captures import load as scenes
+from jaxcloseup.captures import load as load_module
 from jaxcloseup.captures.load import SceneError, load_scene
 from jaxcloseup.photos.scene import (
     DuplicateFileWarning,
@@ -293,12 +293,12 @@ def test_missing_near_far_is_estimated(capture, given):
 
 
 def test_names_of_built_in_scenes(monkeypatch, tmp_path, capture):
-    monkeypatch.setattr(scenes, "DRAWN_SCENES", ("table", "room"))
+    monkeypatch.setattr(load_module, "DRAWN_SCENES", ("table", "room"))
 
     def drawn(name, *, downscale):
         return types.SimpleNamespace(name=name, downscale=downscale, train=range(3))
 
-    monkeypatch.setattr(scenes, "draw_scene", drawn)
+    monkeypatch.setattr(load_module, "draw_scene", drawn)
     scene = load_scene("table", downscale=2)
     assert (scene.name, scene.downscale) == ("table", 2)
     with pytest.raises(SceneError, match=r"tabel is neither .* choose one of table, room"):

@@ -19,7 +19,7 @@ from tiny_capture import (
     write_model,
 )
 
-from jaxcloseup.captures import folder as loading
+from jaxcloseup.captures import folder as folder_module
 from jaxcloseup.captures.load import SceneError, load_scene
 
 
@@ -156,7 +156,9 @@ def test_pycolmap_is_not_installed(tmp_path, monkeypatch):
 
 def test_plush_loads_three_ways(shared, monkeypatch):
     none = np.zeros((0, 3), np.float32)
-    monkeypatch.setattr(loading, "triangulate", lambda *_: (none, none, none))  # would take seconds
+    monkeypatch.setattr(
+        folder_module, "triangulate", lambda *_: (none, none, none)
+    )  # would take seconds
     folder = shared / "data" / "plush_raw"
     binary = load_scene(folder, format="colmap")
     text = load_scene(folder / "sparse_text")
@@ -210,7 +212,7 @@ def test_closest_of_plush_are_nearer(shared, tmp_path, monkeypatch):
     assert len(ratios) == 10 and min(ratios) > 1.5
     assert "test is the 10 nearest of 97 photographs, 1.9" in scene.metadata["notes"][1]
     # transforms.json lists no points, but the photographs' features give some.
-    monkeypatch.setattr(loading, "_MEASURED_SIDE", 320)
+    monkeypatch.setattr(folder_module, "_MEASURED_SIDE", 320)
     with pytest.warns(UserWarning, match="from the points"):
         by_features = load_scene(folder, split="closest", downscale=4)
     assert re.search(r"97 photographs by \d+ points triangulated", by_features.metadata["notes"][1])

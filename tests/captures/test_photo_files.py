@@ -9,7 +9,7 @@ import PIL.Image
 import pytest
 from tiny_capture import HEIGHT, WIDTH, write_image
 
-from jaxcloseup.captures import photo_files as images
+from jaxcloseup.captures import photo_files
 from jaxcloseup.captures.load import SceneError
 from jaxcloseup.captures.photo_files import read_image
 
@@ -88,7 +88,7 @@ def test_small_files_of_many_pixels_are_refused_before_they_are_decoded(tmp_path
 
     with monkeypatch.context() as patch:
         patch.setattr(cv2, "imdecode", refuse)
-        patch.setattr(images, "MOST_PIXELS", WIDTH * HEIGHT - 1)
+        patch.setattr(photo_files, "MOST_PIXELS", WIDTH * HEIGHT - 1)
         for suffix in (".png", ".jpg", ".bmp", ".tiff", ".webp"):
             write_image(tmp_path / f"a{suffix}")
             with pytest.raises(SceneError, match="megapixels and is too large to decode"):

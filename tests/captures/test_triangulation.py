@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from tiny_capture import write_image, write_json
 
-from jaxcloseup.captures import folder as loading
+from jaxcloseup.captures import folder as folder_module
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.captures.triangulation import triangulate
 from jaxcloseup.photos.scene import DuplicateFileWarning
@@ -93,7 +93,7 @@ def test_a_capture_without_points_gets_triangulated_ones(tmp_path, views):
 
 def test_too_few_points_are_dropped(tmp_path, views, monkeypatch):
     few = np.ones((99, 3), np.float32)
-    monkeypatch.setattr(loading, "triangulate", lambda *_: (few, few, few))
+    monkeypatch.setattr(folder_module, "triangulate", lambda *_: (few, few, few))
     write_image(tmp_path / "a.png", views[0][0])
     pose = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist(), "fl_x": FOCAL}
     with pytest.warns(DuplicateFileWarning):

@@ -11,8 +11,7 @@ import pytest
 from tiny_runs import KEPT
 
 from jaxcloseup.app.methods.method import TargetConfig
-from jaxcloseup.app.run import fine_tuning, gate
-from jaxcloseup.app.run import kept_detail as training_detail
+from jaxcloseup.app.run import fine_tuning, gate, kept_detail
 from jaxcloseup.app.run.fine_tuning import fine_tune, tuned_detail
 from jaxcloseup.app.run.kept_detail import detail_getter, detail_path, detailed, find_detail
 from jaxcloseup.app.run.keys import run_keys
@@ -203,7 +202,7 @@ def test_target_views_may_be_labeled_by_their_detail(rendered, found, monkeypatc
     gated = dataclasses.replace(programs.preset, gated=True, targets=targets)
     monkeypatch.setattr(programs, "preset", gated)
     monkeypatch.setattr(gate, "weigh_labels", lambda *_: pytest.fail("asked the gate"))
-    monkeypatch.setattr(training_detail, "make_detail", lambda *_: pytest.fail("made again"))
+    monkeypatch.setattr(kept_detail, "make_detail", lambda *_: pytest.fail("made again"))
     views, start = programs.scene.test, start_labels(programs, state, run_keys(0))
     find = detail_getter(programs, state, path)
     labels = label_target_views(programs, start, views.cameras, by_detail, None, find)
@@ -275,13 +274,13 @@ def test_a_tuned_state_has_the_detail_of_photographs_that_see_the_view(rendered,
 
 def test_detail_is_kept_with_its_state_and_made_again_for_another(rendered, found, monkeypatch):
     programs, state, path = rendered
-    monkeypatch.setattr(training_detail, "make_detail", lambda *_: pytest.fail("made again"))
+    monkeypatch.setattr(kept_detail, "make_detail", lambda *_: pytest.fail("made again"))
     again, about = find_detail(programs, state, path)
     assert about == found[1]
     jax.tree.map(np.testing.assert_array_equal, again, found[0])
 
     made = []
-    monkeypatch.setattr(training_detail, "make_detail", lambda *_: made.append(1) or found)
+    monkeypatch.setattr(kept_detail, "make_detail", lambda *_: made.append(1) or found)
     other = state.replace(params=state.params.replace(sh=0.9 * state.params.sh))
     find_detail(programs, other, path)
     find_detail(programs, other, path)
@@ -295,11 +294,11 @@ def test_damaged_detail_is_made_again(rendered, found, monkeypatch, capsys):
     programs, state, path = rendered
     path.unlink()
     made = []
-    monkeypatch.setattr(training_detail, "make_detail", lambda *_: made.append(1) or found)
+    monkeypatch.setattr(kept_detail, "make_detail", lambda *_: made.append(1) or found)
     find_detail(programs, state, path)
     whole = path.read_bytes()
     assert "damaged" not in capsys.readouterr().out
-    key = training_detail._hash(programs, state)
+    key = kept_detail._hash(programs, state)
     arrays, about = load(path, key)
 
     def changed(about=about, **changes):

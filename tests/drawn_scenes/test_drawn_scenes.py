@@ -9,8 +9,7 @@ import pytest
 import reference
 
 from jaxcloseup.captures.load import load_scene
-from jaxcloseup.drawn_scenes import assembly, planning
-from jaxcloseup.drawn_scenes import drawn as loading
+from jaxcloseup.drawn_scenes import assembly, drawn, planning
 from jaxcloseup.drawn_scenes.builtin import SCENES
 from jaxcloseup.drawn_scenes.raycast import cast_rays
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points, points_to_pixels
@@ -27,14 +26,14 @@ def cache(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         root = tmp_path_factory.mktemp("cache")
         patch.setenv("XDG_CACHE_HOME", str(root))
-        loading._world.cache_clear()
+        drawn._world.cache_clear()
         yield root / "jaxcloseup"
-        loading._world.cache_clear()
+        drawn._world.cache_clear()
 
 
 @pytest.fixture(scope="module")
 def scene(cache):
-    return loading.draw_scene("counter", downscale=DOWNSCALE)
+    return drawn.draw_scene("counter", downscale=DOWNSCALE)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +42,7 @@ def truth(scene):
     return [(i, scene.surface(camera_at(scene.train.cameras, i))) for i in range(0, 60, 3)]
 
 
-@pytest.mark.parametrize("name", loading.DRAWN_SCENES)
+@pytest.mark.parametrize("name", drawn.DRAWN_SCENES)
 def test_cameras(name, monkeypatch):
     """Cameras stand in free space; close-ups are near, rotated and seen by training views."""
     monkeypatch.setattr(assembly, "draw_texture", lambda name: np.zeros((1024, 1024, 3)))
@@ -150,7 +149,7 @@ def test_two_views_agree(scene, truth):
 
 def test_points_lie_on_the_surface_with_its_color(scene, truth):
     assert 4500 < len(scene.points) <= 5100
-    solids, seen = loading._world("counter").solids, np.zeros(len(scene.points), bool)
+    solids, seen = drawn._world("counter").solids, np.zeros(len(scene.points), bool)
     for i, surface in truth:
         camera = camera_at(scene.train.cameras, i)
         pixels, depths = reference.project(camera.camtoworld, camera.intrinsics, scene.points)
@@ -213,17 +212,17 @@ def test_the_cache_is_used_and_survives_damage(scene, cache, monkeypatch):
         raise AssertionError("rendered again")
 
     with monkeypatch.context() as patch:
-        patch.setattr(loading, "_capture", must_not_run)
-        again = loading.draw_scene("counter", downscale=DOWNSCALE)
+        patch.setattr(drawn, "_capture", must_not_run)
+        again = drawn.draw_scene("counter", downscale=DOWNSCALE)
     jax.tree.map(np.testing.assert_array_equal, again.train, scene.train)
 
     # Redrawing gives identical bits: textures, light, cameras, photographs and points.
     stored[0].write_bytes(stored[0].read_bytes()[:1000])
     for light in cache.glob("counter-light-*.npz"):
         light.write_text("not an archive")
-    loading._world.cache_clear()
+    drawn._world.cache_clear()
     with pytest.warns(UserWarning, match="is damaged"):
-        rebuilt = loading.draw_scene("counter", downscale=DOWNSCALE)
+        rebuilt = drawn.draw_scene("counter", downscale=DOWNSCALE)
     for split in ("train", "test", "test_far"):
         jax.tree.map(np.testing.assert_array_equal, getattr(rebuilt, split), getattr(scene, split))
     np.testing.assert_array_equal(rebuilt.points, scene.points)
@@ -235,34 +234,34 @@ def test_an_unwritable_cache_only_warns(tmp_path, monkeypatch):
     blocked.write_text("in the way")
     monkeypatch.setenv("XDG_CACHE_HOME", str(blocked))
     with pytest.warns(UserWarning, match="made again next time: .* cannot be written"):
-        made = loading._cached("anything", lambda: {"value": np.arange(3)})
+        made = drawn._cached("anything", lambda: {"value": np.arange(3)})
     np.testing.assert_array_equal(made["value"], [0, 1, 2])
 
 
 def test_sizes_round_up_and_focal_lengths_follow():
-    camera = loading._cameras(np.zeros((1, 3, 4)), 120, 68)
+    camera = drawn._cameras(np.zeros((1, 3, 4)), 120, 68)
     assert (camera.height, camera.width) == (68, 120)
     np.testing.assert_allclose(camera.intrinsics[0], [100, 800 * 68 / 540, 60, 34], rtol=1e-6)
 
 
 def test_bad_requests():
     with pytest.raises(ValueError, match="no built-in scene 'cellar': choose one of counter"):
-        loading.draw_scene("cellar")
+        drawn.draw_scene("cellar")
     with pytest.raises(ValueError, match="positive integer"):
-        loading.draw_scene("counter", downscale=0)
+        drawn.draw_scene("counter", downscale=0)
 
 
 def test_a_new_camera_reuses_the_compiled_render(scene):
     """Each image size compiles once, for any camera."""
-    before = loading._render_surface._cache_size()
+    before = drawn._render_surface._cache_size()
     camera = camera_at(scene.test.cameras, 0)
     moved = Camera(camera.camtoworld + 0.01, camera.intrinsics, 27, 48)
     scene.surface(moved)
-    assert loading._render_surface._cache_size() == before
+    assert drawn._render_surface._cache_size() == before
 
 
 def test_a_surface_first_rendered_inside_a_trace_serves_later_traces(scene):
-    loading._world.cache_clear()
+    drawn._world.cache_clear()
     camera = camera_at(scene.test.cameras, 0)
     for _ in range(2):
         jax.jit(lambda camera: scene.surface(camera).depth).lower(camera)
