@@ -141,7 +141,7 @@ class Camera(struct.PyTreeNode):
         """
         position, target, up = map(_floats, (position, target, up))
         forward = _unit(target - position)
-        # Of the world's axes, the one most across the view stands in for a parallel `up`.
+        # The world axis that is most across the view stands in for a parallel `up`.
         across = jnp.eye(3, dtype=forward.dtype)[jnp.argmin(jnp.abs(forward))]
         right = jnp.cross(forward, _unit(up))
         right = jnp.where(safe_norm(right) < 1e-6, jnp.cross(forward, across), right)

@@ -75,7 +75,7 @@ def reaches(
         least = [a + step * b for a, b in zip(start, along, strict=True)]
         return ~convex | (form(least, least) <= 0)
 
-    # Of the two pairs of edges, those through the tile's nearest point to the anchor.
+    # Only the two edges through the tile's nearest point to the anchor are tested.
     disc = meets(x, low[:, 1], 1) | meets(low[:, 0], y, 0)
     low_pass = column(LOW_PASS) * (x * x + y * y) <= cutoff * cutoff
     return disc | low_pass | (column(INVERSE_DEPTH + 1) * near >= 1 / _WIDER)
