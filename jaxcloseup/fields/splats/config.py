@@ -7,7 +7,7 @@ from typing import ClassVar
 from jaxcloseup.setting import setting
 
 
-COMPOSITORS = ("auto", "loops", "kernel")
+COMPOSITORS = ("auto", "native", "loops", "kernel")
 PLATFORMS = ("cpu", "gpu", "tpu")
 
 
@@ -84,8 +84,9 @@ class RasterizeConfig:
     )
     compositor: str = setting(
         "auto",
-        "loops blends by `jax.lax`, in chunks and blocks; kernel by Pallas kernels, which only "
-        "GPUs run fast; auto by kernels on a GPU that runs them, else by loops",
+        "native blends by the native library, on CPUs and where it was built, in lists of any "
+        "length; loops by `jax.lax`, in chunks and blocks; kernel by Pallas kernels, which only "
+        "GPUs run fast; auto by the fastest that runs",
         choices=COMPOSITORS,
     )
     platform: str | None = setting(

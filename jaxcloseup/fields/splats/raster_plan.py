@@ -15,6 +15,7 @@ from jaxcloseup.fields.splats import blend_pallas
 from jaxcloseup.fields.splats.config import RasterizeConfig, RasterPlan
 from jaxcloseup.fields.splats.layout import PAYLOAD
 from jaxcloseup.fields.splats.tiling import TileLists
+from jaxcloseup.native import library
 
 
 _SMALL = 2**17  # pixels of an image that is best cut into small tiles
@@ -49,8 +50,14 @@ def plan_raster(config: RasterizeConfig, *, height: int, width: int) -> RasterPl
 
 def _compositor(name: str, platform: str, tile: int) -> str:
     """Return the name of a compositor, where "auto" is the fastest that runs on a platform."""
+    if name == "native" and not library.available():
+        raise ValueError(
+            f'compositor "native" cannot run: {library.missing()}; {library.INSTALL}, or use "auto"'
+        )
     if name != "auto":
         return name
+    if platform == "cpu" and library.available():
+        return "native"
     return "kernel" if platform == "gpu" and kernels_compile(tile) else "loops"
 
 

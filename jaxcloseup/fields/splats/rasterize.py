@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxcloseup.fields.splats import blend_native
 from jaxcloseup.fields.splats.blending import blend_tiles
 from jaxcloseup.fields.splats.config import RasterizeConfig
 from jaxcloseup.fields.splats.layout import MOMENTS
@@ -65,32 +66,39 @@ def blend(
     """
     plan = plan_raster(config, height=height, width=width)
     # Which splats a tile lists has no derivative: outside of their lists they draw nothing.
-    kept = lax.stop_gradient(table)
+    shape = lax.stop_gradient(box), lax.stop_gradient(order)
+    if plan.compositor == "native" and blend_native.can_blend(table):
+        sums, median = blend_native.blend_image(plan, height, width, table, *shape)
+        return _image_of(sums, median, jnp.zeros((), jnp.int32))
     lists = tile_lists(
-        lax.stop_gradient(box),
-        lax.stop_gradient(order),
+        *shape,
         height=height,
         width=width,
         tile=plan.tile,
         capacity=plan.capacity,
         at_once=plan.pairs_at_once,
-        reaches=functools.partial(reaches, kept, tile=plan.tile, near=plan.near),
+        reaches=functools.partial(
+            reaches, lax.stop_gradient(table), tile=plan.tile, near=plan.near
+        ),
     )
     sums, median = blend_tiles(plan, table, lists)
-    image = functools.partial(_untile, height=height, width=width, tile=plan.tile)
-    features = sums.shape[1] - MOMENTS
-    payload = jnp.moveaxis(jax.vmap(image, in_axes=1)(sums[:, :features]), 0, -1)
-    depth, alpha, first, second = (image(sums[:, features + i]) for i in range(MOMENTS))
+    untile = functools.partial(_untile, height=height, width=width, tile=plan.tile)
+    return _image_of(jax.vmap(untile, in_axes=1)(sums), untile(median), lists.overflow)
+
+
+def _image_of(sums: jax.Array, median: jax.Array, overflow: jax.Array) -> SplatImage:
+    """Return the image of sums `[F + MOMENTS, H, W]` over splats, see `blend_tiles`."""
+    depth, alpha, first, second = sums[-MOMENTS:]
     return SplatImage(
-        payload=payload,
+        payload=jnp.moveaxis(sums[:-MOMENTS], 0, -1),
         alpha=alpha,
         depth=safe_divide(depth, alpha),
-        median_depth=image(median),
+        median_depth=median,
         # sum_{i<j} w_i w_j (m_i - m_j)^2 (2DGS, equation 13), by moments about the inverse depth of
         # the first drawn splat, whose weight is at least ALPHA_MIN. Without that shift float32
         # would lose every digit of the spread of a converged surface.
         distortion=jnp.maximum(alpha * second - first * first, 0),
-        overflow=lists.overflow,
+        overflow=overflow,
     )
 
 

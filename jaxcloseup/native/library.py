@@ -1,0 +1,46 @@
+"""Loads the native library, which is built when the package is installed, if a compiler is there.
+
+XLA calls its functions by name (`jax.ffi`). Everything that uses it has a twin in JAX, which runs
+where there is no library.
+"""
+
+import ctypes
+import functools
+import pathlib
+
+import jax
+
+
+# The functions of `splats.cc` and the others that XLA may call.
+TARGETS = ("splats_forward", "splats_backward", "splats_count")
+
+INSTALL = (
+    "install g++ or clang++ (Debian and Ubuntu: apt-get install g++), then install jaxcloseup again"
+)
+
+
+def path() -> pathlib.Path | None:
+    """Return the library's file, or None if it was not built."""
+    found = sorted(pathlib.Path(__file__).parent.glob("_native*.so"))
+    return found[0] if found else None
+
+
+@functools.cache
+def missing() -> str | None:
+    """Return None if the library is loaded, which this does on the first call; else why it is not."""
+    file = path()
+    if file is None:
+        return "it was not built"
+    try:
+        library = ctypes.CDLL(str(file))
+        for name in TARGETS:
+            capsule = jax.ffi.pycapsule(getattr(library, name))
+            jax.ffi.register_ffi_target(f"jaxcloseup_{name}", capsule, platform="cpu")
+    except Exception as error:  # whatever keeps it from loading
+        return str(error).splitlines()[0] if str(error) else type(error).__name__
+    return None
+
+
+def available() -> bool:
+    """Return whether programs for CPUs can call the library."""
+    return missing() is None
