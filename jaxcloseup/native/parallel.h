@@ -1,6 +1,7 @@
 // Shares out numbered pieces of work over the thread pool of XLA.
 #pragma once
 
+#include <algorithm>
 #include <atomic>
 #include <condition_variable>
 #include <memory>
@@ -10,11 +11,11 @@
 
 namespace jaxcloseup {
 
-// Calls work(i) once for every i in [0, count), in any order and on any thread, and returns when
-// all calls have. The calling thread takes pieces too, so it never waits for a thread that the
-// pool may not have.
-template <typename Work>
-void parallel_for(xla::ffi::ThreadPool& pool, int count, const Work& work) {
+// Calls work(scratch, i) once for every i in [0, count), in any order and on any thread, and returns
+// when all calls have. Each thread has a `Scratch` of its own for all its pieces. The calling thread
+// takes pieces too, so it never waits for a thread that the pool may not have.
+template <typename Scratch, typename Work>
+void parallel_for_with(xla::ffi::ThreadPool& pool, int count, const Work& work) {
   struct Shared {
     const Work* work;
     int count;
@@ -23,8 +24,11 @@ void parallel_for(xla::ffi::ThreadPool& pool, int count, const Work& work) {
     std::condition_variable all_done;
 
     void take() {
-      for (int i; (i = next.fetch_add(1)) < count;) {
-        (*work)(i);
+      int i = next.fetch_add(1);
+      if (i >= count) return;
+      Scratch scratch;
+      for (; i < count; i = next.fetch_add(1)) {
+        (*work)(scratch, i);
         if (done.fetch_add(1) + 1 == count) {
           std::lock_guard<std::mutex> lock(mutex);
           all_done.notify_all();
@@ -41,6 +45,13 @@ void parallel_for(xla::ffi::ThreadPool& pool, int count, const Work& work) {
   shared->take();
   std::unique_lock<std::mutex> lock(shared->mutex);
   shared->all_done.wait(lock, [&] { return shared->done.load() == count; });
+}
+
+// Calls work(i) likewise.
+template <typename Work>
+void parallel_for(xla::ffi::ThreadPool& pool, int count, const Work& work) {
+  struct None {};
+  parallel_for_with<None>(pool, count, [&](None&, int i) { work(i); });
 }
 
 }  // namespace jaxcloseup

@@ -23,6 +23,31 @@ constexpr int SCALED = 9, PAYLOAD_SUMS = 10;
 inline int offside_sums(int features) { return (PAYLOAD_SUMS + features + 15) / 16 * 16; }
 inline int sums_stride(int features) { return offside_sums(features) + 16; }
 
+// An image, and the splats that are blended into it.
+struct Image {
+  int width, height;   // pixels
+  float near;          // z-depth before which nothing is drawn
+  int count, columns;  // rows and columns of the table
+  const float* table;  // [count, columns]
+  const float* box;    // [count, 4] bounds x0, y0, x1, y1 in pixels
+  const float* order;  // [count] depths that are not negative
+
+  int tile_columns() const { return (width + TILE - 1) / TILE; }
+  int tile_rows() const { return (height + TILE - 1) / TILE; }
+  int features() const { return columns - PAYLOAD; }
+};
+
+// Numbers of tiles, the last included; empty where last < first.
+struct Range {
+  int16_t first, last;
+};
+constexpr int MOST_TILES = INT16_MAX;  // in a row or column
+
+// Tiles with a center of a pixel in a splat's box.
+struct TileBox {
+  Range across, down;
+};
+
 // Rows of tiles whose splats are listed, nearest first.
 struct Band {
   int width, height;   // of the image in pixels
@@ -59,9 +84,19 @@ struct Cotangents {
 using Forward = void (*)(const Band&, const Planes&);
 using Backward = void (*)(const Band&, const Cotangents&, float* sums);
 
-// One pair for each instruction set that the library was compiled for.
+// Tiles of the boxes of splats `begin` to `end`; both ranges of an empty one are empty.
+using FindTiles = void (*)(const Image&, int begin, int end, TileBox* boxes);
+
+// Of `count` splats, in each row of tiles of its box, the tiles in which a splat draws. A splat's
+// rows start at `starts` in `ranges`.
+using FindReach = void (*)(const Image&, int count, const int32_t* splats, const TileBox* boxes,
+                           const int32_t* starts, Range* ranges);
+
+// The functions, compiled for one instruction set.
 struct Passes {
   const char* name;
+  FindTiles find_tiles;
+  FindReach find_reach;
   Forward forward;
   Backward backward;
 };

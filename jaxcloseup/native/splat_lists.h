@@ -4,44 +4,32 @@
 #include <cstdint>
 #include <vector>
 
+#include "parallel.h"
 #include "splat_layout.h"
 
 namespace jaxcloseup {
 
-// An image, and the splats that are blended into it.
-struct Scene {
-  int width, height;   // pixels
-  float near;          // z-depth before which nothing is drawn
-  int count, columns;  // rows and columns of the table
-  const float* table;  // [count, columns]
-  const float* box;    // [count, 4] bounds x0, y0, x1, y1 in pixels
-  const float* order;  // [count] depths that are not negative
+// Splats that show, nearest first, and the tiles of each. An image is cut into bands of rows of
+// tiles, by its size alone, so that every sum has one order on any number of threads.
+struct Listing {
+  int rows_each, bands;
+  std::vector<TileBox> boxes;    // [N]
+  std::vector<int32_t> splats;   // [S] indices, of equal depth by index
+  std::vector<int32_t> starts;   // [S + 1] where the rows of each start in `ranges`
+  std::vector<Range> ranges;     // tiles in which a splat draws, for each row of its box
+  std::vector<Range> of_bands;   // [S] first and last band of each
 
-  int tile_columns() const { return (width + TILE - 1) / TILE; }
-  int tile_rows() const { return (height + TILE - 1) / TILE; }
+  Listing(xla::ffi::ThreadPool& pool, const Passes& passes, const Image& image);
 };
 
-// Splats that show, sorted by depth and dealt out to bands of rows of tiles. The image's size alone
-// determines the bands, so that every sum has one order on any number of threads.
-struct Bands {
-  int rows_each, count;
-  std::vector<int32_t> splats;  // [S] indices, nearest first, of equal ones by index
-  std::vector<int32_t> first;   // [S] first band of each
-  std::vector<int32_t> slots;   // [S + 1] where the slots of each splat start in `entries`
-  std::vector<int32_t> entries; // places of splats in bands, a splat's bands one behind the other
-  std::vector<int32_t> starts;  // [count + 1] where each band starts in `members`
-  std::vector<int32_t> members; // indices of splats, band after band
-
-  explicit Bands(const Scene& scene);
-};
-
-// The rows of a band's splats, and its tiles' lists.
+// The rows of a band's splats, and its tiles' lists. Its arrays are used again for the next band.
 struct BandLists {
   Band band;
+  std::vector<int32_t> members;  // numbers of the band's splats in `Listing.splats`
   std::vector<float> rows;
-  std::vector<int32_t> list, starts;
+  std::vector<int32_t> list, starts, next;
 
-  BandLists(const Scene& scene, const Bands& bands, int number);
+  void make(const Image& image, const Listing& listing, int number);
 };
 
 }  // namespace jaxcloseup

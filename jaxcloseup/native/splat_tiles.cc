@@ -9,7 +9,7 @@
 #define ISA baseline
 #endif
 #define NAMED(prefix, isa) prefix##isa
-#define PASSES(isa) NAMED(passes_, isa)
+#define OF_ISA(prefix, isa) NAMED(prefix, isa)
 
 namespace jaxcloseup {
 namespace {
@@ -32,10 +32,20 @@ struct Pixels {
   }
 };
 
+// Adds what a part of a tile contributes; where a tile has one part, that is all.
+inline void add(V& sum, V part) { sum = PARTS == 1 ? part : sum + part; }
+
+// Fetches what the loops reach some splats later.
+inline void fetch(const float* base, int32_t splat, int stride) {
+  __builtin_prefetch(base + static_cast<long>(splat) * stride);
+  __builtin_prefetch(base + static_cast<long>(splat) * stride + 16);
+}
+constexpr int AHEAD = 4;
+
 // A splat at pixels, see `splat_math.shade`.
 struct Shade {
   V dx, dy, u, v, w, inverse, z, rho, alpha;
-  I on_plane, drawn;
+  M on_plane, drawn;
 };
 
 inline Shade shade(const float* row, float ox, float oy, V x, V y, float near) {
@@ -48,13 +58,13 @@ inline Shade shade(const float* row, float ox, float oy, V x, V y, float near) {
   s.w = mad(broadcast(h[8]), s.dy, mad(broadcast(h[7]), s.dx, broadcast(h[6])));
   const V squared = mad(s.u, s.u, s.v * s.v);
   const V low = row[LOW_PASS] * mad(s.dx, s.dx, s.dy * s.dy);
-  s.on_plane = (s.w > 0.f) & (squared <= low * (s.w * s.w));
+  s.on_plane = less(V{}, s.w) & at_most(squared, low * (s.w * s.w));
   const V clipped = lesser(greater(s.w, broadcast(row[INVERSE_DEPTH])), broadcast(row[INVERSE_DEPTH + 1]));
-  s.inverse = s.on_plane ? s.w : clipped;
+  s.inverse = select(s.on_plane, s.w, clipped);
   s.z = 1.f / s.inverse;
-  s.rho = s.on_plane ? squared * (s.z * s.z) : low;
+  s.rho = select(s.on_plane, squared * (s.z * s.z), low);
   s.alpha = lesser(row[OPACITY] * exponential(-.5f * s.rho), broadcast(ALPHA_MAX));
-  s.drawn = (s.alpha >= ALPHA_MIN) & (s.w * near <= 1.f);
+  s.drawn = at_most(broadcast(ALPHA_MIN), s.alpha) & at_most(s.w * near, broadcast(1));
   return s;
 }
 
@@ -108,6 +118,7 @@ template <int FEATURES>
 void forward_tile(const Band& band, const Planes& out, int tile, const Pixels& pixels) {
   const int features = FEATURES ? FEATURES : band.features;
   const Place place(band, tile);
+  const V least = broadcast(TRANSMITTANCE_MIN);
   V product[PARTS], remaining[PARTS], median[PARTS], reference[PARTS], stop[PARTS];
   V sums[FEATURES ? FEATURES + MOMENTS : MOST_FEATURES + MOMENTS][PARTS];
   for (int j = 0; j < PARTS; j++) {
@@ -119,28 +130,29 @@ void forward_tile(const Band& band, const Planes& out, int tile, const Pixels& p
   const int count = band.starts[tile + 1] - band.starts[tile];
   for (int i = 0; i < count; i++) {
     const float* row = band.splats + static_cast<long>(list[i]) * band.stride;
-    I open{};
+    if (i + AHEAD < count) fetch(band.splats, list[i + AHEAD], band.stride);
+    M open{};
     for (int j = 0; j < PARTS; j++) {
       const Shade s = shade(row, place.ox, place.oy, pixels.x[j], pixels.y[j], band.near);
       if (!any(s.drawn)) {
-        open |= product[j] >= TRANSMITTANCE_MIN;
+        open = open | at_most(least, product[j]);
         continue;
       }
-      const V alpha = s.drawn ? s.alpha : V{};
+      const V alpha = select(s.drawn, s.alpha);
       const V before = product[j], after = before - alpha * before;
       // The splat that would take the transmittance below the limit is not drawn itself.
-      const I unfinished = after >= TRANSMITTANCE_MIN;
-      const V weight = unfinished ? alpha * before : V{};
+      const M unfinished = at_most(least, after);
+      const V weight = select(unfinished, alpha * before);
       // Only in front of the first drawn splat is the product exactly 1.
-      reference[j] = s.drawn & (before == 1.f) ? s.inverse : reference[j];
-      median[j] = s.drawn & (before > .5f) ? s.z : median[j];
-      stop[j] = unfinished & s.drawn ? broadcast(i + 1) : stop[j];
-      remaining[j] = unfinished ? after : remaining[j];
+      reference[j] = select(s.drawn & equal(before, broadcast(1)), s.inverse, reference[j]);
+      median[j] = select(s.drawn & less(broadcast(.5f), before), s.z, median[j]);
+      stop[j] = select(unfinished & s.drawn, broadcast(i + 1), stop[j]);
+      remaining[j] = select(unfinished, after, remaining[j]);
       product[j] = after;  // it keeps falling, so that a finished pixel stays finished
-      open |= unfinished;
+      open = open | unfinished;
       for (int f = 0; f < features; f++) sums[f][j] = mad(weight, broadcast(row[PAYLOAD + f]), sums[f][j]);
       // Pixels that draw nothing may have no depth.
-      const V z = s.drawn ? s.z : V{}, shifted = s.drawn ? s.inverse - reference[j] : V{};
+      const V z = select(s.drawn, s.z), shifted = select(s.drawn, s.inverse - reference[j]);
       const V first = weight * shifted;
       sums[features][j] = mad(weight, z, sums[features][j]);
       sums[features + 1][j] += weight;
@@ -195,19 +207,23 @@ void backward_tile(const Band& band, const Cotangents& in, float* all_sums, int 
   const int listed = band.starts[tile + 1] - band.starts[tile];
   for (int i = (last < listed ? last : listed) - 1; i >= 0; i--) {
     const float* row = band.splats + static_cast<long>(list[i]) * band.stride;
+    if (i >= AHEAD) {
+      fetch(band.splats, list[i - AHEAD], band.stride);
+      fetch(all_sums, list[i - AHEAD], stride);
+    }
     V total[SUMS], aside[4];
     for (int f = 0; f < count; f++) total[f] = V{};
     for (int f = 0; f < 4; f++) aside[f] = V{};
     bool draws = false, has_aside = false;
     for (int j = 0; j < PARTS; j++) {
       const Shade s = shade(row, place.ox, place.oy, pixels.x[j], pixels.y[j], band.near);
-      const I drawn = s.drawn & (at.stop[j] > static_cast<float>(i));
+      const M drawn = s.drawn & less(broadcast(i), at.stop[j]);
       if (!any(drawn)) continue;
       draws = true;
       // Pixels that draw nothing may have no depth.
-      const V alpha = drawn ? s.alpha : V{}, z = drawn ? s.z : V{}, inverse = drawn ? s.inverse : V{};
+      const V alpha = select(drawn, s.alpha), z = select(drawn, s.z), inverse = select(drawn, s.inverse);
       const V passing = 1.f / (1.f - alpha), before = after[j] * passing;
-      const V shifted = drawn ? inverse - at.reference[j] : V{};
+      const V shifted = select(drawn, inverse - at.reference[j]);
       const V depth_bar = at.sums[features][j], alpha_bar = at.sums[features + 1][j];
       const V first_bar = at.sums[features + 2][j], second_bar = at.sums[features + 3][j];
       V value = mad(z, depth_bar, alpha_bar);
@@ -215,41 +231,43 @@ void backward_tile(const Band& band, const Cotangents& in, float* all_sums, int 
       const V weight = alpha * before;
       for (int f = 0; f < features; f++) {
         value = mad(broadcast(row[PAYLOAD + f]), at.sums[f][j], value);
-        total[PAYLOAD_SUMS + f] += weight * at.sums[f][j];
+        add(total[PAYLOAD_SUMS + f], weight * at.sums[f][j]);
       }
       // The splat adds its own worth and dims all splats behind it.
       V scaled = alpha * (before * value - behind[j] * passing);
-      scaled = alpha < ALPHA_MAX ? scaled : V{};
+      scaled = select(less(alpha, broadcast(ALPHA_MAX)), scaled);
       // The median splat takes transmittance to 1/2, else it is the last drawn one.
-      const I median = drawn & (before > .5f) & ((after[j] <= .5f) | (after[j] == at.remaining[j]));
-      const V z_bar = mad(weight, depth_bar, median ? at.median[j] : V{});
+      const M last = at_most(after[j], broadcast(.5f)) | equal(after[j], at.remaining[j]);
+      const M median = drawn & less(broadcast(.5f), before) & last;
+      const V z_bar = mad(weight, depth_bar, select(median, at.median[j]));
       const V inverse_bar = weight * mad(2.f * shifted, second_bar, first_bar) - z * z * z_bar;
       behind[j] = mad(weight, value, behind[j]);
       after[j] = before;
-      const V plane = s.on_plane ? scaled * z : V{};
+      const V plane = select(s.on_plane, scaled * z);
       const V u = -plane * z * s.u, v = -plane * z * s.v;
-      const I off = drawn & ~s.on_plane;
+      const M off = drawn & ~s.on_plane;
       V w = mad(plane, s.rho, inverse_bar);
       if (any(off)) {
         has_aside = true;
-        const I clipped = off & ((s.w < row[INVERSE_DEPTH]) | (s.w > row[INVERSE_DEPTH + 1]));
-        w = s.on_plane ? w : (clipped ? V{} : inverse_bar);
-        const V low = s.on_plane ? V{} : scaled;
-        aside[0] += low;
-        aside[1] += low * s.dx;
-        aside[2] += low * s.dy;
-        aside[3] += clipped ? inverse_bar * inverse * inverse : V{};
+        const M outside = less(s.w, broadcast(row[INVERSE_DEPTH])) | less(broadcast(row[INVERSE_DEPTH + 1]), s.w);
+        const M clipped = off & outside;
+        w = select(s.on_plane, w, select(~clipped, inverse_bar));
+        const V low = select(~s.on_plane, scaled);
+        add(aside[0], low);
+        add(aside[1], low * s.dx);
+        add(aside[2], low * s.dy);
+        add(aside[3], select(clipped, inverse_bar * inverse * inverse));
       }
-      total[0] += u;
-      total[1] += u * s.dx;
-      total[2] += u * s.dy;
-      total[3] += v;
-      total[4] += v * s.dx;
-      total[5] += v * s.dy;
-      total[6] += w;
-      total[7] += w * s.dx;
-      total[8] += w * s.dy;
-      total[SCALED] += scaled;
+      add(total[0], u);
+      add(total[1], u * s.dx);
+      add(total[2], u * s.dy);
+      add(total[3], v);
+      add(total[4], v * s.dx);
+      add(total[5], v * s.dy);
+      add(total[6], w);
+      add(total[7], w * s.dx);
+      add(total[8], w * s.dy);
+      add(total[SCALED], scaled);
     }
     if (!draws) continue;
     float* sums = all_sums + static_cast<long>(list[i]) * stride;
@@ -292,6 +310,10 @@ void backward(const Band& band, const Cotangents& in, float* sums) {
 
 }  // namespace
 
-extern const Passes PASSES(ISA) = {NAME(ISA), forward, backward};
+void OF_ISA(find_tiles_, ISA)(const Image&, int, int, TileBox*);
+void OF_ISA(find_reach_, ISA)(const Image&, int, const int32_t*, const TileBox*, const int32_t*, Range*);
+
+extern const Passes OF_ISA(passes_, ISA) = {NAME(ISA), OF_ISA(find_tiles_, ISA), OF_ISA(find_reach_, ISA),
+                                            forward, backward};
 
 }  // namespace jaxcloseup

@@ -1,6 +1,7 @@
 // The native compositor as functions that XLA calls.
 #include <algorithm>
 #include <cstring>
+#include <memory>
 #include <vector>
 
 #include "parallel.h"
@@ -31,14 +32,16 @@ const Passes& best_passes() {
 // The images of a batch, `[..., N, C]` and so on.
 struct Batch {
   int64_t images = 1;
-  Scene scene;
+  Image first;
 
-  Scene at(int64_t image) const {
-    Scene one = scene;
-    one.table += image * scene.count * scene.columns;
-    one.box += image * scene.count * 4;
-    one.order += image * scene.count;
-    return one;
+  int64_t pixels() const { return int64_t(first.width) * first.height; }
+  int channels() const { return first.features() + MOMENTS; }
+  Image at(int64_t number) const {
+    Image image = first;
+    image.table += number * image.count * image.columns;
+    image.box += number * image.count * 4;
+    image.order += number * image.count;
+    return image;
   }
 };
 
@@ -51,9 +54,9 @@ ffi::Error read_batch(Floats& table, Floats& box, Floats& order, int64_t height,
   if (features < 0 || features > MOST_FEATURES) return ffi::Error::InvalidArgument("a payload has 0 to 54 values");
   if (box.element_count() != size_t(batch.images * count * 4) || order.element_count() != size_t(batch.images * count))
     return ffi::Error::InvalidArgument("boxes must be [..., N, 4] and orders [..., N]");
-  if (height < 0 || width < 0 || height * width > INT32_MAX || count > INT32_MAX / 4)
-    return ffi::Error::InvalidArgument("an image or its splats are too many");
-  batch.scene = {static_cast<int>(width), static_cast<int>(height), near, static_cast<int>(count),
+  if (std::max(height, width) > int64_t(MOST_TILES) * TILE || count > INT32_MAX / 4)
+    return ffi::Error::InvalidArgument("an image is too large, or has too many splats");
+  batch.first = {static_cast<int>(width), static_cast<int>(height), near, static_cast<int>(count),
                  static_cast<int>(columns), table.typed_data(), box.typed_data(), order.typed_data()};
   return ffi::Error::Success();
 }
@@ -63,16 +66,16 @@ ffi::Error forward(ffi::ThreadPool pool, Floats table, Floats box, Floats order,
                    Result<Integers> stop, Result<Floats> reference) {
   Batch batch;
   if (auto error = read_batch(table, box, order, height, width, near, batch); error.failure()) return error;
-  const int64_t pixels = height * width, channels = batch.scene.columns - PAYLOAD + MOMENTS;
+  const int64_t pixels = batch.pixels();
   const Passes& passes = best_passes();
-  for (int64_t image = 0; image < batch.images && pixels > 0; image++) {
-    const Scene scene = batch.at(image);
-    const Bands bands(scene);
-    const Planes out = {sums->typed_data() + image * channels * pixels, median->typed_data() + image * pixels,
-                        transmittance->typed_data() + image * pixels, stop->typed_data() + image * pixels,
-                        reference->typed_data() + image * pixels};
-    parallel_for(pool, bands.count, [&](int number) {
-      const BandLists lists(scene, bands, number);
+  for (int64_t number = 0; number < batch.images && pixels > 0; number++) {
+    const Image image = batch.at(number);
+    const Listing listing(pool, passes, image);
+    const Planes out = {sums->typed_data() + number * batch.channels() * pixels,
+                        median->typed_data() + number * pixels, transmittance->typed_data() + number * pixels,
+                        stop->typed_data() + number * pixels, reference->typed_data() + number * pixels};
+    parallel_for_with<BandLists>(pool, listing.bands, [&](BandLists& lists, int band) {
+      lists.make(image, listing, band);
       passes.forward(lists.band, out);
     });
   }
@@ -80,54 +83,65 @@ ffi::Error forward(ffi::ThreadPool pool, Floats table, Floats box, Floats order,
 }
 
 // Cotangents of a row of the table from sums over all pixels, see `splat_math.row_bar`.
-void row_bar(const float* row, const double* sums, int features, float* bar) {
-  const double *low = sums + offside_sums(features), clip = low[3];
-  const float* h = row + HOMOGRAPHY;
+void row_bar(const float* row, const float* sums, int features, float* bar) {
+  const float *low = sums + offside_sums(features), clip = low[3], *h = row + HOMOGRAPHY;
   for (int axis = 0; axis < 2; axis++) {
-    double moved = row[LOW_PASS] * low[1 + axis];
+    float moved = row[LOW_PASS] * low[1 + axis];
     for (int i = 0; i < 3; i++) moved -= sums[3 * i] * h[3 * i + 1 + axis];
-    bar[ANCHOR + axis] = static_cast<float>(moved);
+    bar[ANCHOR + axis] = moved;
   }
-  for (int i = 0; i < 9; i++) bar[HOMOGRAPHY + i] = static_cast<float>(sums[i]);
+  std::memcpy(bar + HOMOGRAPHY, sums, 9 * sizeof(float));
   // A clipped depth moves with the anchor's depth.
-  if (clip != 0) bar[HOMOGRAPHY + 6] = static_cast<float>(sums[6] + clip / (double(h[6]) * h[6]));
-  bar[OPACITY] = row[OPACITY] != 0 ? static_cast<float>(sums[SCALED] / row[OPACITY]) : 0;
-  for (int f = 0; f < features; f++) bar[PAYLOAD + f] = static_cast<float>(sums[PAYLOAD_SUMS + f]);
+  if (clip != 0) bar[HOMOGRAPHY + 6] += clip / (h[6] * h[6]);
+  bar[OPACITY] = row[OPACITY] != 0 ? sums[SCALED] / row[OPACITY] : 0;
+  for (int i = LOW_PASS; i < PAYLOAD; i++) bar[i] = 0;
+  std::memcpy(bar + PAYLOAD, sums + PAYLOAD_SUMS, features * sizeof(float));
 }
+
+// Sums over the pixels of one band, for each of its splats.
+using BandSums = std::unique_ptr<float[]>;
 
 ffi::Error backward(ffi::ThreadPool pool, Floats table, Floats box, Floats order, Floats transmittance, Integers stop,
                     Floats reference, Floats sums_bar, Floats median_bar, int64_t height, int64_t width, float near,
                     Result<Floats> table_bar) {
   Batch batch;
   if (auto error = read_batch(table, box, order, height, width, near, batch); error.failure()) return error;
-  const int features = batch.scene.columns - PAYLOAD, stride = sums_stride(features);
-  const int64_t pixels = height * width, channels = features + MOMENTS;
+  const int64_t pixels = batch.pixels();
   const Passes& passes = best_passes();
   std::memset(table_bar->typed_data(), 0, table_bar->size_bytes());
-  for (int64_t image = 0; image < batch.images && pixels > 0; image++) {
-    const Scene scene = batch.at(image);
-    const Bands bands(scene);
-    const Cotangents in = {sums_bar.typed_data() + image * channels * pixels, median_bar.typed_data() + image * pixels,
-                           transmittance.typed_data() + image * pixels, stop.typed_data() + image * pixels,
-                           reference.typed_data() + image * pixels};
-    std::vector<float> sums(bands.members.size() * stride);
-    parallel_for(pool, bands.count, [&](int number) {
-      const BandLists lists(scene, bands, number);
-      passes.backward(lists.band, in, sums.data() + static_cast<size_t>(bands.starts[number]) * stride);
+  for (int64_t number = 0; number < batch.images && pixels > 0; number++) {
+    const Image image = batch.at(number);
+    const Listing listing(pool, passes, image);
+    const Cotangents in = {sums_bar.typed_data() + number * batch.channels() * pixels,
+                           median_bar.typed_data() + number * pixels, transmittance.typed_data() + number * pixels,
+                           stop.typed_data() + number * pixels, reference.typed_data() + number * pixels};
+    const int features = image.features(), stride = sums_stride(features);
+    std::vector<BandSums> sums(listing.bands);
+    std::vector<int32_t> places(listing.ranges.size());  // of each splat in its bands, one by one
+    parallel_for_with<BandLists>(pool, listing.bands, [&](BandLists& lists, int band) {
+      lists.make(image, listing, band);
+      const size_t size = lists.members.size() * stride;
+      sums[band].reset(new float[size]);
+      std::memset(sums[band].get(), 0, size * sizeof(float));
+      passes.backward(lists.band, in, sums[band].get());
+      for (size_t k = 0; k < lists.members.size(); k++) {
+        const int splat = lists.members[k];
+        places[listing.starts[splat] + band - listing.of_bands[splat].first] = static_cast<int32_t>(k);
+      }
     });
     // One order of sums: along a tile's list, then over tiles, then over bands.
-    float* bars = table_bar->typed_data() + image * scene.count * scene.columns;
-    const int shown = static_cast<int>(bands.splats.size()), each = 1024;
-    parallel_for(pool, (shown + each - 1) / each, [&](int part) {
-      std::vector<double> total(stride);
+    float* bars = table_bar->typed_data() + int64_t(number) * image.count * image.columns;
+    const int shown = static_cast<int>(listing.splats.size()), each = 1024;
+    parallel_for_with<std::vector<float>>(pool, (shown + each - 1) / each, [&](std::vector<float>& total, int part) {
       for (int i = part * each; i < std::min(shown, (part + 1) * each); i++) {
-        std::fill(total.begin(), total.end(), 0.);
-        for (int slot = bands.slots[i]; slot < bands.slots[i + 1]; slot++) {
-          const float* own = sums.data() + static_cast<size_t>(bands.entries[slot]) * stride;
+        total.assign(stride, 0.f);
+        const Range bands = listing.of_bands[i];
+        for (int band = bands.first; band <= bands.last; band++) {
+          const float* own = sums[band].get() + static_cast<size_t>(places[listing.starts[i] + band - bands.first]) * stride;
           for (int f = 0; f < stride; f++) total[f] += own[f];
         }
-        const size_t place = static_cast<size_t>(bands.splats[i]) * scene.columns;
-        row_bar(scene.table + place, total.data(), features, bars + place);
+        const size_t place = static_cast<size_t>(listing.splats[i]) * image.columns;
+        row_bar(image.table + place, total.data(), features, bars + place);
       }
     });
   }
@@ -139,16 +153,15 @@ ffi::Error count_splats(ffi::ThreadPool pool, Floats table, Floats box, Floats o
                         float near, Result<Integers> counts) {
   Batch batch;
   if (auto error = read_batch(table, box, order, height, width, near, batch); error.failure()) return error;
-  const int64_t tiles = int64_t(batch.scene.tile_rows()) * batch.scene.tile_columns();
-  for (int64_t image = 0; image < batch.images && tiles > 0; image++) {
-    const Scene scene = batch.at(image);
-    const Bands bands(scene);
-    int32_t* out = counts->typed_data() + image * tiles;
-    parallel_for(pool, bands.count, [&](int number) {
-      const BandLists lists(scene, bands, number);
-      const int own = lists.band.rows * lists.band.columns;
-      for (int tile = 0; tile < own; tile++)
-        out[lists.band.first_row * lists.band.columns + tile] = lists.starts[tile + 1] - lists.starts[tile];
+  const int64_t tiles = int64_t(batch.first.tile_rows()) * batch.first.tile_columns();
+  for (int64_t number = 0; number < batch.images && tiles > 0; number++) {
+    const Image image = batch.at(number);
+    const Listing listing(pool, best_passes(), image);
+    int32_t* out = counts->typed_data() + number * tiles;
+    parallel_for_with<BandLists>(pool, listing.bands, [&](BandLists& lists, int band) {
+      lists.make(image, listing, band);
+      const int first = lists.band.first_row * lists.band.columns, own = lists.band.rows * lists.band.columns;
+      for (int tile = 0; tile < own; tile++) out[first + tile] = lists.starts[tile + 1] - lists.starts[tile];
     });
   }
   return ffi::Error::Success();

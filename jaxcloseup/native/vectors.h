@@ -25,7 +25,15 @@ namespace {
 typedef float V __attribute__((vector_size(4 * WIDTH)));
 typedef int32_t I __attribute__((vector_size(4 * WIDTH)));
 
-inline V broadcast(float x) { return V{} + x; }
+inline V broadcast(float x) {
+#if defined(__AVX512F__)
+  return (V)_mm512_set1_ps(x);
+#elif defined(__AVX__)
+  return (V)_mm256_set1_ps(x);
+#else
+  return V{} + x;
+#endif
+}
 inline V load(const float* from) {
   V to;
   std::memcpy(&to, from, sizeof to);
@@ -44,27 +52,61 @@ inline V mad(V a, V b, V c) {
 #endif
 }
 
-// Whether any element of a comparison holds.
-inline bool any(I mask) {
+// Where a comparison holds: a bit for each element, or all bits of an element.
 #if defined(__AVX512F__)
-  return _mm512_test_epi32_mask((__m512i)mask, (__m512i)mask) != 0;
-#elif defined(__AVX__)
-  return !_mm256_testz_si256((__m256i)mask, (__m256i)mask);
+struct M {
+  __mmask16 bits;
+};
+#define COMPARE(name, op, predicate) \
+  inline M name(V a, V b) { return {_mm512_cmp_ps_mask((__m512)a, (__m512)b, predicate)}; }
+inline bool any(M mask) { return mask.bits != 0; }
+inline V select(M mask, V a, V b) {
+  return (V)_mm512_mask_blend_ps(mask.bits, (__m512)b, (__m512)a);
+}
+inline V select(M mask, V a) { return (V)_mm512_maskz_mov_ps(mask.bits, (__m512)a); }
+inline M operator&(M a, M b) { return {(__mmask16)(a.bits & b.bits)}; }
+inline M operator|(M a, M b) { return {(__mmask16)(a.bits | b.bits)}; }
+inline M operator~(M a) { return {(__mmask16)~a.bits}; }
+#else
+struct M {
+  I bits;
+};
+#define COMPARE(name, op, predicate) \
+  inline M name(V a, V b) { return {a op b}; }
+inline bool any(M mask) {
+#if defined(__AVX__)
+  return !_mm256_testz_si256((__m256i)mask.bits, (__m256i)mask.bits);
 #elif defined(__SSE2__)
-  return _mm_movemask_ps((__m128)mask) != 0;
+  return _mm_movemask_ps((__m128)mask.bits) != 0;
 #else
   int32_t all = 0;
-  for (int i = 0; i < WIDTH; i++) all |= mask[i];
+  for (int i = 0; i < WIDTH; i++) all |= mask.bits[i];
   return all != 0;
 #endif
 }
+inline V select(M mask, V a, V b) { return (V)((mask.bits & (I)a) | (~mask.bits & (I)b)); }
+inline V select(M mask, V a) { return (V)(mask.bits & (I)a); }
+inline M operator&(M a, M b) { return {a.bits & b.bits}; }
+inline M operator|(M a, M b) { return {a.bits | b.bits}; }
+inline M operator~(M a) { return {~a.bits}; }
+#endif
+COMPARE(less, <, _CMP_LT_OQ)
+COMPARE(at_most, <=, _CMP_LE_OQ)
+COMPARE(equal, ==, _CMP_EQ_OQ)
+#undef COMPARE
 
+// The first where both are numbers and it is the lesser, or greater; else the second.
+#if defined(__AVX512F__)
+inline V lesser(V a, V b) { return (V)_mm512_maskz_min_ps(-1, (__m512)a, (__m512)b); }
+inline V greater(V a, V b) { return (V)_mm512_maskz_max_ps(-1, (__m512)a, (__m512)b); }
+#else
 inline V lesser(V a, V b) { return a < b ? a : b; }
 inline V greater(V a, V b) { return a > b ? a : b; }
+#endif
 
 // e^x of x <= 0, to 1e-7; the coefficients are those of Cephes' expf.
 inline V exponential(V x) {
-  x = x < -80.f ? broadcast(-80.f) : x;
+  x = greater(broadcast(-80.f), x);  // NaN stays
   const I whole = __builtin_convertvector(x * 1.44269504f - .5f, I);  // rounds, since x <= 0
   const V k = __builtin_convertvector(whole, V);
   V r = mad(k, broadcast(-.693359375f), x);
