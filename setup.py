@@ -12,7 +12,7 @@ from setuptools.command.build_ext import build_ext
 FOLDER = pathlib.Path("jaxcloseup/native")
 FLAGS = ["-std=c++17", "-O3", "-g0", "-ffp-contract=off", "-fvisibility=hidden", "-Wno-psabi"]
 # The files that are compiled for several processors, of which one is chosen when it is loaded.
-OF_PROCESSOR = [str(FOLDER / "splat_reach.cc"), str(FOLDER / "splat_tiles.cc")]
+OF_PROCESSOR = [str(FOLDER / f"splat_{name}.cc") for name in ("project", "reach", "tiles")]
 PROCESSORS = {"baseline": []}
 if platform.machine() in ("x86_64", "AMD64"):
     PROCESSORS |= {

@@ -11,8 +11,11 @@ import pathlib
 import jax
 
 
-# The functions of `splats.cc` and the others that XLA may call.
-TARGETS = ("splats_forward", "splats_backward", "splats_count")
+# The functions that XLA may call, of `splats.cc` and of `surfels.cc`.
+TARGETS = (
+    *("splats_forward", "splats_backward", "splats_count"),
+    *("surfels_forward", "surfels_backward"),
+)
 
 INSTALL = (
     "install g++ or clang++ (Debian and Ubuntu: apt-get install g++), then install jaxcloseup again"

@@ -1,11 +1,9 @@
 // The native compositor as functions that XLA calls.
 #include <algorithm>
 #include <cstring>
-#include <memory>
 #include <vector>
 
-#include "parallel.h"
-#include "splat_layout.h"
+#include "splat_blend.h"
 #include "splat_lists.h"
 #include "xla/ffi/api/ffi.h"
 
@@ -17,17 +15,6 @@ using Floats = ffi::Buffer<ffi::F32>;
 using Integers = ffi::Buffer<ffi::S32>;
 template <typename Buffer>
 using Result = ffi::Result<Buffer>;
-
-const Passes& best_passes() {
-#if defined(__x86_64__)
-  static const bool avx512 = __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
-                             __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512bw");
-  static const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
-  if (avx512) return passes_avx512;
-  if (avx2) return passes_avx2;
-#endif
-  return passes_baseline;
-}
 
 // The images of a batch, `[..., N, C]` and so on.
 struct Batch {
@@ -67,39 +54,13 @@ ffi::Error forward(ffi::ThreadPool pool, Floats table, Floats box, Floats order,
   Batch batch;
   if (auto error = read_batch(table, box, order, height, width, near, batch); error.failure()) return error;
   const int64_t pixels = batch.pixels();
-  const Passes& passes = best_passes();
-  for (int64_t number = 0; number < batch.images && pixels > 0; number++) {
-    const Image image = batch.at(number);
-    const Listing listing(pool, passes, image);
-    const Planes out = {sums->typed_data() + number * batch.channels() * pixels,
-                        median->typed_data() + number * pixels, transmittance->typed_data() + number * pixels,
-                        stop->typed_data() + number * pixels, reference->typed_data() + number * pixels};
-    parallel_for_with<BandLists>(pool, listing.bands, [&](BandLists& lists, int band) {
-      lists.make(image, listing, band);
-      passes.forward(lists.band, out);
-    });
+  for (int64_t i = 0; i < batch.images && pixels > 0; i++) {
+    blend(pool, batch.at(i), {sums->typed_data() + i * batch.channels() * pixels, median->typed_data() + i * pixels,
+                              transmittance->typed_data() + i * pixels, stop->typed_data() + i * pixels,
+                              reference->typed_data() + i * pixels});
   }
   return ffi::Error::Success();
 }
-
-// Cotangents of a row of the table from sums over all pixels, see `splat_math.row_bar`.
-void row_bar(const float* row, const float* sums, int features, float* bar) {
-  const float *low = sums + offside_sums(features), clip = low[3], *h = row + HOMOGRAPHY;
-  for (int axis = 0; axis < 2; axis++) {
-    float moved = row[LOW_PASS] * low[1 + axis];
-    for (int i = 0; i < 3; i++) moved -= sums[3 * i] * h[3 * i + 1 + axis];
-    bar[ANCHOR + axis] = moved;
-  }
-  std::memcpy(bar + HOMOGRAPHY, sums, 9 * sizeof(float));
-  // A clipped depth moves with the anchor's depth.
-  if (clip != 0) bar[HOMOGRAPHY + 6] += clip / (h[6] * h[6]);
-  bar[OPACITY] = row[OPACITY] != 0 ? sums[SCALED] / row[OPACITY] : 0;
-  for (int i = LOW_PASS; i < PAYLOAD; i++) bar[i] = 0;
-  std::memcpy(bar + PAYLOAD, sums + PAYLOAD_SUMS, features * sizeof(float));
-}
-
-// Sums over the pixels of one band, for each of its splats.
-using BandSums = std::unique_ptr<float[]>;
 
 ffi::Error backward(ffi::ThreadPool pool, Floats table, Floats box, Floats order, Floats transmittance, Integers stop,
                     Floats reference, Floats sums_bar, Floats median_bar, int64_t height, int64_t width, float near,
@@ -107,43 +68,14 @@ ffi::Error backward(ffi::ThreadPool pool, Floats table, Floats box, Floats order
   Batch batch;
   if (auto error = read_batch(table, box, order, height, width, near, batch); error.failure()) return error;
   const int64_t pixels = batch.pixels();
-  const Passes& passes = best_passes();
   std::memset(table_bar->typed_data(), 0, table_bar->size_bytes());
-  for (int64_t number = 0; number < batch.images && pixels > 0; number++) {
-    const Image image = batch.at(number);
-    const Listing listing(pool, passes, image);
-    const Cotangents in = {sums_bar.typed_data() + number * batch.channels() * pixels,
-                           median_bar.typed_data() + number * pixels, transmittance.typed_data() + number * pixels,
-                           stop.typed_data() + number * pixels, reference.typed_data() + number * pixels};
-    const int features = image.features(), stride = sums_stride(features);
-    std::vector<BandSums> sums(listing.bands);
-    std::vector<int32_t> places(listing.ranges.size());  // of each splat in its bands, one by one
-    parallel_for_with<BandLists>(pool, listing.bands, [&](BandLists& lists, int band) {
-      lists.make(image, listing, band);
-      const size_t size = lists.members.size() * stride;
-      sums[band].reset(new float[size]);
-      std::memset(sums[band].get(), 0, size * sizeof(float));
-      passes.backward(lists.band, in, sums[band].get());
-      for (size_t k = 0; k < lists.members.size(); k++) {
-        const int splat = lists.members[k];
-        places[listing.starts[splat] + band - listing.of_bands[splat].first] = static_cast<int32_t>(k);
-      }
-    });
-    // One order of sums: along a tile's list, then over tiles, then over bands.
-    float* bars = table_bar->typed_data() + int64_t(number) * image.count * image.columns;
-    const int shown = static_cast<int>(listing.splats.size()), each = 1024;
-    parallel_for_with<std::vector<float>>(pool, (shown + each - 1) / each, [&](std::vector<float>& total, int part) {
-      for (int i = part * each; i < std::min(shown, (part + 1) * each); i++) {
-        total.assign(stride, 0.f);
-        const Range bands = listing.of_bands[i];
-        for (int band = bands.first; band <= bands.last; band++) {
-          const float* own = sums[band].get() + static_cast<size_t>(places[listing.starts[i] + band - bands.first]) * stride;
-          for (int f = 0; f < stride; f++) total[f] += own[f];
-        }
-        const size_t place = static_cast<size_t>(listing.splats[i]) * image.columns;
-        row_bar(image.table + place, total.data(), features, bars + place);
-      }
-    });
+  for (int64_t i = 0; i < batch.images && pixels > 0; i++) {
+    const Cotangents in = {sums_bar.typed_data() + i * batch.channels() * pixels, median_bar.typed_data() + i * pixels,
+                           transmittance.typed_data() + i * pixels, stop.typed_data() + i * pixels,
+                           reference.typed_data() + i * pixels};
+    const Image image = batch.at(i);
+    const Listing listing(pool, best_passes(), image);
+    pull_back(pool, image, listing, in, table_bar->typed_data() + i * image.count * image.columns);
   }
   return ffi::Error::Success();
 }

@@ -104,11 +104,25 @@ inline V lesser(V a, V b) { return a < b ? a : b; }
 inline V greater(V a, V b) { return a > b ? a : b; }
 #endif
 
-// e^x of x <= 0, to 1e-7; the coefficients are those of Cephes' expf.
+inline V squared(V x) { return x * x; }
+inline V root(V x) {
+#if defined(__AVX512F__)
+  return (V)_mm512_maskz_sqrt_ps(-1, (__m512)x);
+#elif defined(__AVX__)
+  return (V)_mm256_sqrt_ps((__m256)x);
+#elif defined(__SSE2__)
+  return (V)_mm_sqrt_ps((__m128)x);
+#else
+  for (int i = 0; i < WIDTH; i++) x[i] = __builtin_sqrtf(x[i]);
+  return x;
+#endif
+}
+
+// e^x of x <= 87, to 1e-7; the coefficients are those of Cephes' expf.
 inline V exponential(V x) {
   x = greater(broadcast(-80.f), x);  // NaN stays
-  const I whole = __builtin_convertvector(x * 1.44269504f - .5f, I);  // rounds, since x <= 0
-  const V k = __builtin_convertvector(whole, V);
+  const V shift = broadcast(12582912.f);  // rounds what is added to it
+  const V k = (x * 1.44269504f + shift) - shift;
   V r = mad(k, broadcast(-.693359375f), x);
   r = mad(k, broadcast(2.12194440e-4f), r);
   V y = broadcast(1.9875691500e-4f);
@@ -118,8 +132,30 @@ inline V exponential(V x) {
   y = mad(y, r, broadcast(1.6666665459e-1f));
   y = mad(y, r, broadcast(5.0000001201e-1f));
   y = mad(y, r * r, r + 1.f);
-  const I power = (whole + 127) << 23;
+  const I power = (__builtin_convertvector(k, I) + 127) << 23;
   return y * (V)power;
+}
+
+// log x of normal x > 0, to 1e-7; the coefficients are those of Cephes' logf.
+inline V logarithm(V x) {
+  I bits = (I)x;
+  V e = __builtin_convertvector((bits >> 23) - 126, V);
+  V m = (V)((bits & 0x7fffff) | 0x3f000000);  // in [1/2, 1)
+  const M small = less(m, broadcast(.707106781f));
+  e = e - select(small, broadcast(1));
+  m = select(small, m + m, m) - 1.f;
+  V y = broadcast(7.0376836292e-2f);
+  y = mad(y, m, broadcast(-1.1514610310e-1f));
+  y = mad(y, m, broadcast(1.1676998740e-1f));
+  y = mad(y, m, broadcast(-1.2420140846e-1f));
+  y = mad(y, m, broadcast(1.4249322787e-1f));
+  y = mad(y, m, broadcast(-1.6668057665e-1f));
+  y = mad(y, m, broadcast(2.0000714765e-1f));
+  y = mad(y, m, broadcast(-2.4999993993e-1f));
+  y = mad(y, m, broadcast(3.3333331174e-1f));
+  const V square = m * m;
+  y = mad(e, broadcast(-2.12194440e-4f), y * m * square) - .5f * square;
+  return mad(e, broadcast(.693359375f), m + y);
 }
 
 // The sums of WIDTH vectors, as the elements of one.

@@ -69,7 +69,7 @@ def blend(
     shape = lax.stop_gradient(box), lax.stop_gradient(order)
     if plan.compositor == "native" and blend_native.can_blend(table):
         sums, median = blend_native.blend_image(plan, height, width, table, *shape)
-        return _image_of(sums, median, jnp.zeros((), jnp.int32))
+        return image_of(sums, median, jnp.zeros((), jnp.int32))
     lists = tile_lists(
         *shape,
         height=height,
@@ -83,10 +83,10 @@ def blend(
     )
     sums, median = blend_tiles(plan, table, lists)
     untile = functools.partial(_untile, height=height, width=width, tile=plan.tile)
-    return _image_of(jax.vmap(untile, in_axes=1)(sums), untile(median), lists.overflow)
+    return image_of(jax.vmap(untile, in_axes=1)(sums), untile(median), lists.overflow)
 
 
-def _image_of(sums: jax.Array, median: jax.Array, overflow: jax.Array) -> SplatImage:
+def image_of(sums: jax.Array, median: jax.Array, overflow: jax.Array) -> SplatImage:
     """Return the image of sums `[F + MOMENTS, H, W]` over splats, see `blend_tiles`."""
     depth, alpha, first, second = sums[-MOMENTS:]
     return SplatImage(

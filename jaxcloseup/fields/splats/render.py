@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxcloseup.fields.contract import Rendering
+from jaxcloseup.fields.splats import surfels_native
 from jaxcloseup.fields.splats.config import RasterizeConfig
 from jaxcloseup.fields.splats.culling import map_shown, may_show
 from jaxcloseup.fields.splats.ellipsoids import project_ellipsoids
@@ -19,7 +20,8 @@ from jaxcloseup.fields.splats.projection import (
     surfel_columns,
     to_camera,
 )
-from jaxcloseup.fields.splats.rasterize import blend
+from jaxcloseup.fields.splats.raster_plan import plan_raster
+from jaxcloseup.fields.splats.rasterize import SplatImage, blend, image_of
 from jaxcloseup.fields.splats.spherical_harmonics import sh_to_channels
 from jaxcloseup.fields.splats.surfels import Surfels
 from jaxcloseup.geometry.cameras import Camera
@@ -80,12 +82,8 @@ def render_surfels(
     chex.assert_shape(camera.camtoworld, (3, 4))
     chex.assert_shape(camera.intrinsics, (4,))
 
-    # Only surfels that may show are projected, and only pairs that draw are listed.
     opacity = jnp.where(alive, jax.nn.sigmoid(surfels.opacity_logits), 0)
-    shown = may_show(surfels, opacity, camera, near=config.near, antialias=config.antialias)
-    project = functools.partial(_project, near=config.near, antialias=config.antialias)
-    table, box, order = map_shown(project, (surfel_columns(surfels), opacity), camera, shown)
-    image = blend(table, box, order, config, height=camera.height, width=camera.width)
+    image = _blend(surfels, opacity, camera, config)
     rgb = image.payload[..., :3]
     normal = image.payload[..., 3:] if image.payload.shape[-1] > 3 else None
     if background is not None:
@@ -93,6 +91,21 @@ def render_surfels(
         rgb = rgb + (1 - image.alpha)[..., None] * background[None, None]
     aux = SurfelAux(normal, image.median_depth, image.distortion, image.overflow)
     return Rendering(rgb, image.depth, image.alpha, aux, normal=aux.normal, overflow=aux.overflow)
+
+
+def _blend(
+    surfels: Surfels, opacity: jax.Array, camera: Camera, config: RasterizeConfig
+) -> SplatImage:
+    """Project surfels and blend their colors and normals."""
+    plan = plan_raster(config, height=camera.height, width=camera.width)
+    if plan.compositor == "native" and surfels_native.can_render(surfels):
+        sums, median = surfels_native.render_sums(surfels, opacity, camera, config)
+        return image_of(sums, median, jnp.zeros((), jnp.int32))
+    # Only surfels that may show are projected, and only pairs that draw are listed.
+    shown = may_show(surfels, opacity, camera, near=config.near, antialias=config.antialias)
+    project = functools.partial(_project, near=config.near, antialias=config.antialias)
+    table, box, order = map_shown(project, (surfel_columns(surfels), opacity), camera, shown)
+    return blend(table, box, order, config, height=camera.height, width=camera.width)
 
 
 def _project(
