@@ -4,6 +4,7 @@ A splat is a planar homography, a reference pixel and a payload, see `Footprints
 3-D Gaussian is the special case of a constant inverse depth.
 """
 
+import dataclasses
 import functools
 from typing import NamedTuple
 
@@ -67,9 +68,11 @@ def blend(
     plan = plan_raster(config, height=height, width=width)
     # Which splats a tile lists has no derivative: outside of their lists they draw nothing.
     shape = lax.stop_gradient(box), lax.stop_gradient(order)
-    if plan.compositor == "native" and blend_native.can_blend(table):
-        sums, median = blend_native.blend_image(plan, height, width, table, *shape)
-        return image_of(sums, median, jnp.zeros((), jnp.int32))
+    if plan.compositor == "native":
+        if blend_native.can_blend(table):
+            sums, median = blend_native.blend_image(plan, height, width, table, *shape)
+            return image_of(sums, median, jnp.zeros((), jnp.int32))
+        plan = dataclasses.replace(plan, compositor="loops")
     lists = tile_lists(
         *shape,
         height=height,
