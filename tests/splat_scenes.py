@@ -19,9 +19,12 @@ COUNT, HEIGHT, WIDTH, NEAR = 16, 24, 32, 0.2
 INTRINSICS = np.array([30.0, 34.0, 14.5, 13.0])  # fx != fy, principal point off the center
 IDENTITY = np.eye(4)[:3]
 BACKGROUND = np.array([0.2, 0.4, 0.6])
-CONFIG = RasterizeConfig(capacity=1024, near=NEAR, tile=8, chunk=4, block=4)
+CONFIG = RasterizeConfig(
+    capacity=1024, near=NEAR, tile=8, chunk=4, block=4, compositor="loops"
+)
 ANTIALIASED = dataclasses.replace(CONFIG, antialias=True)
 KERNEL = dataclasses.replace(CONFIG, compositor="kernel")
+NATIVE = dataclasses.replace(CONFIG, compositor="native")
 OUTPUTS = ("rgb", "alpha", "depth", "normal", "median_depth", "distortion")
 
 

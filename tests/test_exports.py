@@ -100,11 +100,16 @@ def test_the_library_needs_few_libraries():
 
 
 def test_the_wheel_has_every_file_of_the_package_and_no_other_package():
+    """The native library's sources are not in it, and the library is if it was built."""
     config = tomllib.loads((ROOT.parent / "pyproject.toml").read_text(encoding="utf-8"))
     settings = config["tool"]["setuptools"]
     assert settings["packages"]["find"]["include"] == ["jaxcloseup*"]
     data = {path for name in settings["package-data"]["jaxcloseup"] for path in ROOT.glob(name)}
+    kinds = settings["exclude-package-data"]["jaxcloseup.native"]
+    sources = {path for kind in kinds for path in (ROOT / "native").glob(kind)}
+    built = set((ROOT / "native").glob("_native*.so"))
+    assert len(sources) > 5 and len(built) <= 1
     for path in ROOT.rglob("*"):
         if path.is_file() and "__pycache__" not in path.parts:
-            assert path.suffix == ".py" or path in data, path
+            assert path.suffix == ".py" or path in data | sources | built, path
             assert path.suffix != ".py" or (path.parent / "__init__.py").is_file(), path

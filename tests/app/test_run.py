@@ -171,10 +171,12 @@ def test_a_nerf_may_learn_from_rays_of_larger_photographs(capture_folder, capsys
 
 
 def test_no_step_is_taken_on_a_truncated_image(capture_folder, capsys):
-    """The same steps with too little room and with plenty end alike."""
+    """The same steps of the loops with too little room and with plenty end alike."""
     states = []
     for capacity in (1800, 3600):
-        raster = dataclasses.replace(TINY_SURFELS.field.raster, capacity=capacity)
+        raster = dataclasses.replace(
+            TINY_SURFELS.field.raster, capacity=capacity, compositor="loops"
+        )
         field = dataclasses.replace(TINY_SURFELS.field, raster=raster)
         with jax.numpy_dtype_promotion("standard"):
             scene = load_scene(str(capture_folder))

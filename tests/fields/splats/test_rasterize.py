@@ -1,5 +1,6 @@
 """Images and derivatives of splats against a NumPy splatter, and their invariances."""
 
+import dataclasses
 import functools
 import itertools
 
@@ -182,7 +183,7 @@ def test_tile_sizes_do_not_change_the_image(scene, precision):
     with jax.enable_x64(precision == "float64"):
         surfels, camera = to_surfels(scene, precision), to_camera(dtype=precision)
         images = [
-            render(surfels, camera, config=RasterizeConfig(1024, NEAR, False, *each))
+            render(surfels, camera, config=RasterizeConfig(1024, NEAR, False, *each, "loops"))
             for each in sizes
         ]
     cut = scene["means"][:, 2].min() < 0.5
@@ -195,15 +196,13 @@ def test_tile_sizes_do_not_change_the_image(scene, precision):
 
 def test_sizes_left_open_suit_the_image():
     """A platform that the program names is not asked again."""
-    config = RasterizeConfig(capacity=1000, platform="cpu")
+    config = RasterizeConfig(capacity=1000, compositor="loops", platform="cpu")
     small = plan_raster(config, height=68, width=120)
     large = plan_raster(config, height=540, width=960)
     assert (small.tile, small.capacity) == (4, 3000) and (large.tile, large.capacity) == (8, 1000)
     assert small.chunk == large.chunk > 0 and small.block == large.block > 0
-    assert (
-        small.compositor == "loops"
-        and plan_raster(RasterizeConfig(capacity=1000), height=68, width=120) == small
-    )
+    asked = dataclasses.replace(config, platform=None)
+    assert plan_raster(asked, height=68, width=120) == small
     sizes = {"capacity": 1000, "tile": 16, "chunk": 3, "block": 5}
     for platform in ("cpu", "tpu"):
         plan = plan_raster(RasterizeConfig(**sizes, platform=platform), height=68, width=120)
@@ -322,7 +321,7 @@ def test_extreme_parameters_have_finite_images_and_gradients(num_scales):
 
 
 def test_overflow_is_counted():
-    config = RasterizeConfig(capacity=16, near=NEAR, tile=8, chunk=4, block=4)
+    config = dataclasses.replace(CONFIG, capacity=16)
     images = render(to_surfels(SCENES["in front"]), to_camera(), config=config)
     assert images["overflow"] > 0
     assert render(to_surfels(SCENES["in front"]), to_camera())["overflow"] == 0
