@@ -9,7 +9,7 @@ import numpy as np
 import reference_splats as reference
 from tiny_training import run_train_steps
 
-from jaxcloseup.fields.splats import RasterizeConfig, Surfels, render_surfels
+from jaxcloseup.fields.splats import RasterizeConfig, Surfels, projection, render_surfels
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.training.config import TrainConfig
 from jaxcloseup.training.state import init_state
@@ -19,9 +19,7 @@ COUNT, HEIGHT, WIDTH, NEAR = 16, 24, 32, 0.2
 INTRINSICS = np.array([30.0, 34.0, 14.5, 13.0])  # fx != fy, principal point off the center
 IDENTITY = np.eye(4)[:3]
 BACKGROUND = np.array([0.2, 0.4, 0.6])
-CONFIG = RasterizeConfig(
-    capacity=1024, near=NEAR, tile=8, chunk=4, block=4, compositor="loops"
-)
+CONFIG = RasterizeConfig(capacity=1024, near=NEAR, tile=8, chunk=4, block=4, compositor="loops")
 ANTIALIASED = dataclasses.replace(CONFIG, antialias=True)
 KERNEL = dataclasses.replace(CONFIG, compositor="kernel")
 NATIVE = dataclasses.replace(CONFIG, compositor="native")
@@ -58,6 +56,12 @@ VOLUMES = {
     ]
 }
 SPLATS = SCENES | VOLUMES
+CROWDS = {
+    **SCENES,
+    "long": random_scene(5, count=40, log_scale=(-7.0, -0.5)),
+    "faint": random_scene(6, count=40, log_scale=(-5.0, -2.0)),
+}
+CROWDS["faint"]["opacity_logits"] -= 4.0
 
 
 def pixel_centers(height=HEIGHT, width=WIDTH):
@@ -103,6 +107,23 @@ def trainer(field, optimizer):
             return compiled(state, views, count=count)
 
     return start, run
+
+
+@functools.partial(jax.jit, static_argnames="antialias")
+def footprints_of(surfels, camera, antialias):
+    """Project discs with a payload of zeros."""
+    discs, _ = projection.to_camera(projection.surfel_columns(surfels), camera)
+    opacity = jax.nn.sigmoid(surfels.opacity_logits)
+    payload = jnp.zeros((1, len(opacity)), opacity.dtype)
+    options = {"near": NEAR, "antialias": antialias}
+    return projection.project_discs(discs, opacity, payload, camera, **options)
+
+
+def drawn(scene, pixels, antialias):
+    """Return where the oracle's discs are visible, `[N, ...]`, at `pixels[..., 2]`."""
+    options = {"near": NEAR, "antialias": antialias}
+    alpha, _ = reference.intersect(scene, IDENTITY, INTRINSICS, pixels.reshape(-1, 2), **options)
+    return (alpha > 0).reshape(-1, *pixels.shape[:-1])
 
 
 def oracle(scene, camtoworld=IDENTITY, intrinsics=INTRINSICS, size=(HEIGHT, WIDTH), **options):

@@ -30,7 +30,7 @@ def path() -> pathlib.Path | None:
 
 @functools.cache
 def missing() -> str | None:
-    """Return None if the library is loaded, which this does on the first call; else why it is not."""
+    """Load the library on the first call; return None if it is loaded, else why it is not."""
     file = path()
     if file is None:
         return "it was not built"

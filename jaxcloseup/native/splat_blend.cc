@@ -20,7 +20,7 @@ namespace {
 
 // Cotangents of a row of the table from sums over all pixels, see `splat_math.row_bar`.
 void row_bar(const float* row, const float* sums, int features, float* bar) {
-  const float *low = sums + offside_sums(features), clip = low[3], *h = row + HOMOGRAPHY;
+  const float *low = sums + offside_sums(features), *h = row + HOMOGRAPHY;
   for (int axis = 0; axis < 2; axis++) {
     float moved = row[LOW_PASS] * low[1 + axis];
     for (int i = 0; i < 3; i++) moved -= sums[3 * i] * h[3 * i + 1 + axis];
@@ -28,7 +28,7 @@ void row_bar(const float* row, const float* sums, int features, float* bar) {
   }
   std::memcpy(bar + HOMOGRAPHY, sums, 9 * sizeof(float));
   // A clipped depth moves with the anchor's depth.
-  if (clip != 0) bar[HOMOGRAPHY + 6] += clip / (h[6] * h[6]);
+  if (h[6] * h[6] != 0) bar[HOMOGRAPHY + 6] += low[3] / (h[6] * h[6]);
   bar[OPACITY] = row[OPACITY] != 0 ? sums[SCALED] / row[OPACITY] : 0;
   for (int i = LOW_PASS; i < PAYLOAD; i++) bar[i] = 0;
   std::memcpy(bar + PAYLOAD, sums + PAYLOAD_SUMS, features * sizeof(float));

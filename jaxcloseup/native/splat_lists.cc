@@ -21,7 +21,8 @@ void sort_by_depth(const float* order, std::vector<int32_t>& indices) {
   std::vector<Key> from(size), to(size);
   std::vector<uint32_t> bins(3 * BINS);
   for (size_t i = 0; i < size; i++) {
-    std::memcpy(&from[i].depth, order + indices[i], sizeof from[i].depth);
+    const float depth = order[indices[i]] + 0.f;  // turns -0 into 0
+    std::memcpy(&from[i].depth, &depth, sizeof depth);
     from[i].index = indices[i];
     for (int pass = 0; pass < 3; pass++) bins[pass * BINS + (from[i].depth >> pass * BITS) % BINS]++;
   }
@@ -77,10 +78,10 @@ void BandLists::make(const Image& image, const Listing& listing, int number) {
     for (size_t k = 0; k < members.size(); k++) {
       const int i = members[k];
       const Range down = listing.boxes[listing.splats[i]].down;
-      const Range* ranges = listing.ranges.data() + listing.starts[i] - down.first;
+      const Range* ranges = listing.ranges.data() + listing.starts[i];
       const int last = std::min<int>(down.last, first_row + band_rows - 1);
       for (int row = std::max<int>(down.first, first_row); row <= last; row++)
-        work(static_cast<int>(k), row - first_row, ranges[row]);
+        work(static_cast<int>(k), row - first_row, ranges[row - down.first]);
     }
   };
   each_row([&](int, int row, Range range) {

@@ -40,13 +40,13 @@ inline D root(D x) {
 #endif
 }
 
-// Tiles with centers of pixels between two bounds, of `size` pixels in all; NaN has none.
+// Tiles with centers of pixels between two bounds, of `size` pixels in all; none if one is NaN.
 inline Range tiles_between(float low, float high, int size) {
   // Clipped before the cast: bounds may be infinite.
   float first = std::ceil(low - .5f), last = std::floor(high - .5f);
   first = first > 0 ? first : 0;
   last = last < size - 1 ? last : size - 1;
-  if (!(first <= last) || low != low) return {0, -1};
+  if (!(first <= last && low <= high)) return {0, -1};
   return {static_cast<int16_t>(static_cast<int>(first) / TILE), static_cast<int16_t>(static_cast<int>(last) / TILE)};
 }
 

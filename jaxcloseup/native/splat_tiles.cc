@@ -63,7 +63,8 @@ inline Shade shade(const float* row, float ox, float oy, V x, V y, float near) {
   s.inverse = select(s.on_plane, s.w, clipped);
   s.z = 1.f / s.inverse;
   s.rho = select(s.on_plane, squared * (s.z * s.z), low);
-  s.alpha = lesser(row[OPACITY] * exponential(-.5f * s.rho), broadcast(ALPHA_MAX));
+  // In this order, so that NaN stays and is not drawn.
+  s.alpha = lesser(broadcast(ALPHA_MAX), row[OPACITY] * exponential(-.5f * s.rho));
   s.drawn = at_most(broadcast(ALPHA_MIN), s.alpha) & at_most(s.w * near, broadcast(1));
   return s;
 }

@@ -4,39 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import reference_splats as reference
-from splat_scenes import (
-    HEIGHT,
-    IDENTITY,
-    INTRINSICS,
-    NEAR,
-    SCENES,
-    WIDTH,
-    random_scene,
-    to_camera,
-    to_surfels,
-)
+from splat_scenes import CROWDS, HEIGHT, NEAR, WIDTH, drawn, footprints_of, to_camera, to_surfels
 
-from jaxcloseup.fields.splats import projection
 from jaxcloseup.fields.splats.layout import pack
 from jaxcloseup.fields.splats.tile_test import reaches
 
 
-CROWDS = {
-    **SCENES,
-    "long": random_scene(5, count=40, log_scale=(-7.0, -0.5)),
-    "faint": random_scene(6, count=40, log_scale=(-5.0, -2.0)),
-}
-CROWDS["faint"]["opacity_logits"] -= 4.0
-
-
 _reaches = jax.jit(reaches, static_argnames=("tile", "near"))
-
-
-def drawn(scene, pixels, antialias):
-    options = {"near": NEAR, "antialias": antialias}
-    alpha, _ = reference.intersect(scene, IDENTITY, INTRINSICS, pixels.reshape(-1, 2), **options)
-    return (alpha > 0).reshape(-1, *pixels.shape[:2])
 
 
 def pixels_of(corners, at):
@@ -50,19 +24,14 @@ def pixels_of(corners, at):
 @pytest.mark.parametrize("name", CROWDS)
 def test_a_surfel_is_listed_where_it_draws_and_hardly_elsewhere(name, tile, antialias):
     scene = CROWDS[name]
-    surfels, camera = to_surfels(scene), to_camera()
-    discs, _ = projection.to_camera(projection.surfel_columns(surfels), camera)
-    opacity = jax.nn.sigmoid(surfels.opacity_logits)
-    payload = jnp.zeros((1, len(opacity)))
-    options = {"near": NEAR, "antialias": antialias}
-    footprints = projection.project_discs(discs, opacity, payload, camera, **options)
+    footprints = footprints_of(to_surfels(scene), to_camera(), antialias)
     corners = np.stack(np.meshgrid(range(0, WIDTH, tile), range(0, HEIGHT, tile)), -1)
     corners = corners.reshape(-1, 2)
-    splat, where = np.mgrid[: len(opacity), : len(corners)].reshape(2, -1)
+    splat, where = np.mgrid[: len(scene["means"]), : len(corners)].reshape(2, -1)
     splat, corner = jnp.asarray(splat), jnp.asarray(corners[where])
     found = _reaches(pack(footprints), splat, corner, tile=tile, near=NEAR)
     visible = np.asarray(footprints.opacity) > 0  # the boxes of others are empty
-    found = np.asarray(found).reshape(len(opacity), -1) & visible[:, None]
+    found = np.asarray(found).reshape(-1, len(corners)) & visible[:, None]
 
     at_pixels = drawn(scene, pixels_of(corners, np.arange(tile) + 0.5), antialias).any(-1)
     assert at_pixels.any() and not np.any(at_pixels & ~found)
