@@ -12,7 +12,19 @@ from absl import flags
 from jaxcloseup.app.cli.start import start
 
 
-SUITES = ("nerf", "warp", "labels", "splats", "sweep", "resume", "detail", "scales", "teach", "gpu")
+SUITES = (
+    "nerf",
+    "warp",
+    "labels",
+    "splats",
+    "steps",
+    "sweep",
+    "resume",
+    "detail",
+    "scales",
+    "teach",
+    "gpu",
+)
 
 _SUITE = flags.DEFINE_list("suite", ["nerf", "warp"], f"suites to run: {', '.join(SUITES)}")
 

@@ -33,6 +33,29 @@ class Rendering(NamedTuple):
     overflow: jax.Array | None = None
 
 
+class Local(NamedTuple):
+    """How steps touch only the part of a field that their cameras see.
+
+    A state is prepared for many steps. The functions are called outside of `jax.jit`, since the
+    size of a part differs from step to step.
+
+    Attributes:
+      prepare: `(state) -> state`, with what `take` needs; its arrays are copies.
+      take: `(state, cameras) -> (part, place)`, a state of what the cameras may see, and where it
+        belongs.
+      adapt: `(key, part) -> part`, what every step changes besides.
+      put: `(key, state, part, place) -> state`, with the part in its place. The arrays of the
+        state before are given away.
+      finish: `(state) -> state`, as it was before `prepare`, but for the order of its rows.
+    """
+
+    prepare: Callable[[Any], Any]
+    take: Callable[[Any, Any], tuple[Any, Any]]
+    adapt: Callable[[jax.Array, Any], Any]
+    put: Callable[[jax.Array, Any, Any, Any], Any]
+    finish: Callable[[Any], Any]
+
+
 class RadianceField(NamedTuple):
     """Pure functions that make a renderer trainable.
 
@@ -46,6 +69,7 @@ class RadianceField(NamedTuple):
       adapt: `(key, state) -> state`, density control or occupancy refresh; identity by default.
       gradient_chunk: pixels that training differentiates at once, see `rendered_loss`; None for
         all. With chunks, every array that `render` returns is per pixel.
+      local: for fields of which a view can change a part alone; None where it can change all.
     """
 
     init: Callable[..., tuple[Any, Any]]
@@ -53,3 +77,4 @@ class RadianceField(NamedTuple):
     loss: Callable[..., tuple[jax.Array, dict[str, jax.Array]]]
     adapt: Callable[..., Any] = lambda key, state: state
     gradient_chunk: int | None = None
+    local: Local | None = None

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,13 +10,26 @@ import optax
 from flax import struct
 
 from jaxcloseup.fields.contract import RadianceField
+from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.training.parallel import Spread
 from jaxcloseup.training.sampling import DrawKeys, draw_keys
 
 
 Metrics = dict[str, jax.Array]
-# `(params, buffers, keys, data) -> loss, metrics` of one draw.
-DrawLoss = Callable[[Any, Any, DrawKeys, Any], tuple[jax.Array, Metrics]]
+
+
+class DrawLoss(NamedTuple):
+    """The loss of one draw of a step.
+
+    Attributes:
+      draw: `(keys, data) -> drawn`, draws at random what the step looks at.
+      loss: `(params, buffers, drawn) -> loss, metrics`.
+      cameras: `(drawn) -> cameras`, all that the loss renders.
+    """
+
+    draw: Callable[[DrawKeys, Any], Any]
+    loss: Callable[[Any, Any, Any], tuple[jax.Array, Metrics]]
+    cameras: Callable[[Any], tuple[Camera, ...]]
 
 
 class TrainState(struct.PyTreeNode):
@@ -61,7 +74,7 @@ def init_state(
 
 def update_state(
     state: TrainState,
-    loss: DrawLoss,
+    of_draw: DrawLoss,
     data: Any,
     *,
     field: RadianceField,
@@ -69,45 +82,54 @@ def update_state(
     draws: int,
     spread: Spread,
     lr_scale: jax.Array | None = None,
+    local: bool = False,
 ) -> tuple[TrainState, Metrics]:
     """Take one optimizer step along the mean gradient of the draws' losses.
 
     Args:
       state: training state.
-      loss: loss and metrics of one draw.
-      data: what all draws read; passed to `loss`.
+      of_draw: what one draw looks at, and its loss.
+      data: what all draws read.
       field: static; its `adapt` follows the update.
       optimizer: static.
       draws: static; how many there are.
       spread: how several draws are taken.
       lr_scale: `[]` factor on the optimizer's updates; None: 1.
+      local: static; touch only what the step sees, where the field has `local`: for one draw,
+        outside of `jax.jit`, of a state that `field.local.prepare` made.
 
     Returns:
       The next state and the metrics, as in `train_step`.
     """
     keys, key_adapt = draw_keys(state.key, state.step, draws)
+    scale = jnp.ones(()) if lr_scale is None else lr_scale
+    advance = functools.partial(_advance, update=optimizer.update)
+    if local and field.local is not None:
+        drawn = of_draw.draw(keys, data)
+        part, place = field.local.take(state, of_draw.cameras(drawn))
+        (value, metrics), gradients = _differentiate(of_draw, part.params, part.buffers, drawn)
+        part, skipped = advance(part, key_adapt, value, gradients, scale, adapt=field.local.adapt)
+        after = field.local.put(key_adapt, state, part, place)
+        return after, {"loss": value, "skipped": skipped} | metrics
 
     def gradient(keys: DrawKeys, shared: tuple[Any, Any, Any]) -> Any:
         params, buffers, data = shared
-
-        def of_params(params: Any) -> tuple[jax.Array, Metrics]:
-            return loss(params, buffers, keys, data)
-
-        return jax.value_and_grad(of_params, has_aux=True)(params)
+        return _differentiate(of_draw, params, buffers, of_draw.draw(keys, data))
 
     shared = state.params, state.buffers, data
     found = spread(gradient, keys, shared) if draws > 1 else gradient(keys, shared)
     (value, metrics), gradients = found
-    after, skipped = _advance(
-        state,
-        key_adapt,
-        value,
-        gradients,
-        jnp.ones(()) if lr_scale is None else lr_scale,
-        update=optimizer.update,
-        adapt=field.adapt,
-    )
+    after, skipped = advance(state, key_adapt, value, gradients, scale, adapt=field.adapt)
     return after, {"loss": value, "skipped": skipped} | metrics
+
+
+def _differentiate(of_draw: DrawLoss, params: Any, buffers: Any, drawn: Any) -> Any:
+    """Return the loss with its metrics, and its gradient by the parameters."""
+
+    def of_params(params: Any) -> tuple[jax.Array, Metrics]:
+        return of_draw.loss(params, buffers, drawn)
+
+    return jax.value_and_grad(of_params, has_aux=True)(params)
 
 
 # Compiled by itself for fields that render whole images: all kinds of steps share it.

@@ -37,6 +37,7 @@ def train_step(
     config: TrainConfig,
     spread: Spread = in_a_loop,
     sequential: bool = False,
+    local: bool = False,
 ) -> tuple[TrainState, Metrics]:
     """Take one step on training photographs alone.
 
@@ -49,6 +50,7 @@ def train_step(
       config: static.
       spread: how several draws are taken.
       sequential: static; see `rendered_loss`.
+      local: static; touch only the part of the field that the step sees, see `update_state`.
 
     Returns:
       The next state, and metrics: `loss`, `skipped` and those of the field. A step whose loss or
@@ -56,19 +58,22 @@ def train_step(
     """
     loss_of = _bind_loss(field, sequential=sequential)
 
-    def loss(params: Any, buffers: Any, keys: DrawKeys, views: Views | Windows) -> Loss:
-        batch = sample_batch(keys.batch, views, config.num_rays)
-        return loss_of(params, buffers, batch, keys.render)
+    def draw(keys: DrawKeys, views: Views | Windows) -> Any:
+        return sample_batch(keys.batch, views, config.num_rays), keys.render
+
+    def loss(params: Any, buffers: Any, drawn: Any) -> Loss:
+        return loss_of(params, buffers, *drawn)
 
     return update_state(
         state,
-        loss,
+        DrawLoss(draw, loss, lambda drawn: (drawn[0].cameras,)),
         views,
         field=field,
         optimizer=optimizer,
         draws=config.num_windows,
         spread=spread,
         lr_scale=lr_scale,
+        local=local,
     )
 
 
@@ -103,6 +108,7 @@ def closeup_step(
     config: TrainConfig,
     spread: Spread = in_a_loop,
     sequential: bool = False,
+    local: bool = False,
 ) -> tuple[TrainState, Metrics]:
     """Take one step on training photographs and on one pseudo-labeled random close-up.
 
@@ -121,6 +127,7 @@ def closeup_step(
       spread: how several draws are taken.
       sequential: static; under `jax.vmap`, render the pixels of one member after another; see
         `rendered_loss`.
+      local: static; as in `train_step`.
 
     Returns:
       The next state, and metrics with `label_coverage`, the share of labeled virtual pixels; unless
@@ -135,6 +142,7 @@ def closeup_step(
         draws=config.num_windows,
         spread=spread,
         lr_scale=settings.lr_scale,
+        local=local,
     )
 
 
@@ -144,15 +152,14 @@ def _closeup_loss(field: RadianceField, config: TrainConfig, *, sequential: bool
     loss_of = _bind_loss(field, sequential=sequential)
     render = _render_pixels(field, sequential=sequential and not whole)
 
-    def loss(
-        params: Any,
-        buffers: Any,
-        keys: DrawKeys,
-        data: tuple[Views | Windows, LabelSources, PseudoSettings],
-    ) -> Loss:
+    def draw(keys: DrawKeys, data: tuple[Views | Windows, LabelSources, PseudoSettings]) -> Any:
         views, sources, settings = data
         batch = sample_batch(keys.batch, views, config.num_rays)
         virtual = sample_closeup(keys.label, sources, settings, config.num_label_rays)
+        return batch, keys.render, virtual, sources, settings
+
+    def loss(params: Any, buffers: Any, drawn: Any) -> Loss:
+        batch, key_render, virtual, sources, settings = drawn
         camera = virtual.camera
         key_depth = rule.depth_key(virtual.key_depth)
         fixed = jax.lax.stop_gradient(params)
@@ -165,13 +172,13 @@ def _closeup_loss(field: RadianceField, config: TrainConfig, *, sequential: bool
         add = add_label_loss if whole else rule.loss
         value, metrics = add(
             lambda batch, key: loss_of(params, buffers, batch, key),
-            (batch, keys.render),
+            (batch, key_render),
             (labeled, virtual.key_render),
             settings.label_loss_weight,
         )
         return value, metrics | {"label_coverage": jnp.mean(label.weight)}
 
-    return loss
+    return DrawLoss(draw, loss, lambda drawn: (drawn[0].cameras, drawn[2].camera))
 
 
 def labeled_step(
@@ -185,6 +192,7 @@ def labeled_step(
     config: TrainConfig,
     spread: Spread = in_a_loop,
     sequential: bool = False,
+    local: bool = False,
 ) -> tuple[TrainState, Metrics]:
     """Take one step on training photographs and on views labeled once, such as target views.
 
@@ -201,35 +209,38 @@ def labeled_step(
       config: static.
       spread: how several draws are taken.
       sequential: static; see `rendered_loss`.
+      local: static; as in `train_step`.
 
     Returns:
       The next state and metrics; the field's metrics of the labeled pixels as `label_<name>`.
     """
     loss_of = _bind_loss(field, sequential=sequential)
 
-    def loss(
-        params: Any,
-        buffers: Any,
-        keys: DrawKeys,
-        data: tuple[Views | Windows, Views | Windows, PseudoSettings],
-    ) -> Loss:
+    def draw(keys: DrawKeys, data: tuple[Views | Windows, Views | Windows, PseudoSettings]) -> Any:
         views, labels, settings = data
+        batch = sample_batch(keys.batch, views, config.num_rays)
+        labeled = sample_labels(keys.label, labels, config.num_label_rays)
+        return (batch, keys.render), labeled, settings
+
+    def loss(params: Any, buffers: Any, drawn: Any) -> Loss:
+        photographs, labeled, settings = drawn
         return add_label_loss(
             lambda batch, key: loss_of(params, buffers, batch, key),
-            (sample_batch(keys.batch, views, config.num_rays), keys.render),
-            sample_labels(keys.label, labels, config.num_label_rays),
+            photographs,
+            labeled,
             settings.label_loss_weight,
         )
 
     return update_state(
         state,
-        loss,
+        DrawLoss(draw, loss, lambda drawn: (drawn[0][0].cameras, drawn[1][0].cameras)),
         (views, labels, settings),
         field=field,
         optimizer=optimizer,
         draws=config.num_windows,
         spread=spread,
         lr_scale=settings.lr_scale,
+        local=local,
     )
 
 

@@ -220,7 +220,13 @@ class Programs:
         if isinstance(data, ArmsData):
             return gather_hosts(self._run_together(state, data, count))
         if self._in_parts:
-            return _run_in_parts(functools.partial(data.step, **self._static), state, count=count)
+            step = functools.partial(data.step, **self._static)
+            local = self.field.local if self.preset.train.num_windows == 1 else None
+            if local is None or jax.default_backend() != "cpu":
+                return _run_in_parts(step, state, count=count)
+            step = functools.partial(step, local=True)
+            state, metrics = _run_in_parts(step, local.prepare(state), count=count)
+            return local.finish(state), metrics
         result = self._run(state, data, count)
         return result if self._mesh is None else one_copy(result)
 

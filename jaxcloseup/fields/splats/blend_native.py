@@ -94,8 +94,5 @@ def _call(name: str, result: Any, static: tuple[RasterPlan, int, int], *arrays: 
     plan, height, width = static
     function = jax.ffi.ffi_call(f"jaxcloseup_{name}", result, vmap_method="broadcast_all")
     return function(
-        *arrays,
-        height=np.int64(height),
-        width=np.int64(width),
-        near=np.float32(plan.near),
+        *arrays, height=np.int64(height), width=np.int64(width), near=np.float32(plan.near)
     )

@@ -12,10 +12,17 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxcloseup.fields.contract import RadianceField, Rendering
-from jaxcloseup.fields.splats.config import GaussianConfig, SplatConfig, SurfelConfig
+from jaxcloseup.fields.contract import Local, RadianceField, Rendering
+from jaxcloseup.fields.splats.config import (
+    AdaptiveConfig,
+    GaussianConfig,
+    McmcConfig,
+    SplatConfig,
+    SurfelConfig,
+)
 from jaxcloseup.fields.splats.control import DensityControl
 from jaxcloseup.fields.splats.filters import sampling_intervals, smoothed
+from jaxcloseup.fields.splats.local import Bounds, local_steps
 from jaxcloseup.fields.splats.render import SurfelAux, render_surfels
 from jaxcloseup.fields.splats.splat_loss import penalty_of, prior_of, splat_loss
 from jaxcloseup.fields.splats.splat_optimizer import control_of
@@ -37,6 +44,8 @@ class SurfelBuffers(struct.PyTreeNode):
       expected: `[]` 1 where `Rendering.depth` is the expected depth, 0 where it is the median.
       interval: `[N]` between the pixels of the photographs that show surfels finest, in world
         units; None without a smoothing filter, see `filters`.
+      number: `[]` living surfels in all, where these are a part of them; None: count them.
+      bounds: boxes around chunks of surfels, see `local`; None but in local steps.
     """
 
     alive: jax.Array
@@ -44,6 +53,8 @@ class SurfelBuffers(struct.PyTreeNode):
     regularize: jax.Array
     expected: jax.Array
     interval: jax.Array | None = None
+    number: jax.Array | None = None
+    bounds: Bounds | None = None
 
 
 class SurfelFieldAux(NamedTuple):
@@ -116,7 +127,9 @@ def surfel_field(
         return draw(params, buffers, camera)
 
     loss = jax.jit(functools.partial(splat_loss, config=config))
-    return RadianceField(init=field.init, render=render, loss=loss, adapt=jax.jit(field.adapt))
+    return RadianceField(
+        init=field.init, render=render, loss=loss, adapt=jax.jit(field.adapt), local=field.local()
+    )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -163,19 +176,44 @@ class _SplatField:
         # The penalty is computed here, for `loss` knows no camera.
         penalty = buffers.regularize * penalty_of(image, camera, config)
         # Priors act on the parameters, not on what the filter makes of them.
-        prior = prior_of(params, buffers.alive, config, self.extent)
+        prior = prior_of(params, buffers.alive, config, self.extent, buffers.number)
         return image._replace(
             depth=jnp.where(buffers.expected > 0, image.depth, image.aux.median_depth),
             aux=SurfelFieldAux(image.aux, penalty, prior),
         )
 
     def adapt(self, key: jax.Array, state: Any) -> Any:
-        degree, regularize = _schedule(self.config, state.step)
-        buffers = state.buffers.replace(degree=degree, regularize=regularize)
-        state = self.control.adapt(key, state.replace(buffers=buffers))
-        surfels = _bound_scales(state.params, self.config, self.extent, self.center)
-        state = state.replace(params=surfels)
+        state = self.control.adapt(key, self.follow_schedule(state))
+        state = self.bound_scales(state)
         return state if self.photographs is None else self.renew_intervals(state)
+
+    def follow_schedule(self, state: Any) -> Any:
+        degree, regularize = _schedule(self.config, state.step)
+        return state.replace(buffers=state.buffers.replace(degree=degree, regularize=regularize))
+
+    def bound_scales(self, state: Any) -> Any:
+        surfels = _bound_scales(state.params, self.config, self.extent, self.center)
+        return state.replace(params=surfels)
+
+    def local(self) -> Local | None:
+        """Return how steps touch a part of the surfels, if they leave the others as they are."""
+        config, density = self.config, self.config.density
+        noise = isinstance(density, McmcConfig) and density.noise > 0
+        if not config.selective_adam or noise or isinstance(density, AdaptiveConfig):
+            return None
+        every: Any = _RENEWED_EVERY if density is None else density.every
+
+        def adapt(key: jax.Array, part: Any) -> Any:
+            del key
+            return self.bound_scales(self.follow_schedule(part))
+
+        return local_steps(
+            config.capacity,
+            near=config.raster.near,
+            adapt=jax.jit(adapt),
+            adapt_all=jax.jit(self.adapt),
+            is_due=lambda step: step % every == 0,
+        )
 
     def renew_intervals(self, state: Any) -> Any:
         """Renew sampling intervals after every density control, which moves surfels far."""

@@ -88,13 +88,22 @@ def penalty_of(image: Rendering, camera: Camera, config: SplatConfig) -> jax.Arr
     return config.normal_weight * inconsistency + config.distortion_weight * distortion
 
 
-def prior_of(surfels: Surfels, alive: jax.Array, config: SplatConfig, extent: float) -> jax.Array:
-    """Return the weighted mean opacity and scale `[]` of living surfels.
+def prior_of(
+    surfels: Surfels,
+    alive: jax.Array,
+    config: SplatConfig,
+    extent: float,
+    number: jax.Array | None = None,
+) -> jax.Array:
+    """Return the weighted mean opacity and scale `[]` of living surfels, or these ones' share.
+
+    `number` is how many live in all, where these are a part of them.
 
     Both fade surfels that nothing holds, which MCMC density control then moves (Kheradmand et al.
     2024, equation 10).
     """
-    number = jnp.sum(alive, dtype=surfels.means.dtype)
+    if number is None:
+        number = jnp.sum(alive, dtype=surfels.means.dtype)
 
     def mean(values: jax.Array) -> jax.Array:
         return safe_divide(jnp.sum(jnp.where(alive, values, 0)), number)

@@ -55,9 +55,7 @@ def _render(
     return sums, median
 
 
-def _call_forward(
-    config: RasterizeConfig, size: tuple[int, int], splats: Any, camera: Any
-) -> Any:
+def _call_forward(config: RasterizeConfig, size: tuple[int, int], splats: Any, camera: Any) -> Any:
     image = functools.partial(jax.ShapeDtypeStruct, size)
     results = [
         jax.ShapeDtypeStruct((FEATURES + MOMENTS, *size), jnp.float32),
