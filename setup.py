@@ -12,7 +12,10 @@ from setuptools.command.build_ext import build_ext
 FOLDER = pathlib.Path("jaxcloseup/native")
 FLAGS = ["-std=c++17", "-O3", "-g0", "-ffp-contract=off", "-fvisibility=hidden", "-Wno-psabi"]
 # The files that are compiled for several processors, of which one is chosen when it is loaded.
-OF_PROCESSOR = [str(FOLDER / f"splat_{name}.cc") for name in ("project", "reach", "tiles")]
+OF_PROCESSOR = [
+    str(FOLDER / f"{name}.cc")
+    for name in ("gather_block", "splat_project", "splat_reach", "splat_tiles")
+]
 PROCESSORS = {"baseline": []}
 if platform.machine() in ("x86_64", "AMD64"):
     PROCESSORS |= {

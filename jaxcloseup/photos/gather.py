@@ -7,12 +7,14 @@ render) show what the photographs know beyond a model.
 import functools
 import math
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import chex
 import jax
 import jax.numpy as jnp
 
 from jaxcloseup.geometry.cameras import Camera, mean_focal, pixels_to_points
+from jaxcloseup.photos import gather_native
 from jaxcloseup.photos.depth_maps import GatherSources
 from jaxcloseup.photos.gather_sums import Gathered, GatherSettings, Reader, gather_points
 from jaxcloseup.photos.pyramids import Pyramid
@@ -95,18 +97,65 @@ def gather_parts(
         raise ValueError(
             f"{pyramid.values.shape[-1]} channels are not {len(settings)} parts of one size"
         )
+    arrays = _Arrays(
+        *(camera, pixels, depth, sources, pyramid),
+        *(jnp.asarray(index, jnp.int32) for index in (finest, exclude)),
+    )
+    if not gather_native.can_gather(*arrays[:5], parts=len(settings)):
+        return _gather_blocks(tuple(settings), arrays)
+    if _is_traced(arrays):
+        return _gather_natively(tuple(settings), arrays)
+    platforms = {device.platform for device in jnp.asarray(pyramid.values).devices()}
+    gather = _compiled_natively if platforms == {"cpu"} else _gather_blocks
+    return gather(tuple(settings), arrays)
+
+
+class _Arrays(NamedTuple):
+    """What is gathered, and where from: arguments of `gather_parts`."""
+
+    camera: Camera
+    pixels: jax.Array
+    depth: jax.Array
+    sources: GatherSources
+    pyramid: Pyramid
+    finest: jax.Array
+    exclude: jax.Array
+
+
+def _is_traced(arrays: Any) -> bool:
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(arrays))
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _gather_natively(settings: tuple[GatherSettings, ...], arrays: _Arrays) -> tuple[Gathered, ...]:
+    """Gather by the native library where a program is compiled for CPUs."""
+    native = functools.partial(gather_native.gather_image, settings=settings)
+    return jax.lax.platform_dependent(
+        arrays,
+        cpu=lambda arrays: native(*arrays[:5], finest=arrays.finest, exclude=arrays.exclude),
+        default=functools.partial(_gather_blocks, settings),
+    )
+
+
+@_gather_natively.defjvp
+def _differentiate(
+    settings: tuple[GatherSettings, ...], primals: tuple[_Arrays], tangents: tuple[_Arrays]
+) -> Any:
+    """Differentiate what is gathered in JAX instead."""
+    return jax.jvp(functools.partial(_gather_blocks, settings), primals, tangents)
+
+
+_compiled_natively = jax.jit(_gather_natively, static_argnums=0)
+
+
+def _gather_blocks(settings: tuple[GatherSettings, ...], arrays: _Arrays) -> tuple[Gathered, ...]:
+    """Gather in JAX, on any platform."""
+    camera, pixels, depth, sources, pyramid, finest, exclude = arrays
     # Blocks of one size share a program; in a trace, each would be a copy of it.
-    traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((camera, pixels, depth)))
+    traced = _is_traced((camera, pixels, depth))
     blocks = [
         _gather_chunks(
-            points,
-            side,
-            camera.position,
-            sources,
-            pyramid,
-            jnp.asarray(finest, jnp.int32),
-            jnp.asarray(exclude, jnp.int32),
-            settings=tuple(settings),
+            points, side, camera.position, sources, pyramid, finest, exclude, settings=settings
         )
         for points, side in _surface(camera, pixels, depth, whole=traced)
     ]
