@@ -20,7 +20,6 @@ namespace jaxcloseup {
 namespace {
 
 typedef float Four __attribute__((vector_size(16)));
-typedef int32_t Places __attribute__((vector_size(16)));
 typedef float Channels __attribute__((vector_size(4 * LANES)));
 
 inline V root(V x) {
@@ -205,61 +204,120 @@ inline Channels load_channels(const uint8_t* from) {
 }
 #endif
 
-// Adds a share of one pixel's channels to a value. Vectors may reach beyond a pixel, not the image.
+// a b + c
+inline Channels add_product(Channels a, Channels b, Channels c) {
+#if defined(__FMA__)
+  return (Channels)_mm256_fmadd_ps((__m256)a, (__m256)b, (__m256)c);
+#else
+  return a * b + c;
+#endif
+}
+
+// A photograph's values, and where reading must end: vectors may reach beyond a pixel.
 template <typename T>
-inline void add_pixel(const Job& job, const T* from, const T* end, int vectors, float share, Channels* value) {
-  const int channels = job.channels;
-  for (int v = 0; v < vectors; v++, from += LANES) {
-    if (__builtin_expect(end - from >= LANES, 1)) {
-      value[v] += share * load_channels(from);
-    } else {
-      T rest[LANES] = {};
-      std::memcpy(rest, from, (channels - v * LANES < LANES ? channels - v * LANES : LANES) * sizeof(T));
-      value[v] += share * load_channels(rest);
+struct Values {
+  const T *first, *end;
+  int channels;
+};
+
+// Adds shares of two pixels that lie side by side to a value; the second one may lie beyond a row,
+// without a share.
+template <typename T>
+inline void add_pixels(const Values<T>& values, int32_t place, float left, float right, int vectors, Channels* value) {
+  const T* from = values.first + int64_t(place) * values.channels;
+  if (__builtin_expect(values.end - from >= values.channels + vectors * LANES, 1)) {
+    const bool both = sizeof(T) == 1 || right != 0;  // floats may not be numbers
+    for (int v = 0; v < vectors; v++) {
+      value[v] = add_product(Channels{} + left, load_channels(from + v * LANES), value[v]);
+      if (both) value[v] = add_product(Channels{} + right, load_channels(from + values.channels + v * LANES), value[v]);
     }
+    return;
+  }
+  for (int c = 0; c < values.channels; c++) {
+    float& sum = reinterpret_cast<float*>(value)[c];
+    sum += left * from[c];
+    if (right != 0) sum += right * from[values.channels + c];
   }
 }
 
-// Where a point falls on two neighboring levels, and how much of each of the four pixels around it
-// counts there.
+// The four pixels around each point on two neighboring levels, and their shares in its value.
 struct Taps {
-  int32_t place[8];
-  float share[8];
+  const Record* record;
+  float wanted[BLOCK];       // not 0 if the photograph matters at the point
+  int32_t place[4][BLOCK];   // of the left pixels above and below, on the finer level and the other
+  float share[8][BLOCK];     // of each of these, and of the one to its right
 };
 
-inline Taps find_taps(const LevelPair& pair, float x, float y, float coarser) {
-  const Four at = {x, y, x, y};
-  Four focal, center, most;
-  std::memcpy(&focal, pair.focal, sizeof focal);
-  std::memcpy(&center, pair.center, sizeof center);
-  std::memcpy(&most, pair.most, sizeof most);
-  Four pixel = at * focal + (center - .5f);
-  pixel = pixel > -2.f ? pixel : Four{} - 2.f;  // also if not a number
-  pixel = pixel < 0x1p20f ? pixel : Four{} + 0x1p20f;
-  const Places whole = __builtin_convertvector(pixel, Places);
-  const Four corner = __builtin_convertvector(whole + (Places)(__builtin_convertvector(whole, Four) > pixel), Four);
-  const Four after = pixel - corner, before = 1.f - after, next = corner + 1.f;
-  const auto clip = [&](Four to) {
-    to = to > 0.f ? to : Four{};
-    return __builtin_convertvector(to < most ? to : most, Places);
-  };
-  const Places first = clip(corner), last = clip(next);
-  Taps taps;
-  for (int level = 0; level < 2; level++) {
-    const int i = 2 * level, k = 4 * level, width = pair.width[level], start = pair.start[level];
-    const float part = level ? coarser : 1 - coarser;
-    const int32_t top = start + first[i + 1] * width, bottom = start + last[i + 1] * width;
-    taps.place[k] = top + first[i];
-    taps.place[k + 1] = top + last[i];
-    taps.place[k + 2] = bottom + first[i];
-    taps.place[k + 3] = bottom + last[i];
-    const float above = part * before[i + 1], below = part * after[i + 1];
-    taps.share[k] = above * before[i];
-    taps.share[k + 1] = above * after[i];
-    taps.share[k + 2] = below * before[i];
-    taps.share[k + 3] = below * after[i];
+// Finds the pixels on one of the levels, at points of a mask.
+inline void find_pixels(const LevelPair& pair, int level, V x, V y, V share, M at, int j, Taps& taps) {
+  I first[2], other;  // of the pixels before, and whether there is another one behind
+  V before[2], after[2];
+  for (int axis = 0; axis < 2; axis++) {
+    const int i = 2 * level + axis;
+    const V most = broadcast(pair.most[i]);
+    V pixel = mad(axis ? y : x, broadcast(pair.focal[i]), broadcast(pair.center[i] - .5f));
+    pixel = lesser(greater(pixel, broadcast(-2)), broadcast(0x1p20f));  // also if not a number
+    const V corner = __builtin_convertvector(floor_of(pixel), V);
+    const M between = at_most(V{}, corner) & less(corner, most);
+    after[axis] = select(between, pixel - corner);
+    before[axis] = 1.f - after[axis];
+    first[axis] = __builtin_convertvector(lesser(greater(corner, V{}), most), I);
+    if (axis) other = (I)select(between, (V)(I{} + pair.width[level]));
   }
-  return taps;
+  const I top = pair.start[level] + first[1] * pair.width[level] + first[0], bottom = top + other;
+  const V above = share * before[1], below = share * after[1];
+  const V shares[4] = {above * before[0], above * after[0], below * before[0], below * after[0]};
+  float* places[2] = {(float*)taps.place[2 * level] + j, (float*)taps.place[2 * level + 1] + j};
+  store(places[0], select(at, (V)top, load(places[0])));
+  store(places[1], select(at, (V)bottom, load(places[1])));
+  for (int k = 0; k < 4; k++) {
+    float* to = taps.share[4 * level + k] + j;
+    store(to, select(at, shares[k], load(to)));
+  }
+}
+
+// Where a group of parts is read.
+struct Group {
+  bool own[MOST_PARTS];
+  float finer;
+};
+
+// Finds what has to be read of a photograph, and fetches it; returns whether that is anything.
+bool find_taps(const Job& job, const Points& points, const Workspace& work, const Group& group, const Record& record,
+               int bytes, const char* values, Taps& taps) {
+  const Photograph& of = job.photograph[record.photograph];
+  const LevelPair* pairs = job.pairs + record.photograph * job.levels;
+  bool found = false;
+  taps.record = &record;
+  for (int j = 0; j < points.count; j += WIDTH) {
+    M wanted = less(broadcast(1), V{});
+    for (int k = 0; k < job.parts; k++)
+      if (group.own[k])
+        wanted = wanted | less(NEGLIGIBLE * load(work.parts[k].weight + j), load(record.weight[k] + j));
+    store(taps.wanted + j, select(wanted, broadcast(1)));
+    if (!any(wanted)) continue;
+    found = true;
+    const V coarser = -load(record.size + j) - group.finer;
+    V level = V{};
+    for (int l = 0; l + 1 < job.levels; l++) {
+      const float step = of.coarseness[l + 1] - of.coarseness[l];
+      level += lesser(greater((coarser - of.coarseness[l]) / step, V{}), broadcast(1));
+    }
+    level = select(wanted, greater(level, broadcast(job.finest)), broadcast(job.finest));
+    const V whole = __builtin_convertvector(__builtin_convertvector(level, I), V);
+    const V x = load(record.ray[0] + j), y = load(record.ray[1] + j), share = level - whole;
+    // Neighboring points mostly lie between the same two levels.
+    for (int l = job.finest; l < job.levels; l++) {
+      const M at = equal(whole, broadcast(l)) & wanted;
+      if (!any(at)) continue;
+      find_pixels(pairs[l], 0, x, y, 1.f - share, at, j, taps);
+      find_pixels(pairs[l], 1, x, y, share, at, j, taps);
+    }
+    for (int p = j; p < j + WIDTH; p++)
+      if (taps.wanted[p] != 0)
+        for (int i = 0; i < 4; i++) __builtin_prefetch(values + int64_t(taps.place[i][p]) * bytes);
+  }
+  return found;
 }
 
 template <typename T>
@@ -267,91 +325,100 @@ inline float unit_of() {
   return sizeof(T) > 1 ? 1.f : T(-1) < T(0) ? 1 / 127.f : 1 / 255.f;
 }
 
-// Reads what the recorded photographs show and adds it, by their weights; once more for robust
-// parts, which compare it with the mean. VECTORS is the number of vectors of channels, or 0 for any.
+// Lowers the weights with which a point's robust parts count, where their values differ from the mean.
+template <typename T>
+inline void weigh_again(const Job& job, const Group& group, const Workspace& work, int p, const Channels* value,
+                        float* weight) {
+  const int each = job.part_channels();
+  const float *mean = work.values + p * job.vectors() * LANES, *read = reinterpret_cast<const float*>(value);
+  for (int k = 0; k < job.parts; k++) {
+    if (!group.own[k]) continue;
+    float apart = 0;
+    for (int c = k * each; c < (k + 1) * each; c++) {
+      const float off = unit_of<T>() * read[c] - mean[c];
+      apart += off * off;
+    }
+    const float variance = work.parts[k].variance[p];
+    const float odd = variance == 0 ? 1 : 1 + job.settings[k].robust * (apart / each) / variance;
+    weight[k] /= odd * odd;
+  }
+}
+
+// Reads what a photograph shows and adds it by its weights; `again` for robust parts alone.
+template <typename T, int VECTORS>
+void add_photograph(const Job& job, const Points& points, Workspace& work, const Group& group, const Values<T>& all,
+                    const Taps& taps, bool again) {
+  constexpr int MOST = VECTORS ? VECTORS : MOST_CHANNELS / LANES;
+  const int vectors = VECTORS ? VECTORS : job.vectors(), each = job.part_channels(), parts = job.parts;
+  float *sums = again ? work.robust : work.values, *squares = work.squares;
+  const Record& record = *taps.record;
+  Values<T> values = all;
+  values.first += record.photograph * job.pixels * job.channels;
+  Channels lanes[MOST_PARTS][MOST];  // 1 in the channels of a part
+  for (int k = 0; k < parts; k++)
+    for (int c = 0; c < vectors * LANES; c++) lanes[k][c / LANES][c % LANES] = group.own[k] && c / each == k;
+  for (int p = 0; p < points.count; p++) {
+    if (taps.wanted[p] == 0) continue;
+    Channels value[MOST];
+    for (int v = 0; v < vectors; v++) value[v] = Channels{};
+    const int most = taps.share[4][p] + taps.share[5][p] + taps.share[6][p] + taps.share[7][p] > 0 ? 4 : 2;
+    for (int i = 0; i < most; i++)
+      add_pixels(values, taps.place[i][p], taps.share[2 * i][p], taps.share[2 * i + 1][p], vectors, value);
+    float weight[MOST_PARTS] = {};
+    for (int k = 0; k < parts; k++) weight[k] = record.weight[k][p];
+    if (again) {
+      weigh_again<T>(job, group, work, p, value, weight);
+      for (int k = 0; k < parts; k++) work.robust_weight[k][p] += group.own[k] ? weight[k] : 0;
+    }
+    for (int v = 0; v < vectors; v++) {
+      Channels share = weight[0] * lanes[0][v], sum;
+      for (int k = 1; k < parts; k++) share = add_product(Channels{} + weight[k], lanes[k][v], share);
+      const int place = (p * vectors + v) * LANES;
+      const Channels weighted = share * value[v];
+      std::memcpy(&sum, sums + place, sizeof sum);
+      sum += weighted;
+      std::memcpy(sums + place, &sum, sizeof sum);
+      if (again) continue;
+      std::memcpy(&sum, squares + place, sizeof sum);
+      sum = add_product(weighted, value[v], sum);
+      std::memcpy(squares + place, &sum, sizeof sum);
+    }
+  }
+}
+
+// Adds what the recorded photographs show. VECTORS is the number of vectors of channels, or 0 for any.
 template <typename T, int VECTORS>
 void add_values(const Job& job, const Points& points, Workspace& work, int records, bool again) {
-  constexpr int MOST = VECTORS ? VECTORS : MOST_CHANNELS / LANES;
-  const int vectors = VECTORS ? VECTORS : job.vectors(), each = job.part_channels();
-  float* sums = again ? work.robust : work.values;
-  for (int group = 0; group < job.parts; group++) {
+  const T* first = static_cast<const T*>(job.values);
+  const int64_t size = job.pixels * job.channels;
+  const Values<T> values = {first, first + job.photographs * size, job.channels};
+  for (int head = 0; head < job.parts; head++) {
     // Parts that are read alike are read together, with the first of them.
-    const float finer = job.settings[group].finer;
-    bool own[MOST_PARTS], first = true, wanted = false;
+    Group group;
+    group.finer = job.settings[head].finer;
+    bool is_first = true, some = false;
     for (int k = 0; k < job.parts; k++) {
-      own[k] = job.settings[k].finer == finer && (!again || job.settings[k].robust != 0);
-      first = first && !(k < group && job.settings[k].finer == finer);
-      wanted = wanted || own[k];
+      const bool alike = job.settings[k].finer == group.finer;
+      group.own[k] = alike && (!again || job.settings[k].robust != 0);
+      is_first = is_first && !(k < head && alike);
+      some = some || group.own[k];
     }
-    if (!first || !wanted) continue;
-    Channels lanes[MOST_PARTS][MOST];  // 1 in the channels of a part
-    for (int k = 0; k < job.parts; k++)
-      for (int c = 0; c < vectors * LANES; c++) lanes[k][c / LANES][c % LANES] = own[k] && c / each == k;
-    for (int i = 0; i < records; i++) {
-      const Record& record = work.records[i];
-      const Photograph& of = job.photograph[record.photograph];
-      const LevelPair* pairs = job.pairs + record.photograph * job.levels;
-      const T* values = static_cast<const T*>(job.values) + record.photograph * job.pixels * job.channels;
-      const T* end = static_cast<const T*>(job.values) + job.photographs * job.pixels * job.channels;
-      int32_t levels[BLOCK];
-      float shares[BLOCK];
-      for (int j = 0; j < points.count; j += WIDTH) {
-        const V coarser = -load(record.size + j) - finer;
-        V level = V{};
-        for (int l = 0; l + 1 < job.levels; l++) {
-          const float step = of.coarseness[l + 1] - of.coarseness[l];
-          level += lesser(greater((coarser - of.coarseness[l]) / step, V{}), broadcast(1));
-        }
-        level = greater(level, broadcast(job.finest));
-        const V whole = __builtin_convertvector(__builtin_convertvector(level, I), V);
-        store(shares + j, level - whole);
-        const I index = __builtin_convertvector(whole, I);
-        std::memcpy(levels + j, &index, sizeof index);
+    if (!is_first || !some) continue;
+    // Memory is slow: while one photograph is read, the next one's pixels are on their way.
+    Taps taps[2];
+    int now = 0;
+    bool ready = false;
+    for (int i = 0; i <= records; i++) {
+      bool next = false;
+      if (i < records) {
+        const Record& record = work.records[i];
+        const char* from = reinterpret_cast<const char*>(first + record.photograph * size);
+        next = find_taps(job, points, work, group, record, job.channels * sizeof(T), from, taps[1 - now]);
+        if (!next) continue;
       }
-      for (int p = 0; p < points.count; p++) {
-        float weight[MOST_PARTS];
-        bool matters = false;
-        for (int k = 0; k < job.parts; k++) {
-          weight[k] = record.weight[k][p];
-          matters = matters || (own[k] && weight[k] > NEGLIGIBLE * work.parts[k].weight[p]);
-        }
-        if (!matters) continue;
-        const Taps taps = find_taps(pairs[levels[p]], record.ray[0][p], record.ray[1][p], shares[p]);
-        Channels value[MOST];
-        for (int v = 0; v < vectors; v++) value[v] = Channels{};
-        const int count = shares[p] > 0 ? 8 : 4;
-        for (int t = 0; t < count; t++)
-          add_pixel(job, values + int64_t(taps.place[t]) * job.channels, end, vectors, taps.share[t], value);
-        if (again) {
-          const float* mean = work.values + p * vectors * LANES;
-          for (int k = 0; k < job.parts; k++) {
-            if (!own[k]) continue;
-            float apart = 0;
-            for (int c = k * each; c < (k + 1) * each; c++) {
-              const float off = unit_of<T>() * value[c / LANES][c % LANES] - mean[c];
-              apart += off * off;
-            }
-            const float variance = work.parts[k].variance[p];
-            const float odd = variance == 0 ? 1 : 1 + job.settings[k].robust * (apart / each) / variance;
-            weight[k] /= odd * odd;
-            work.robust_weight[k][p] += weight[k];
-          }
-        }
-        for (int v = 0; v < vectors; v++) {
-          Channels share = weight[0] * lanes[0][v];
-          for (int k = 1; k < job.parts; k++) share += weight[k] * lanes[k][v];
-          Channels sum;
-          const int place = (p * vectors + v) * LANES;
-          std::memcpy(&sum, sums + place, sizeof sum);
-          const Channels weighted = share * value[v];
-          sum += weighted;
-          std::memcpy(sums + place, &sum, sizeof sum);
-          if (again) continue;
-          std::memcpy(&sum, work.squares + place, sizeof sum);
-          sum += weighted * value[v];
-          std::memcpy(work.squares + place, &sum, sizeof sum);
-        }
-      }
+      if (ready) add_photograph<T, VECTORS>(job, points, work, group, values, taps[now], again);
+      ready = next;
+      now = 1 - now;
     }
   }
 }
