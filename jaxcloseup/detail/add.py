@@ -17,7 +17,8 @@ from flax import struct
 
 from jaxcloseup.detail.features import pixel_features
 from jaxcloseup.detail.holes import OPAQUE, fill_holes, find_empty
-from jaxcloseup.detail.weights import DetailWeights, blend, expected_errors
+from jaxcloseup.detail.strips import predict_by_strips
+from jaxcloseup.detail.weights import DetailWeights, mix
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.geometry.numerics import safe_divide
@@ -106,9 +107,10 @@ def add_detail(
       alpha: `[H, W]` rendered opacity.
       depth: `[H, W]` rendered z-depth; 0 is undefined and gets no detail.
     """
-    candidates = find_candidates(detail, camera, pixels, rgb, alpha, depth)
-    sharper = _add(detail.weights, candidates, rgb)
-    filled = _fill(camera, pixels, sharper.rgb, alpha, candidates.weight > 0, detail.sources)
+    gathered = gather_parts(camera, pixels, depth, detail.sources, detail.shown, SETTINGS)
+    sharper = _add(detail.weights, detail.finer, gathered, rgb, alpha, depth)
+    seen = gathered[0].weight > 0
+    filled = _fill(camera, pixels, sharper.rgb, alpha, seen, detail.sources)
     return sharper._replace(rgb=filled)
 
 
@@ -159,18 +161,27 @@ def label_with_detail(
 
 
 @jax.jit
-def _add(weights: DetailWeights, candidates: Candidates, rgb: jax.Array) -> Detailed:
-    features = candidates.features
-    mixed, weight = blend(weights, features, candidates.residual, candidates.colors)
-    seen = candidates.weight > 0
+def _add(
+    weights: DetailWeights,
+    finer: jax.Array,
+    gathered: tuple[Gathered, Gathered],
+    rgb: jax.Array,
+    alpha: jax.Array,
+    depth: jax.Array,
+) -> Detailed:
+    residual, _ = gathered
+    instead = _instead(gathered, rgb)
+    outputs, errors = predict_by_strips(weights, finer, gathered, instead, alpha, depth)
+    mixed, weight = mix(jnp.moveaxis(outputs, 0, -1), residual.mean, instead)
+    seen = residual.weight > 0
     weight = jnp.where(seen, weight, 0)
     added = weight[..., None] * mixed
     # Photographs and view may differ in exposure, so detail keeps the mean color of the view.
     shift = safe_divide(jnp.sum(added, axis=(0, 1)), jnp.sum(weight))
     added = added - weight[..., None] * shift[None, None]
-    error = jnp.where(seen, expected_errors(weights, features)[..., 1], jnp.nan)
+    error = jnp.where(seen, jnp.exp(errors[1]), jnp.nan)
     sharper = jnp.clip(jnp.clip(rgb, 0, 1) + added, 0, 1)
-    return Detailed(sharper, weight, candidates.footprint, error)
+    return Detailed(sharper, weight, residual.footprint, error)
 
 
 @jax.jit
@@ -220,7 +231,13 @@ def _candidates(
     depth: jax.Array,
 ) -> Candidates:
     residual, colors = gathered
-    instead = (1 + colors.mean) / 2 - jnp.clip(rgb, 0, 1)
-    instead = jnp.where(colors.weight[..., None] > 0, instead, 0)
+    instead = _instead(gathered, rgb)
     features = pixel_features(residual, colors, instead, alpha, depth, finer)
     return Candidates(features, residual.mean, instead, residual.weight, residual.footprint)
+
+
+def _instead(gathered: tuple[Gathered, Gathered], rgb: jax.Array) -> jax.Array:
+    """Return gathered colors minus the render, `[H, W, 3]`; 0 where there are none."""
+    _, colors = gathered
+    instead = (1 + colors.mean) / 2 - jnp.clip(rgb, 0, 1)
+    return jnp.where(colors.weight[..., None] > 0, instead, 0)

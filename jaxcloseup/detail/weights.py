@@ -146,6 +146,24 @@ def _perceptron(network: Networks, features: jax.Array) -> jax.Array:
     return matmul(values, last[0]) + last[1][None]
 
 
+def mean_planes(networks: Networks, features: jax.Array) -> jax.Array:
+    """Return the mean of all networks' outputs `[2, N]` for features `[F, N]`.
+
+    On a CPU, this takes a third less time than `mean_output` if N is about 1000.
+    """
+    count = networks.center.shape[0]
+    outputs: Any = 0
+    for i in range(count):
+        center, scale, *layers = (
+            leaf[i] for leaf in (networks.center, networks.scale, *networks.layers)
+        )
+        values = jnp.clip((features - center[:, None]) * scale[:, None], -_UNUSUAL, _UNUSUAL)
+        for matrix, offset in zip(layers[:-2:2], layers[1:-2:2], strict=True):
+            values = jax.nn.relu(matmul(matrix.T, values) + offset[:, None])
+        outputs += matmul(layers[-2].T, values) + layers[-1][:, None]
+    return outputs / count
+
+
 def mix(outputs: jax.Array, residual: jax.Array, colors: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the mixture `[..., 3]` and its share `[...]` for outputs of the mixing networks."""
     share, mixture = jax.nn.sigmoid(outputs[..., 0]), jax.nn.sigmoid(outputs[..., 1:])
