@@ -194,7 +194,7 @@ def _fill(
     sources: GatherSources,
 ) -> jax.Array:
     def fill() -> jax.Array:
-        return fill_holes(rgb, alpha, seen, find_empty(camera, pixels, sources))
+        return fill_holes(rgb, alpha, seen, find_empty(camera, pixels, sources, ~seen))
 
     # Most views have no holes.
     return jax.lax.cond(jnp.any(~seen & (alpha < OPAQUE)), fill, lambda: rgb)

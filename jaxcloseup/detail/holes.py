@@ -7,9 +7,9 @@ black. A smooth continuation of the surroundings is nearer to the truth.
 import jax
 import jax.numpy as jnp
 
-from jaxcloseup.geometry.cameras import Camera, pixels_to_points, points_to_pixels
-from jaxcloseup.geometry.numerics import safe_divide
-from jaxcloseup.geometry.warp import backward_warp
+from jaxcloseup.geometry.cameras import Camera, pixels_to_rays
+from jaxcloseup.geometry.masks import in_bounds
+from jaxcloseup.geometry.numerics import matmul, safe_divide
 from jaxcloseup.photos.depth_maps import GatherSources
 
 
@@ -18,10 +18,13 @@ _PHOTOGRAPHS = 3  # photographs that must see through a place that counts as emp
 _DEPTHS = 16  # places that are tried on a ray,
 _REACH = 3.0  # from 2**-3 to 2**3 times the typical depth of the photographs
 _RAYS = 120  # rays that are tried across an image
+_BAND = 4  # rows of these that are skipped together
 _ACROSS = 20  # width in pixels of the small image whose enlargement blurs the rims of holes
 
 
-def find_empty(camera: Camera, pixels: jax.Array, sources: GatherSources) -> jax.Array:
+def find_empty(
+    camera: Camera, pixels: jax.Array, sources: GatherSources, wanted: jax.Array | None = None
+) -> jax.Array:
     """Return the pixels `[H, W]` whose rays pass a place behind which photographs see nothing.
 
     Dark surfaces may be learned as transparent, so these pixels may truly be black.
@@ -30,27 +33,57 @@ def find_empty(camera: Camera, pixels: jax.Array, sources: GatherSources) -> jax
       camera: camera of the view.
       pixels: `[H, W, 2]` its pixel centers, neighbors in the image.
       sources: depth maps of the photographs; an inverse depth of 0 means that nothing was seen.
+      wanted: `[H, W]` bool, where the answer is needed; elsewhere it may be False. None is
+        everywhere.
     """
     (height, width), step = pixels.shape[:2], max(1, round(pixels.shape[1] / _RAYS))
-    pixels, known = pixels[::step, ::step], sources.inverse_depth > 0
-    nothing = jnp.where(known, 0.0, 1.0)[..., None]
+    wanted = jnp.ones((height, width), bool) if wanted is None else wanted
+    wanted = jnp.pad(wanted, ((0, -height % step), (0, -width % step)))
+    wanted = wanted.reshape(-1, step, wanted.shape[1] // step, step).any((1, 3))
+    pixels = pixels[::step, ::step]
+    rows, columns = pixels.shape[:2]
+    pad = ((0, -rows % _BAND), (0, 0))
+    pixels = jnp.pad(pixels, (*pad, (0, 0)), mode="edge").reshape(-1, _BAND * columns, 2)
+    wanted = jnp.pad(wanted, pad).reshape(-1, _BAND * columns)
+
+    def find(band: tuple[jax.Array, jax.Array]) -> jax.Array:
+        pixels, wanted = band
+        return jax.lax.cond(
+            jnp.any(wanted),
+            lambda: _pass_emptiness(camera, pixels, sources),
+            lambda: jnp.zeros(wanted.shape, bool),
+        )
+
+    empty = jax.lax.map(find, (pixels, wanted)).reshape(-1, columns)[:rows]
+    return jnp.repeat(jnp.repeat(empty, step, axis=0), step, axis=1)[:height, :width]
+
+
+def _pass_emptiness(camera: Camera, pixels: jax.Array, sources: GatherSources) -> jax.Array:
+    """Return whether rays of pixels `[N, 2]` pass an empty place, `[N]` bool."""
+    known = sources.inverse_depth > 0
     log_depth = -jnp.log2(jnp.where(known, sources.inverse_depth, 1))
     typical = safe_divide(jnp.sum(log_depth), jnp.sum(known, dtype=log_depth.dtype))
+    depths = 2 ** (typical + jnp.linspace(-_REACH, _REACH, _DEPTHS))[None, :, None]
+    _, directions = pixels_to_rays(camera, pixels)
+    height, width = known.shape[1:]
 
-    def at_depth(depth: jax.Array) -> jax.Array:
-        points = pixels_to_points(camera, pixels, jnp.full(pixels.shape[:2], depth))
+    def add(through: jax.Array, photograph: tuple[Camera, jax.Array]) -> tuple[jax.Array, None]:
+        view, known = photograph
+        # Places on a ray are linear in depth, in any camera.
+        start = matmul(camera.position - view.position, view.rotation)
+        x, y, z = start[:, None, None] + depths * matmul(directions, view.rotation).T[:, None, :]
+        fx, fy, cx, cy = view.intrinsics
+        in_front = z > jnp.finfo(z.dtype).eps
+        z = jnp.where(in_front, z, 1)
+        landed = jnp.stack([fx * x / z + cx, fy * y / z + cy], axis=-1)
+        inside = in_bounds(landed, height, width)
+        column, row = jnp.moveaxis(jnp.where(inside[..., None], landed, 0).astype(jnp.int32), -1, 0)
+        sees_nothing = in_front & inside & ~known[row, column]
+        return through + sees_nothing.astype(jnp.int32), None
 
-        def add(through: jax.Array, photograph: tuple[Camera, jax.Array]) -> tuple[jax.Array, None]:
-            view, nothing = photograph
-            landed, z = points_to_pixels(view, points)
-            sees_nothing = backward_warp(nothing, landed, order=0)[..., 0]
-            return through + jnp.where(z > 0, sees_nothing, 0), None
-
-        return jax.lax.scan(add, jnp.zeros(pixels.shape[:2]), (sources.cameras, nothing))[0]
-
-    depths = 2 ** (typical + jnp.linspace(-_REACH, _REACH, _DEPTHS))
-    empty = jnp.max(jax.lax.map(at_depth, depths), axis=0) >= _PHOTOGRAPHS
-    return jnp.repeat(jnp.repeat(empty, step, axis=0), step, axis=1)[:height, :width]
+    none = jnp.zeros((_DEPTHS, len(pixels)), jnp.int32)
+    through, _ = jax.lax.scan(add, none, (sources.cameras, known))
+    return jnp.max(through, axis=0) >= _PHOTOGRAPHS
 
 
 def fill_holes(rgb: jax.Array, alpha: jax.Array, seen: jax.Array, empty: jax.Array) -> jax.Array:
@@ -75,17 +108,60 @@ def fill_holes(rgb: jax.Array, alpha: jax.Array, seen: jax.Array, empty: jax.Arr
     opacity = jnp.where(seen, jnp.maximum(alpha, 0.05), 1)
     colors = jnp.clip(rgb / opacity[..., None], 0, 1)
     weight = jnp.where(hole, 0, jnp.where(seen, jnp.clip(alpha, 0, 1), 1))
-    around = _spread(colors, weight[..., None])
+    planes = jnp.concatenate([jnp.moveaxis(colors, -1, 0), weight[None]])
+    around = jnp.moveaxis(_spread(planes), 0, -1)
     return jnp.clip(rgb + missing[..., None] * around, 0, 1)
 
 
-def _spread(colors: jax.Array, weight: jax.Array) -> jax.Array:
-    """Mix colors `[H, W, 3]` of weight `[H, W, 1]` with coarser ones, which have the rest."""
-    height, width, _ = colors.shape
+def _spread(planes: jax.Array) -> jax.Array:
+    """Mix colors with coarser ones, which have the rest of the weight, `[3, H, W]`.
+
+    Args:
+      planes: `[4, H, W]` colors and their weight.
+    """
+    colors, weight = planes[:3], planes[3:]
+    _, height, width = planes.shape
     if min(height, width) == 1:
-        coarse = safe_divide(jnp.sum(weight * colors, (0, 1)), jnp.sum(weight))
-        return weight * colors + (1 - weight) * coarse[None, None]
-    both = jnp.concatenate([weight * colors, weight], axis=-1)
-    both = jax.image.resize(both, ((height + 1) // 2, (width + 1) // 2, 4), "linear")
-    coarse = _spread(safe_divide(both[..., :3], both[..., 3:]), both[..., 3:])
-    return weight * colors + (1 - weight) * jax.image.resize(coarse, colors.shape, "linear")
+        coarse = safe_divide(jnp.sum(weight * colors, (1, 2)), jnp.sum(weight))
+        return weight * colors + (1 - weight) * coarse[:, None, None]
+    both = _halve(_halve(jnp.concatenate([weight * colors, weight]), axis=1), axis=2)
+    both = jnp.concatenate([safe_divide(both[:3], both[3:]), both[3:]])
+    coarse = _double(_double(_spread(both), height, axis=1), width, axis=2)
+    return weight * colors + (1 - weight) * coarse
+
+
+def _halve(images: jax.Array, *, axis: int) -> jax.Array:
+    """Halve images along an axis as `jax.image.resize` does, without its products of matrices."""
+    size = images.shape[axis]
+    if size % 2:
+        return _resize(images, (size + 1) // 2, axis)
+    ends = _pad(jnp.ones_like(images), axis, "constant"), _pad(images, axis, "constant")
+    shares, sums = (
+        before + 3 * first + 3 * second + after
+        for before, first, second, after in (
+            [jax.lax.slice_in_dim(padded, i, i + size - 1, 2, axis) for i in range(4)]
+            for padded in ends
+        )
+    )
+    return sums / shares
+
+
+def _double(images: jax.Array, size: int, *, axis: int) -> jax.Array:
+    """Enlarge images along an axis likewise, to a size that is about twice theirs."""
+    if size != 2 * images.shape[axis]:
+        return _resize(images, size, axis)
+    padded = _pad(images, axis, "edge")
+    before, here, after = (
+        jax.lax.slice_in_dim(padded, i, i + images.shape[axis], axis=axis) for i in range(3)
+    )
+    pairs = jnp.stack([(before + 3 * here) / 4, (3 * here + after) / 4], axis=axis + 1)
+    return pairs.reshape([size if i == axis else n for i, n in enumerate(images.shape)])
+
+
+def _resize(images: jax.Array, size: int, axis: int) -> jax.Array:
+    shape = [size if i == axis else n for i, n in enumerate(images.shape)]
+    return jax.image.resize(images, shape, "linear")
+
+
+def _pad(images: jax.Array, axis: int, mode: str) -> jax.Array:
+    return jnp.pad(images, [(1, 1) if i == axis else (0, 0) for i in range(3)], mode=mode)

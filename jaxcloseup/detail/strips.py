@@ -24,8 +24,7 @@ _LOOPS = 2  # loops over strips, which run at the same time
 class _Whole(NamedTuple):
     """What features of a pixel are made of, `[H, W, ...]`."""
 
-    residual: Gathered
-    colors: Gathered
+    gathered: tuple[Gathered, Gathered]
     alpha: jax.Array
     bends: jax.Array
 
@@ -53,12 +52,14 @@ def predict_by_strips(
     """
     powers = feature_powers(*gathered, instead)
     powers = jnp.pad(powers, ((0, 0), (REACH, REACH), (0, 0)), mode="edge")
-    whole = _Whole(*gathered, alpha, edges(depth))
+    whole = _Whole(gathered, alpha, edges(depth))
 
     def predict(start: jax.Array | int, rows: int, chunks: int) -> jax.Array:
         strip = jax.tree.map(lambda image: jax.lax.dynamic_slice_in_dim(image, start, rows), whole)
         near = jax.lax.dynamic_slice_in_dim(powers, start, rows + 2 * REACH, axis=1)
-        planes = feature_planes(*strip, near, finer).reshape(-1, chunks, rows // chunks * width)
+        residual, colors = strip.gathered
+        planes = feature_planes(residual, colors, strip.alpha, strip.bends, near, finer)
+        planes = planes.reshape(-1, chunks, rows // chunks * width)
 
         def outputs(chunk: jax.Array) -> jax.Array:
             features = jax.lax.dynamic_index_in_dim(planes, chunk, axis=1, keepdims=False)

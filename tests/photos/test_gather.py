@@ -10,6 +10,7 @@ import pytest
 import reference
 
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points
+from jaxcloseup.photos import gather_native
 from jaxcloseup.photos.depth_maps import gather_sources
 from jaxcloseup.photos.gather import GatherSettings, gather, gather_parts
 from jaxcloseup.photos.pyramids import Pyramid, photograph_pyramid
@@ -21,6 +22,13 @@ GRID = pixel_grid(plane.HEIGHT, plane.WIDTH)
 SETTINGS = GatherSettings(robust=1.0)
 # Compiled once: three photographs, three levels, one view.
 gathered = jax.jit(functools.partial(gather, settings=SETTINGS))
+
+
+@jax.jit
+def gathered_in_jax(*arguments, **options):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gather_native, "can_gather", lambda *_, **__: False)
+        return gather(*arguments, settings=SETTINGS, **options)
 
 
 def with_edge(depths):
@@ -53,8 +61,9 @@ def closeup():
     return camera, jnp.asarray(depth, jnp.float32)
 
 
+@pytest.mark.parametrize("gathered", [gathered, gathered_in_jax], ids=["fastest", "in_jax"])
 @pytest.mark.parametrize(("exclude", "finest"), [(-1, 0), (1, 0), (-1, 1)])
-def test_gather_against_an_oracle(capture, closeup, exclude, finest):
+def test_gather_against_an_oracle(capture, closeup, gathered, exclude, finest):
     sources, pyramid = capture
     camera, depth = closeup
     found = gathered(camera, GRID, depth, sources, pyramid, exclude=exclude, finest=finest)
