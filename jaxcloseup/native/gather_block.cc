@@ -22,37 +22,6 @@ namespace {
 typedef float Four __attribute__((vector_size(16)));
 typedef float Channels __attribute__((vector_size(4 * LANES)));
 
-inline V root(V x) {
-#if defined(__AVX512F__)
-  return (V)_mm512_maskz_sqrt_ps(-1, (__m512)x);
-#elif defined(__AVX__)
-  return (V)_mm256_sqrt_ps((__m256)x);
-#elif defined(__SSE__)
-  return (V)_mm_sqrt_ps((__m128)x);
-#else
-  for (int i = 0; i < WIDTH; i++) x[i] = __builtin_sqrtf(x[i]);
-  return x;
-#endif
-}
-
-// log2 of x > 0, to 1e-7; the coefficients are those of Cephes' logf.
-inline V log2_of(V x) {
-  // The mantissa is brought to [1 / sqrt(2), sqrt(2)).
-  const I bits = (I)x - 0x3f3504f3, whole = bits >> 23;
-  const V f = (V)((bits & 0x7fffff) + 0x3f3504f3) - 1.f, squared = f * f;
-  V y = broadcast(7.0376836292e-2f);
-  y = mad(y, f, broadcast(-1.1514610310e-1f));
-  y = mad(y, f, broadcast(1.1676998740e-1f));
-  y = mad(y, f, broadcast(-1.2420140846e-1f));
-  y = mad(y, f, broadcast(1.4249322787e-1f));
-  y = mad(y, f, broadcast(-1.6668057665e-1f));
-  y = mad(y, f, broadcast(2.0000714765e-1f));
-  y = mad(y, f, broadcast(-2.4999993993e-1f));
-  y = mad(y, f, broadcast(3.3333331174e-1f));
-  y = mad(y * f, squared, f - .5f * squared);
-  return mad(y, broadcast(1.44269504f), __builtin_convertvector(whole, V));
-}
-
 // Arcsine of x in [0, 1], to 3e-7; the coefficients are those of Cephes' asinf.
 inline V arcsine(V x) {
   const M large = less(broadcast(.5f), x);
@@ -158,7 +127,7 @@ bool weigh(const Job& job, int index, const Points& points, Workspace& work, Rec
     }
     const V angle = 2.f * arcsine(lesser(.5f * root(apart), broadcast(.999f)));
     const V ratio = select(known, z / select(known, side, broadcast(1)), broadcast(1));
-    const V size = log2_of(ratio) - of.log_focal, sharpest = size + of.coarseness[job.finest];
+    const V size = 1.44269504f * logarithm(ratio) - of.log_focal, sharpest = size + of.coarseness[job.finest];
     const V footprint = ratio * of.footprint;
     const V clipped = lesser(greater(footprint, broadcast(1)), broadcast(COARSEST));
     const V sharpness = 1.f / (clipped * clipped);
