@@ -21,7 +21,7 @@ from jaxcloseup.geometry.cameras import Camera
 
 _LARGEST, _SMALLEST = 128, 32  # surfels of a chunk
 _STEP = 2  # parts are compiled for this many times more chunks, and for all
-_FEWEST = 32  # chunks of the smallest part
+_FEWEST = 16  # chunks of the smallest part
 # Pixels by which an image grows on each side: filters draw a splat farther out than it reaches.
 _MARGIN = 4.0
 _CUTOFF = 3.34  # standard deviations at which the most opaque splat falls to `ALPHA_MIN`
