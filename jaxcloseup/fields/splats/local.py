@@ -211,7 +211,8 @@ def _morton_order(surfels: Surfels, alive: jax.Array) -> jax.Array:
     # Most surfels, without the few that are far out.
     living = jnp.where(alive[:, None], surfels.means, jnp.nan)
     low, high = jnp.nanquantile(living, jnp.array([0.02, 0.98]), axis=0)
-    share = (surfels.means - low[None]) / jnp.maximum(high - low, 1e-12)[None]
+    # Cells are cubes: a thin layer is not cut across its thickness.
+    share = (surfels.means - low[None]) / jnp.maximum(jnp.max(high - low), 1e-12)
     cell = jnp.nan_to_num(jnp.clip(share * 511, 0, 511)).astype(jnp.uint32)
     key = sum(_spread_bits(cell[:, i]) << i for i in range(3))
     key |= jnp.nan_to_num(size).astype(jnp.uint32) << 27

@@ -47,11 +47,11 @@ def wide_state(seed):
     """Surfels all over a wide plane, some of them large, some faint."""
     rng = np.random.default_rng(seed)
     count = CONFIG.capacity - 100
-    points = rng.uniform([-6, -6, -0.05], [6, 6, 0.05], (count, 3)).astype(np.float32)
+    points = rng.uniform([-12, -12, -0.05], [12, 12, 0.05], (count, 3)).astype(np.float32)
     state = init_state(
         jax.random.key(seed), points, np.full_like(points, 0.5), field=FIELD, optimizer=OPTIMIZER
     )
-    scales = rng.uniform(-4.0, -1.5, (CONFIG.capacity, 2))
+    scales = rng.uniform(-4.0, -2.0, (CONFIG.capacity, 2))
     logits = rng.uniform(-6.0, 3.0, CONFIG.capacity)
     params = state.params.replace(
         log_scales=jnp.asarray(scales, jnp.float32), opacity_logits=jnp.asarray(logits, jnp.float32)
