@@ -97,7 +97,7 @@ void find_reach(const Image& image, int count, const int32_t* splats, const Tile
     const L empty = depth < 0;
     const D half_y = root(depth * a / area), rightmost = -b / c * root(depth * c / area);
     for (int r = 0; r < most_rows; r++) {
-      D top;
+      D top{};
       for (int k = 0; k < LANES; k++) top[k] = (boxes[splats[begin + (k < lanes ? k : 0)]].down.first + r) * TILE + .5;
       const D low = top - MARGIN - at[ANCHOR + 1], high = top + (TILE - 1 + MARGIN) - at[ANCHOR + 1];
       const D from = larger(low, center_y - half_y), to = smaller(high, center_y + half_y);
