@@ -13,17 +13,8 @@ from jaxcloseup.app.cli.start import start
 
 
 SUITES = (
-    "nerf",
-    "warp",
-    "labels",
-    "splats",
-    "steps",
-    "sweep",
-    "resume",
-    "detail",
-    "scales",
-    "teach",
-    "gpu",
+    *("nerf", "warp", "labels", "splats", "native", "steps", "sweep"),
+    *("resume", "detail", "scales", "teach", "gpu"),
 )
 
 _SUITE = flags.DEFINE_list("suite", ["nerf", "warp"], f"suites to run: {', '.join(SUITES)}")

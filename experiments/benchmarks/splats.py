@@ -47,7 +47,7 @@ SCAN_BYTES = 6e9  # the scan is skipped if its stored steps need more memory
 
 def run() -> None:
     """Print a table of milliseconds, ratios, memory and compile time."""
-    rate = _matmul_rate()
+    rate = matmul_rate()
     print(
         f"matrix product: {rate / 1e9:.0f} GFLOP/s; the table shows milliseconds of the forward "
         "pass and of both passes, and how many times slower the scan is in forward/both"
@@ -58,7 +58,7 @@ def run() -> None:
     )
     scene = load_scene("table", downscale=4)
     for count, size in CASES:
-        _report(*_discs_on_table(scene, count, size), rate)
+        _report(*discs_on_table(scene, count, size), rate)
     print("a wavy wall, which gives all tiles lists of nearly the same length:")
     _report(*discs_on_a_wall(20_000, (270, 480)), rate)
 
@@ -121,7 +121,7 @@ def config_for(surfels, camera):
     return dataclasses.replace(guess, capacity=-(-touched // 2**14) * 2**14)
 
 
-def _discs_on_table(scene, count, size):
+def discs_on_table(scene, count, size):
     """Return discs at random points that the photographs see, and the first photograph's camera."""
     key_pixel, key_opacity, key_surfels = jax.random.split(jax.random.key(0), 3)
     cameras, depths = scene.train.cameras, exact_depths(scene, scene.train.cameras)
@@ -171,7 +171,7 @@ def render_all(surfels, camera, config):
     return image.rgb, image.depth, image.aux.normal, image.aux.distortion
 
 
-def _footprints(surfels, camera, config):
+def footprints(surfels, camera, config):
     discs, normals = to_camera(surfel_columns(surfels), camera)
     offset = surfels.means - camera.position[None]
     colors = sh_to_rgb(surfels.sh, offset / safe_norm(offset, keepdims=True))
@@ -204,12 +204,12 @@ def count_pairs(surfels, camera, config, *, exact=True):
 
 @functools.partial(jax.jit, static_argnums=(2, 3))
 def _find_lists(surfels, camera, config, exact):
-    return _lists(_footprints(surfels, camera, config), camera, config, exact=exact)
+    return _lists(footprints(surfels, camera, config), camera, config, exact=exact)
 
 
 def _render_by_scan(surfels, camera, config, longest):
     """Blend all tiles together, one splat of each list at a time."""
-    splats = _footprints(surfels, camera, config)
+    splats = footprints(surfels, camera, config)
     lists = _lists(lax.stop_gradient(splats), camera, config)
     splats = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), splats)
     starts, counts, origins = lists.starts, lists.counts, lists.origins
@@ -258,7 +258,7 @@ def _check(gradient, expected):
             raise AssertionError("the splatter and the scan disagree on a derivative")
 
 
-def _matmul_rate():
+def matmul_rate():
     """Return the operations per second of a large matrix product."""
     side = 2048
     matrix = jax.random.normal(jax.random.key(0), (side, side))
