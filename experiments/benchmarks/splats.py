@@ -172,6 +172,7 @@ def render_all(surfels, camera, config):
 
 
 def footprints(surfels, camera, config):
+    """Return the footprints of surfels."""
     discs, normals = to_camera(surfel_columns(surfels), camera)
     offset = surfels.means - camera.position[None]
     colors = sh_to_rgb(surfels.sh, offset / safe_norm(offset, keepdims=True))
