@@ -4,8 +4,11 @@ Rays that leave the part of the scene that was photographed meet no surface, so 
 black. A smooth continuation of the surroundings is nearer to the truth.
 """
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcloseup.geometry.cameras import Camera, pixels_to_rays
 from jaxcloseup.geometry.masks import in_bounds
@@ -131,37 +134,50 @@ def _spread(planes: jax.Array) -> jax.Array:
 
 
 def _halve(images: jax.Array, *, axis: int) -> jax.Array:
-    """Halve images along an axis as `jax.image.resize` does, without its products of matrices."""
-    size = images.shape[axis]
-    if size % 2:
-        return _resize(images, (size + 1) // 2, axis)
-    ends = _pad(jnp.ones_like(images), axis, "constant"), _pad(images, axis, "constant")
-    shares, sums = (
-        before + 3 * first + 3 * second + after
-        for before, first, second, after in (
-            [jax.lax.slice_in_dim(padded, i, i + size - 1, 2, axis) for i in range(4)]
-            for padded in ends
-        )
+    """Resize images along an axis to half their size, rounded up, as `jax.image.resize` does.
+
+    It multiplies by whole matrices, of which no row has more than five numbers that are not 0.
+    """
+    old = images.shape[axis]
+    new = (old + 1) // 2
+    first = 2 * np.arange(new)
+    shares = _shares(first[None] + np.arange(-2, 3)[:, None], np.arange(new), old, new)
+    padded = _pad(images, axis, (2, 2 + old % 2))
+    return _sum_shares(
+        shares, [jax.lax.slice_in_dim(padded, k, k + 2 * new - 1, 2, axis) for k in range(5)], axis
     )
-    return sums / shares
 
 
 def _double(images: jax.Array, size: int, *, axis: int) -> jax.Array:
-    """Enlarge images along an axis likewise, to a size that is about twice theirs."""
-    if size != 2 * images.shape[axis]:
-        return _resize(images, size, axis)
-    padded = _pad(images, axis, "edge")
-    before, here, after = (
-        jax.lax.slice_in_dim(padded, i, i + images.shape[axis], axis=axis) for i in range(3)
+    """Resize images along an axis likewise to a size that is twice theirs, or 1 less."""
+    old = images.shape[axis]
+    padded, here = _pad(images, axis, (1, 1)), np.arange(old)
+    parts = [jax.lax.slice_in_dim(padded, k, k + old, axis=axis) for k in range(3)]
+    pairs = [
+        _sum_shares(_shares(here + np.arange(-1, 2)[:, None], 2 * here + i, old, size), parts, axis)
+        for i in range(2)
+    ]
+    shape = [2 * n if i == axis else n for i, n in enumerate(images.shape)]
+    doubled = jnp.stack(pairs, axis=axis + 1).reshape(shape)
+    return jax.lax.slice_in_dim(doubled, 0, size, axis=axis)
+
+
+def _shares(index: np.ndarray, resized: np.ndarray, old: int, new: int) -> np.ndarray:
+    """Return the shares `[K, N]` of old pixels `index[K, N]` in new ones `resized[N]`."""
+    center = (resized + 0.5) * old / new - 0.5
+    shares = np.maximum(1 - np.abs(index - center) / max(old / new, 1), 0)
+    shares = np.where((index >= 0) & (index < old), shares, 0)
+    return shares / np.maximum(shares.sum(0), 1e-9)
+
+
+def _sum_shares(shares: np.ndarray, parts: Sequence[jax.Array], axis: int) -> jax.Array:
+    shape = [-1 if i == axis else 1 for i in range(3)]
+    return sum(
+        jnp.asarray(share.reshape(shape), part.dtype) * part
+        for share, part in zip(shares, parts, strict=True)
+        if share.any()
     )
-    pairs = jnp.stack([(before + 3 * here) / 4, (3 * here + after) / 4], axis=axis + 1)
-    return pairs.reshape([size if i == axis else n for i, n in enumerate(images.shape)])
 
 
-def _resize(images: jax.Array, size: int, axis: int) -> jax.Array:
-    shape = [size if i == axis else n for i, n in enumerate(images.shape)]
-    return jax.image.resize(images, shape, "linear")
-
-
-def _pad(images: jax.Array, axis: int, mode: str) -> jax.Array:
-    return jnp.pad(images, [(1, 1) if i == axis else (0, 0) for i in range(3)], mode=mode)
+def _pad(images: jax.Array, axis: int, width: tuple[int, int]) -> jax.Array:
+    return jnp.pad(images, [width if i == axis else (0, 0) for i in range(3)])
