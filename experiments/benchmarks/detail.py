@@ -5,9 +5,15 @@ other with the rendered depth. Interpolation by the warp blurs sharp frames, whi
 differences. So the suite also renders frames twice as large and averages differences over 2 x 2
 pixels, and measures the true frames of the scene and the errors of frames, whose flicker is not in
 the scene.
+
+*Time* is that of a frame and of its parts, the library's own code beside JAX's, and what bounds
+them: the networks' arithmetic at the speed of one large product of matrices, and one visit to all
+residuals at the speed at which arrays are copied.
 """
 
 import functools
+import time
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -17,18 +23,25 @@ from experiments.benchmarks.timing import interleaved_medians
 from experiments.trained_run import newest_run
 from jaxcloseup.app.run.kept_detail import detailed
 from jaxcloseup.app.view.camera_paths import dolly, resized
+from jaxcloseup.detail.add import SETTINGS
+from jaxcloseup.detail.holes import fill_holes, find_empty
+from jaxcloseup.detail.strips import predict_by_strips
 from jaxcloseup.geometry import warp_to
+from jaxcloseup.geometry.cameras import pixel_grid
 from jaxcloseup.labels.rules import label_depth
+from jaxcloseup.photos import gather_native
+from jaxcloseup.photos.gather import gather_parts
 from jaxcloseup.photos.views import camera_at
 
 
 FRAMES, WIDTH, REPEATS = 60, 240, 5
+SIZES = 960, 480  # widths of frames that are timed
 EVERY = 3  # pair of frames that are twice as large
 VIEWS = (3, 25, 47)  # training photographs from which dollies start
 
 
 def run() -> None:
-    """Print flicker with and without detail, and the seconds of both halves of a view."""
+    """Print flicker with and without detail, and the time of a frame and of its parts."""
     run = newest_run()
     scene, programs, state, detail = run.scene, run.programs, run.state, run.detail()
 
@@ -52,17 +65,66 @@ def run() -> None:
             pairs = ((shot(i), shot(i + 1)) for i in range(0, FRAMES - 1, every))
             found = np.mean([_flicker(*pair, times) for pair in pairs], axis=0)
             print(f"  {_describe(*found)}, differences averaged over {times} x {times} pixels")
-    camera = camera_at(resized(cameras, 480, None), FRAMES // 2)
-    seen = jax.block_until_ready(programs.render(state, camera))
+    for width in SIZES:
+        camera = camera_at(resized(shots.cameras, width, None), FRAMES // 2)
+        _print_times(run, detail, camera)
+
+
+def _print_times(run, detail, camera):
+    """Print the milliseconds of a frame and of its parts."""
+    seen = jax.block_until_ready(run.programs.render(run.state, camera))
+    pixels = pixel_grid(camera.height, camera.width)
+    depth = label_depth(seen, near=0, far=run.scene.far)
+    where = camera, pixels, depth, detail.sources, detail.shown
+    gathered = gather_parts(*where, SETTINGS)
+    predict = jax.jit(predict_by_strips)
+    empty = jax.jit(find_empty)(camera, pixels, detail.sources)
+    there = gathered[0].weight > 0
     calls = {
-        "render": lambda: programs.render(state, camera),
-        "detail": lambda: detailed(programs, detail, camera, seen),
+        "render": lambda: run.programs.render(run.state, camera),
+        "detail": lambda: detailed(run.programs, detail, camera, seen),
+        "gather": lambda: gather_parts(*where, SETTINGS),
+        "gather in JAX": lambda: _gather_in_jax(*where),
+        "features and networks": lambda: predict(
+            *(detail.weights, detail.finer, gathered, seen.rgb, seen.alpha, depth)
+        ),
+        "find empty places": lambda: _find_empty(camera, pixels, detail.sources, ~there),
+        "fill holes": lambda: _fill_holes(seen.rgb, seen.alpha, there, empty),
+        "bound of networks": functools.partial(_multiply, _operations(detail, depth.size)),
+        "bound of gathering": functools.partial(_copy, detail.shown.values),
     }
-    seconds = interleaved_medians(calls, REPEATS)
-    print(
-        f"{camera.width} x {camera.height}: "
-        + ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items())
-    )
+    first = {}
+    for name, call in calls.items():
+        start = time.perf_counter()
+        jax.block_until_ready(call())
+        first[name] = time.perf_counter() - start
+    print(f"{camera.width} x {camera.height}, ms, and the first call in s:")
+    for name, seconds in interleaved_medians(calls, REPEATS).items():
+        print(f"  {name:22} {1e3 * seconds:8.1f} {first[name]:8.2f}")
+
+
+def _gather_in_jax(*where):
+    with mock.patch.object(gather_native, "can_gather", return_value=False):
+        return gather_parts(*where, SETTINGS)
+
+
+_find_empty, _fill_holes, _copy = jax.jit(find_empty), jax.jit(fill_holes), jax.jit(jnp.copy)
+
+
+def _operations(detail, pixels):
+    """Return the additions and multiplications of all networks."""
+    networks = detail.weights.mixing, detail.weights.errors
+    return 2 * pixels * sum(matrix.size for each in networks for matrix in each.layers[::2])
+
+
+@jax.jit
+def _square(matrix):
+    return matrix @ matrix
+
+
+def _multiply(operations):
+    """Multiply matrices that take as many operations."""
+    return _square(jnp.ones([round((operations / 2) ** (1 / 3))] * 2))
 
 
 _warp = jax.jit(warp_to)

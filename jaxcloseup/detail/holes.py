@@ -40,11 +40,13 @@ def find_empty(
         everywhere.
     """
     (height, width), step = pixels.shape[:2], max(1, round(pixels.shape[1] / _RAYS))
-    wanted = jnp.ones((height, width), bool) if wanted is None else wanted
-    wanted = jnp.pad(wanted, ((0, -height % step), (0, -width % step)))
-    wanted = wanted.reshape(-1, step, wanted.shape[1] // step, step).any((1, 3))
     pixels = pixels[::step, ::step]
     rows, columns = pixels.shape[:2]
+    if wanted is None:
+        wanted = jnp.ones((rows, columns), bool)
+    else:
+        wanted = jnp.pad(wanted, ((0, -height % step), (0, -width % step)))
+        wanted = wanted.reshape(rows, step, columns, step).any((1, 3))
     pad = ((0, -rows % _BAND), (0, 0))
     pixels = jnp.pad(pixels, (*pad, (0, 0)), mode="edge").reshape(-1, _BAND * columns, 2)
     wanted = jnp.pad(wanted, pad).reshape(-1, _BAND * columns)
