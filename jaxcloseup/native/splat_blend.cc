@@ -52,17 +52,12 @@ void pull_back(xla::ffi::ThreadPool& pool, const Image& image, const Listing& li
   const Passes& passes = best_passes();
   const int features = image.features(), stride = sums_stride(features);
   std::vector<BandSums> sums(listing.bands);
-  std::vector<int32_t> places(listing.ranges.size());  // of each splat in its bands, one by one
   parallel_for_with<BandLists>(pool, listing.bands, [&](BandLists& lists, int band) {
     lists.make(image, listing, band);
-    const size_t size = lists.members.size() * stride;
+    const size_t size = static_cast<size_t>(listing.band_starts[band + 1] - listing.band_starts[band]) * stride;
     sums[band].reset(new float[size]);
     std::memset(sums[band].get(), 0, size * sizeof(float));
     passes.backward(lists.band, in, sums[band].get());
-    for (size_t k = 0; k < lists.members.size(); k++) {
-      const int splat = lists.members[k];
-      places[listing.starts[splat] + band - listing.of_bands[splat].first] = static_cast<int32_t>(k);
-    }
   });
   // One order of sums: along a tile's list, then over tiles, then over bands.
   const int shown = static_cast<int>(listing.splats.size()), each = 1024;
@@ -71,7 +66,7 @@ void pull_back(xla::ffi::ThreadPool& pool, const Image& image, const Listing& li
       total.assign(stride, 0.f);
       const Range bands = listing.of_bands[i];
       for (int band = bands.first; band <= bands.last; band++) {
-        const float* own = sums[band].get() + static_cast<size_t>(places[listing.starts[i] + band - bands.first]) * stride;
+        const float* own = sums[band].get() + static_cast<size_t>(listing.places[listing.starts[i] + band - bands.first]) * stride;
         for (int f = 0; f < stride; f++) total[f] += own[f];
       }
       const size_t place = static_cast<size_t>(listing.splats[i]) * image.columns;

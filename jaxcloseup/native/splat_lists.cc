@@ -55,6 +55,7 @@ Listing::Listing(xla::ffi::ThreadPool& pool, const Passes& passes, const Image& 
     starts[i + 1] = starts[i] + down.last - down.first + 1;
     of_bands[i] = {static_cast<int16_t>(down.first / rows_each), static_cast<int16_t>(down.last / rows_each)};
   }
+  deal_out();
   ranges.resize(starts.back());
   parallel_for(pool, pieces(splats.size()), [&](int piece) {
     const int begin = piece * PIECE, count = std::min<int>(splats.size() - begin, PIECE);
@@ -62,20 +63,33 @@ Listing::Listing(xla::ffi::ThreadPool& pool, const Passes& passes, const Image& 
   });
 }
 
+void Listing::deal_out() {
+  band_starts.resize(bands + 1);
+  for (const Range own : of_bands)
+    for (int band = own.first; band <= own.last; band++) band_starts[band + 1]++;
+  for (int band = 0; band < bands; band++) band_starts[band + 1] += band_starts[band];
+  members.resize(band_starts.back());
+  places.resize(starts.back());
+  std::vector<int32_t> next(band_starts.begin(), band_starts.end() - 1);
+  for (size_t i = 0; i < splats.size(); i++) {
+    for (int band = of_bands[i].first; band <= of_bands[i].last; band++) {
+      const int place = next[band]++;
+      members[place] = static_cast<int32_t>(i);
+      places[starts[i] + band - of_bands[i].first] = place - band_starts[band];
+    }
+  }
+}
+
 void BandLists::make(const Image& image, const Listing& listing, int number) {
   const int first_row = number * listing.rows_each;
   const int band_rows = std::min(listing.rows_each, image.tile_rows() - first_row);
   const int columns = image.tile_columns(), tiles = band_rows * columns;
-  members.clear();
+  const int32_t* members = listing.members.data() + listing.band_starts[number];
+  const size_t count = listing.band_starts[number + 1] - listing.band_starts[number];
   starts.assign(tiles + 1, 0);
-  for (int i = 0; i < static_cast<int>(listing.splats.size()); i++) {
-    const Range own = listing.of_bands[i];
-    if (number < own.first || number > own.last) continue;
-    members.push_back(i);
-  }
   // Calls work(member, row of the band, tiles) for all rows of the band's splats.
   const auto each_row = [&](const auto& work) {
-    for (size_t k = 0; k < members.size(); k++) {
+    for (size_t k = 0; k < count; k++) {
       const int i = members[k];
       const Range down = listing.boxes[listing.splats[i]].down;
       const Range* ranges = listing.ranges.data() + listing.starts[i];
@@ -94,10 +108,10 @@ void BandLists::make(const Image& image, const Listing& listing, int number) {
     for (int tile = range.first; tile <= range.last; tile++) list[next[row * columns + tile]++] = member;
   });
   const size_t size = image.columns;
-  rows.resize(members.size() * size);
-  for (size_t k = 0; k < members.size(); k++) {
+  rows.resize(count * size);
+  for (size_t k = 0; k < count; k++) {
     const auto row_of = [&](size_t member) { return image.table + listing.splats[members[member]] * size; };
-    if (k + 8 < members.size()) __builtin_prefetch(row_of(k + 8));
+    if (k + 8 < count) __builtin_prefetch(row_of(k + 8));
     std::memcpy(rows.data() + k * size, row_of(k), size * sizeof(float));
   }
   band = {image.width,   image.height, columns,     first_row,    band_rows, image.features(),

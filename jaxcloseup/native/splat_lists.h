@@ -18,14 +18,20 @@ struct Listing {
   std::vector<int32_t> starts;   // [S + 1] where the rows of each start in `ranges`
   std::vector<Range> ranges;     // tiles in which a splat draws, for each row of its box
   std::vector<Range> of_bands;   // [S] first and last band of each
+  std::vector<int32_t> band_starts;  // [bands + 1] where each band starts in `members`
+  std::vector<int32_t> members;  // numbers of splats in `splats`, band after band
+  // Place of each splat in its bands' members, at `starts`, one band behind the other.
+  std::vector<int32_t> places;
 
   Listing(xla::ffi::ThreadPool& pool, const Passes& passes, const Image& image);
+
+ private:
+  void deal_out();
 };
 
 // The rows of a band's splats, and its tiles' lists. Its arrays are used again for the next band.
 struct BandLists {
   Band band;
-  std::vector<int32_t> members;  // numbers of the band's splats in `Listing.splats`
   std::vector<float> rows;
   std::vector<int32_t> list, starts, next;
 
