@@ -4,6 +4,7 @@ Rays that leave the part of the scene that was photographed meet no surface, so 
 black. A smooth continuation of the surroundings is nearer to the truth.
 """
 
+import functools
 from collections.abc import Sequence
 
 import jax
@@ -174,11 +175,12 @@ def _shares(index: np.ndarray, resized: np.ndarray, old: int, new: int) -> np.nd
 
 def _sum_shares(shares: np.ndarray, parts: Sequence[jax.Array], axis: int) -> jax.Array:
     shape = [-1 if i == axis else 1 for i in range(3)]
-    return sum(
+    products = (
         jnp.asarray(share.reshape(shape), part.dtype) * part
         for share, part in zip(shares, parts, strict=True)
         if share.any()
     )
+    return functools.reduce(jnp.add, products)
 
 
 def _pad(images: jax.Array, axis: int, width: tuple[int, int]) -> jax.Array:
