@@ -27,7 +27,7 @@ def folder(tmp_path_factory):
     probe = [COMPILER, *SANITIZE, str(folder / "empty.cc"), "-o", str(folder / "empty")]
     if not COMPILER or subprocess.run(probe, capture_output=True, check=False).returncode:
         pytest.skip("needs g++ or clang++ with its sanitizers")
-    for source in [*SOURCES, HERE / "fuzz_splats.cc"]:
+    for source in [*SOURCES, *HERE.glob("*.cc")]:
         if not of_processor(source):
             build(source, folder / f"{source.stem}.o", ONE)
     return folder

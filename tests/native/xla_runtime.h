@@ -62,6 +62,8 @@ struct Array {
 inline XLA_FFI_DataType type_of(const float*) { return XLA_FFI_DataType_F32; }
 inline XLA_FFI_DataType type_of(const int32_t*) { return XLA_FFI_DataType_S32; }
 inline XLA_FFI_DataType type_of(const int64_t*) { return XLA_FFI_DataType_S64; }
+inline XLA_FFI_DataType type_of(const int8_t*) { return XLA_FFI_DataType_S8; }
+inline XLA_FFI_DataType type_of(const uint8_t*) { return XLA_FFI_DataType_U8; }
 inline XLA_FFI_DataType type_of(const bool*) { return XLA_FFI_DataType_PRED; }
 
 // Arguments, results and attributes of one call.
@@ -85,12 +87,22 @@ class Call {
     kept.name = {nullptr, name.size()};
     return *this;
   }
+  template <typename T>
+  Call& attr(const std::string& name, const std::vector<T>& values) {
+    auto& kept = attrs_[name];
+    auto own = std::make_shared<std::vector<T>>(values);
+    kept.value = own;
+    kept.array = {type_of(own->data()), own->size(), own->data()};
+    kept.name = {nullptr, name.size()};
+    kept.type = XLA_FFI_AttrType_ARRAY;
+    return *this;
+  }
 
   // Returns what is wrong with the arguments, or nothing.
   std::string run(XLA_FFI_Handler* handler, int threads) {
     std::vector<XLA_FFI_ArgType> arg_types(args_.size(), XLA_FFI_ArgType_BUFFER);
     std::vector<XLA_FFI_RetType> ret_types(rets_.size(), XLA_FFI_RetType_BUFFER);
-    std::vector<XLA_FFI_AttrType> attr_types(attrs_.size(), XLA_FFI_AttrType_SCALAR);
+    std::vector<XLA_FFI_AttrType> attr_types;
     std::vector<void*> args, rets, attrs;
     std::vector<XLA_FFI_ByteSpan*> names;
     for (auto& one : args_) args.push_back(&one);
@@ -98,7 +110,8 @@ class Call {
     for (auto& [name, kept] : attrs_) {
       kept.name.ptr = name.data();
       names.push_back(&kept.name);
-      attrs.push_back(&kept.scalar);
+      attr_types.push_back(kept.type);
+      attrs.push_back(kept.type == XLA_FFI_AttrType_ARRAY ? static_cast<void*>(&kept.array) : &kept.scalar);
     }
     XLA_FFI_ExecutionContext context{threads, {}};
     XLA_FFI_CallFrame frame{};
@@ -119,7 +132,9 @@ class Call {
   struct Attribute {
     std::shared_ptr<void> value;
     XLA_FFI_Scalar scalar;
+    XLA_FFI_Array array;
     XLA_FFI_ByteSpan name;
+    XLA_FFI_AttrType type = XLA_FFI_AttrType_SCALAR;
   };
 
   template <typename T>
