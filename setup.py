@@ -7,6 +7,7 @@ import platform
 from setuptools import Extension, setup
 from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_ext import build_ext
+from setuptools.errors import CompileError
 
 
 FOLDER = pathlib.Path("jaxcloseup/native")
@@ -31,7 +32,7 @@ class BuildNative(build_ext):
         """Compile the library's files, some several times, and link them."""
         jaxlib = importlib.util.find_spec("jaxlib")
         if jaxlib is None:
-            raise RuntimeError("the headers of jaxlib are missing")
+            raise CompileError("the headers of jaxlib are missing")
         self.compiler.include_dirs = [str(pathlib.Path(jaxlib.origin).parent / "include")]
         options = {"output_dir": self.build_temp, "depends": extension.depends}
         once = [source for source in extension.sources if source not in OF_PROCESSOR]

@@ -23,6 +23,10 @@ INSTALL = (
 )
 
 
+class LibraryError(OSError):
+    """The library was asked for, and cannot be loaded."""
+
+
 def path() -> pathlib.Path | None:
     """Return the library's file, or None if it was not built."""
     found = sorted(pathlib.Path(__file__).parent.glob("_native*.so"))
@@ -34,14 +38,15 @@ def missing() -> str | None:
     """Load the library on the first call; return None if it is loaded, else why it is not."""
     file = path()
     if file is None:
-        return "it was not built"
+        return "the native library was not built"
     try:
         library = ctypes.CDLL(str(file))
         for name in TARGETS:
             capsule = jax.ffi.pycapsule(getattr(library, name))
             jax.ffi.register_ffi_target(f"jaxcloseup_{name}", capsule, platform="cpu")
     except Exception as error:  # whatever keeps it from loading
-        return str(error).splitlines()[0] if str(error) else type(error).__name__
+        reason = str(error).splitlines() or [type(error).__name__]
+        return f"the native library cannot be loaded: {reason[0]}"
     return None
 
 

@@ -49,9 +49,15 @@ def plan_raster(config: RasterizeConfig, *, height: int, width: int) -> RasterPl
 
 
 def _compositor(name: str, platform: str, tile: int) -> str:
-    """Return the name of a compositor, where "auto" is the fastest that runs on a platform."""
+    """Return the name of a compositor, where "auto" is the fastest that runs on a platform.
+
+    Raises:
+      LibraryError: the native library is asked for, and cannot run.
+    """
+    if name == "native" and platform != "cpu":
+        raise library.LibraryError('compositor "native" runs on CPUs alone: use "auto"')
     if name == "native" and not library.available():
-        raise ValueError(
+        raise library.LibraryError(
             f'compositor "native" cannot run: {library.missing()}; {library.INSTALL}, or use "auto"'
         )
     if name != "auto":

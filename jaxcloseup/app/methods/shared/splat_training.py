@@ -18,14 +18,17 @@ from jaxcloseup.app.methods.surfels import SurfelTrainingConfig
 from jaxcloseup.artifacts.surfel_ply import write_surfels
 from jaxcloseup.artifacts.viewer_gaussians import Gaussians, as_gaussians
 from jaxcloseup.fields.contract import RadianceField, Rendering
+from jaxcloseup.fields.splats.config import RasterizeConfig
 from jaxcloseup.fields.splats.control import replace_surfels
 from jaxcloseup.fields.splats.filters import sampling_intervals, smoothed
+from jaxcloseup.fields.splats.raster_plan import plan_raster
 from jaxcloseup.fields.splats.refinement import join_surfels, replace_least, surfels_where_wrong
 from jaxcloseup.fields.splats.splat_field import SurfelBuffers, camera_extent, surfel_field
 from jaxcloseup.fields.splats.splat_optimizer import surfel_optimizer
 from jaxcloseup.fields.splats.surfels import Surfels, pad_rows
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.labels.rules import label_depth
+from jaxcloseup.native import library
 from jaxcloseup.photos.pyramids import Pyramid
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.views import Views, camera_at, to_float
@@ -38,7 +41,11 @@ _REFINED_AT = 4  # times the photographs' training size, at which new surfels ar
 
 
 def make_field(config: SplatTrainingConfig, scene: Scene, growth: int) -> RadianceField:
-    """Return splats sized for a scene; `growth` multiplies the rasterizer's capacity."""
+    """Return splats sized for a scene; `growth` multiplies the rasterizer's capacity.
+
+    Raises:
+      LibraryError: the native compositor is asked for, and missing.
+    """
     size, capacity = extent(scene), config.raster.capacity * growth
     raster = dataclasses.replace(
         config.raster,
@@ -46,9 +53,25 @@ def make_field(config: SplatTrainingConfig, scene: Scene, growth: int) -> Radian
         near=_near(config, scene),
         platform=config.raster.platform or jax.default_backend(),
     )
+    _check_compositor(raster)
     config = dataclasses.replace(config, raster=raster)
     center = jnp.mean(jnp.asarray(scene.train.cameras.position), axis=0)
     return surfel_field(config, extent=size, center=center, photographs=_photographs(config, scene))
+
+
+def _check_compositor(raster: RasterizeConfig) -> None:
+    """Raise or say what keeps the fastest compositor from running, before anything is compiled."""
+    if raster.compositor == "auto" and raster.platform != "cpu":
+        return  # a GPU says it when it compiles kernels
+    plan = plan_raster(raster, height=1, width=1)
+    if (raster.compositor, plan.compositor) == ("auto", "loops"):
+        _say_that_it_is_slow()
+
+
+@functools.cache
+def _say_that_it_is_slow() -> None:
+    """Print one line, once in a program, about the missing native library."""
+    print(f"{library.missing()}, so splats are several times slower: {library.INSTALL}")
 
 
 def _near(config: SplatTrainingConfig, scene: Scene) -> float:
