@@ -1,6 +1,7 @@
 """Blends the splats of all tiles, by the compositor of a plan."""
 
 import functools
+import importlib
 from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any
@@ -8,7 +9,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxcloseup.fields.splats import blend_lax, blend_pallas
 from jaxcloseup.fields.splats.config import RasterPlan
 from jaxcloseup.fields.splats.layout import Trace
 from jaxcloseup.fields.splats.tiling import TileLists
@@ -16,9 +16,14 @@ from jaxcloseup.fields.splats.tiling import TileLists
 
 # Modules with `forward(plan, table, lists) -> sums, median, trace`, and
 # `backward(plan, table, lists, trace, (sums_bar, median_bar)) -> table_bar`.
-COMPOSITOR_MODULES: dict[str, ModuleType] = {"loops": blend_lax, "kernel": blend_pallas}
+COMPOSITOR_MODULES = {"loops": "blend_lax", "kernel": "blend_pallas"}
 
 Blended = tuple[jax.Array, jax.Array]  # sums and median, or their cotangents
+
+
+def compositor_module(name: str) -> ModuleType:
+    """Import the module of a compositor; not before it is used, for a backend may be missing."""
+    return importlib.import_module(f"{__package__}.{COMPOSITOR_MODULES[name]}")
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
@@ -63,7 +68,7 @@ def _batched_forward(plan: RasterPlan) -> Callable[..., tuple[jax.Array, jax.Arr
 
     If `vmap` batched the loops instead, all images would wait for the slowest at every chunk.
     """
-    compositor = COMPOSITOR_MODULES[plan.compositor]
+    compositor = compositor_module(plan.compositor)
     forward = jax.custom_batching.custom_vmap(functools.partial(compositor.forward, plan))
 
     @forward.def_vmap
@@ -78,7 +83,7 @@ def _batched_forward(plan: RasterPlan) -> Callable[..., tuple[jax.Array, jax.Arr
 @functools.cache
 def _batched_backward(plan: RasterPlan) -> Callable[..., jax.Array]:
     """Return `backward` with the batching of `_batched_forward`."""
-    compositor = COMPOSITOR_MODULES[plan.compositor]
+    compositor = compositor_module(plan.compositor)
     backward = jax.custom_batching.custom_vmap(functools.partial(compositor.backward, plan))
 
     @backward.def_vmap

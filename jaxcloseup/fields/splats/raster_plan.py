@@ -11,7 +11,7 @@ import logging
 import jax
 import jax.numpy as jnp
 
-from jaxcloseup.fields.splats import blend_pallas
+from jaxcloseup.fields.splats.blending import compositor_module
 from jaxcloseup.fields.splats.config import RasterizeConfig, RasterPlan
 from jaxcloseup.fields.splats.layout import PAYLOAD
 from jaxcloseup.fields.splats.tiling import TileLists
@@ -78,12 +78,13 @@ def kernels_compile(tile: int) -> bool:
         return jnp.zeros((1, PAYLOAD + 1), jnp.float32), lists
 
     def both(table: jax.Array, lists: TileLists) -> jax.Array:
-        sums, median, trace = blend_pallas.forward(plan, table, lists)
-        return blend_pallas.backward(plan, table, lists, trace, (sums, median))
+        kernels = compositor_module("kernel")  # Pallas may have lost the backend that it imports
+        sums, median, trace = kernels.forward(plan, table, lists)
+        return kernels.backward(plan, table, lists, trace, (sums, median))
 
     try:
         jax.jit(both).lower(*jax.eval_shape(example)).compile()
-    except Exception as error:  # whatever stops the compiler
+    except Exception as error:  # whatever stops the import or the compiler
         reason = str(error).splitlines() or [type(error).__name__]
         logging.getLogger(__name__).warning(
             "splats are blended by jax.lax, for this GPU cannot run the kernels: %s", reason[0]

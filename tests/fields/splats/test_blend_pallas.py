@@ -2,11 +2,13 @@
 
 import functools
 import logging
+import sys
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.experimental import pallas
 from splat_scenes import (
     CONFIG,
     COUNT,
@@ -107,6 +109,21 @@ def test_a_gpu_that_cannot_run_them_falls_back_to_loops_and_says_so(caplog):
     said = [record.getMessage() for record in caplog.records if "blended" in record.getMessage()]
     assert len(said) == 1 and "\n" not in said[0]
     np.testing.assert_allclose(found[0], oracle(SCENES["in front"])["rgb"], atol=2e-5)
+
+
+def test_without_their_backend_a_gpu_falls_back_to_loops_and_says_so(caplog, monkeypatch):
+    """Pallas' Triton backend is deprecated: where it is gone, nothing else needs it."""
+    monkeypatch.delitem(sys.modules, blend_pallas.__name__)
+    monkeypatch.delattr(pallas, "triton")
+    monkeypatch.setitem(sys.modules, "jax.experimental.pallas.triton", None)
+    config = RasterizeConfig(platform="gpu")
+    raster_plan.kernels_compile.cache_clear()
+    with caplog.at_level(logging.WARNING):
+        plans = [raster_plan.plan_raster(config, height=24, width=32) for _ in range(2)]
+    raster_plan.kernels_compile.cache_clear()
+    assert [plan.compositor for plan in plans] == ["loops"] * 2
+    (said,) = (record.getMessage() for record in caplog.records)
+    assert "cannot run the kernels" in said and "triton" in said and "\n" not in said
 
 
 @pytest.mark.parametrize("name", ["compositor", "platform"])
