@@ -152,7 +152,7 @@ def _closeup_loss(field: RadianceField, config: TrainConfig, *, sequential: bool
     loss_of = _bind_loss(field, sequential=sequential)
     render = _render_pixels(field, sequential=sequential and not whole)
 
-    def draw(keys: DrawKeys, data: tuple[Views | Windows, LabelSources, PseudoSettings]) -> Any:
+    def draw(keys: DrawKeys, data: Any) -> Any:
         views, sources, settings = data
         batch = sample_batch(keys.batch, views, config.num_rays)
         virtual = sample_closeup(keys.label, sources, settings, config.num_label_rays)
@@ -196,8 +196,7 @@ def labeled_step(
 ) -> tuple[TrainState, Metrics]:
     """Take one step on training photographs and on views labeled once, such as target views.
 
-    The losses are added as in the paper, never pooled. The step draws the same photographs as
-    `train_step`.
+    The losses are added as in the paper, never pooled; the photographs are those of `train_step`.
 
     Args:
       state: training state.

@@ -197,11 +197,12 @@ class _SplatField:
 
     def local(self) -> Local | None:
         """Return how steps touch a part of the surfels, if they leave the others as they are."""
-        config, density = self.config, self.config.density
+        config = self.config
+        density: Any = config.density
         noise = isinstance(density, McmcConfig) and density.noise > 0
         if not config.selective_adam or noise or isinstance(density, AdaptiveConfig):
             return None
-        every: Any = _RENEWED_EVERY if density is None else density.every
+        every = _RENEWED_EVERY if density is None else density.every
 
         def adapt(key: jax.Array, part: Any) -> Any:
             del key
