@@ -40,7 +40,6 @@ inline void fetch(const float* base, int32_t splat, int stride) {
   __builtin_prefetch(base + static_cast<long>(splat) * stride);
   __builtin_prefetch(base + static_cast<long>(splat) * stride + 16);
 }
-constexpr int AHEAD = 4;
 
 // A splat at pixels, see `splat_math.shade`.
 struct Shade {
@@ -68,6 +67,10 @@ inline Shade shade(const float* row, float ox, float oy, V x, V y, float near) {
   s.drawn = at_most(broadcast(ALPHA_MIN), s.alpha) & at_most(s.w * near, broadcast(1));
   return s;
 }
+
+// Splats are evaluated in batches before they are blended one by one: evaluations of a batch depend
+// on nothing, so a processor overlaps them.
+constexpr int BATCH = 8;
 
 // Where a tile lies in images.
 struct Place {
@@ -129,12 +132,20 @@ void forward_tile(const Band& band, const Planes& out, int tile, const Pixels& p
   }
   const int32_t* list = band.list + band.starts[tile];
   const int count = band.starts[tile + 1] - band.starts[tile];
+  Shade batch[BATCH][PARTS];
   for (int i = 0; i < count; i++) {
+    if (i % BATCH == 0) {
+      for (int k = i; k < count && k < i + BATCH; k++) {
+        if (k + BATCH < count) fetch(band.splats, list[k + BATCH], band.stride);
+        const float* row = band.splats + static_cast<long>(list[k]) * band.stride;
+        for (int j = 0; j < PARTS; j++)
+          batch[k - i][j] = shade(row, place.ox, place.oy, pixels.x[j], pixels.y[j], band.near);
+      }
+    }
     const float* row = band.splats + static_cast<long>(list[i]) * band.stride;
-    if (i + AHEAD < count) fetch(band.splats, list[i + AHEAD], band.stride);
     M open{};
     for (int j = 0; j < PARTS; j++) {
-      const Shade s = shade(row, place.ox, place.oy, pixels.x[j], pixels.y[j], band.near);
+      const Shade& s = batch[i % BATCH][j];
       if (!any(s.drawn)) {
         open = open | at_most(least, product[j]);
         continue;
@@ -206,18 +217,26 @@ void backward_tile(const Band& band, const Cotangents& in, float* all_sums, int 
   const int count = FEATURES ? SUMS : offside_sums(features), stride = sums_stride(features);
   const int32_t* list = band.list + band.starts[tile];
   const int listed = band.starts[tile + 1] - band.starts[tile];
-  for (int i = (last < listed ? last : listed) - 1; i >= 0; i--) {
-    const float* row = band.splats + static_cast<long>(list[i]) * band.stride;
-    if (i >= AHEAD) {
-      fetch(band.splats, list[i - AHEAD], band.stride);
-      fetch(all_sums, list[i - AHEAD], stride);
+  Shade batch[BATCH][PARTS];
+  const int behind_all = last < listed ? last : listed;
+  for (int i = behind_all - 1; i >= 0; i--) {
+    const int turn = (behind_all - 1 - i) % BATCH;
+    if (turn == 0) {
+      for (int k = i; k >= 0 && k > i - BATCH; k--) {
+        if (k >= BATCH) fetch(band.splats, list[k - BATCH], band.stride);
+        fetch(all_sums, list[k], stride);
+        const float* row = band.splats + static_cast<long>(list[k]) * band.stride;
+        for (int j = 0; j < PARTS; j++)
+          batch[i - k][j] = shade(row, place.ox, place.oy, pixels.x[j], pixels.y[j], band.near);
+      }
     }
+    const float* row = band.splats + static_cast<long>(list[i]) * band.stride;
     V total[SUMS], aside[4];
     for (int f = 0; f < count; f++) total[f] = V{};
     for (int f = 0; f < 4; f++) aside[f] = V{};
     bool draws = false, has_aside = false;
     for (int j = 0; j < PARTS; j++) {
-      const Shade s = shade(row, place.ox, place.oy, pixels.x[j], pixels.y[j], band.near);
+      const Shade& s = batch[turn][j];
       const M drawn = s.drawn & less(broadcast(i), at.stop[j]);
       if (!any(drawn)) continue;
       draws = true;
