@@ -218,6 +218,7 @@ void backward_tile(const Band& band, const Cotangents& in, float* all_sums, int 
   const int32_t* list = band.list + band.starts[tile];
   const int listed = band.starts[tile + 1] - band.starts[tile];
   Shade batch[BATCH][PARTS];
+  V passing[BATCH][PARTS];  // what each lets pass, inverted
   const int behind_all = last < listed ? last : listed;
   for (int i = behind_all - 1; i >= 0; i--) {
     const int turn = (behind_all - 1 - i) % BATCH;
@@ -226,8 +227,13 @@ void backward_tile(const Band& band, const Cotangents& in, float* all_sums, int 
         if (k >= BATCH) fetch(band.splats, list[k - BATCH], band.stride);
         fetch(all_sums, list[k], stride);
         const float* row = band.splats + static_cast<long>(list[k]) * band.stride;
-        for (int j = 0; j < PARTS; j++)
-          batch[i - k][j] = shade(row, place.ox, place.oy, pixels.x[j], pixels.y[j], band.near);
+        for (int j = 0; j < PARTS; j++) {
+          Shade& s = batch[i - k][j];
+          s = shade(row, place.ox, place.oy, pixels.x[j], pixels.y[j], band.near);
+          s.drawn = s.drawn & less(broadcast(k), at.stop[j]);
+          s.alpha = select(s.drawn, s.alpha);
+          passing[i - k][j] = 1.f / (1.f - s.alpha);
+        }
       }
     }
     const float* row = band.splats + static_cast<long>(list[i]) * band.stride;
@@ -237,12 +243,12 @@ void backward_tile(const Band& band, const Cotangents& in, float* all_sums, int 
     bool draws = false, has_aside = false;
     for (int j = 0; j < PARTS; j++) {
       const Shade& s = batch[turn][j];
-      const M drawn = s.drawn & less(broadcast(i), at.stop[j]);
+      const M drawn = s.drawn;
       if (!any(drawn)) continue;
       draws = true;
       // Pixels that draw nothing may have no depth.
-      const V alpha = select(drawn, s.alpha), z = select(drawn, s.z), inverse = select(drawn, s.inverse);
-      const V passing = 1.f / (1.f - alpha), before = after[j] * passing;
+      const V alpha = s.alpha, z = select(drawn, s.z), inverse = select(drawn, s.inverse);
+      const V before = after[j] * passing[turn][j];
       const V shifted = select(drawn, inverse - at.reference[j]);
       const V depth_bar = at.sums[features][j], alpha_bar = at.sums[features + 1][j];
       const V first_bar = at.sums[features + 2][j], second_bar = at.sums[features + 3][j];
@@ -254,7 +260,7 @@ void backward_tile(const Band& band, const Cotangents& in, float* all_sums, int 
         add(total[PAYLOAD_SUMS + f], weight * at.sums[f][j]);
       }
       // The splat adds its own worth and dims all splats behind it.
-      V scaled = alpha * (before * value - behind[j] * passing);
+      V scaled = alpha * (before * value - behind[j] * passing[turn][j]);
       scaled = select(less(alpha, broadcast(ALPHA_MAX)), scaled);
       // The median splat takes transmittance to 1/2, else it is the last drawn one.
       const M last = at_most(after[j], broadcast(.5f)) | equal(after[j], at.remaining[j]);
