@@ -196,19 +196,18 @@ def labeled_step(
 ) -> tuple[TrainState, Metrics]:
     """Take one step on training photographs and on views labeled once, such as target views.
 
-    The losses are added as in the paper, never pooled; the photographs are those of `train_step`.
+    The losses are added as in the paper; the photographs are those of `train_step`.
 
     Args:
       state: training state.
       views: training photographs.
-      labels: from `label_views`, or windows of such views.
+      labels: from `label_views`, or windows of them.
       settings: `label_loss_weight` and `lr_scale` count.
       field: static.
       optimizer: static.
       config: static.
       spread: how several draws are taken.
-      sequential: static; see `rendered_loss`.
-      local: static; as in `train_step`.
+      sequential, local: static; as in `train_step`.
 
     Returns:
       The next state and metrics; the field's metrics of the labeled pixels as `label_<name>`.

@@ -69,9 +69,8 @@ def local_steps(
 
     def put(key: jax.Array, state: Any, part: Any, place: jax.Array) -> Any:
         state = _put(state, part, place, rows=rows)
-        if is_due(int(state.step)):
-            state = _with_bounds(adapt_all(key, state), rows=rows)
-        return state
+        # Surfels that moved far are sorted anew, or their chunks would be in sight everywhere.
+        return _prepare(adapt_all(key, state), rows=rows) if is_due(int(state.step)) else state
 
     return Local(
         prepare=functools.partial(_prepare, rows=rows),
@@ -92,11 +91,12 @@ def _part_size(needed: int, chunks: int) -> int:
 
 @functools.partial(jax.jit, static_argnames="rows")
 def _prepare(state: Any, *, rows: int) -> Any:
+    state = _finish(state)
     order = _morton_order(state.params, state.buffers.alive)
     state = _map_rows(lambda leaf: leaf[order], state)
     number = jnp.sum(state.buffers.alive, dtype=jnp.float32)
     state = state.replace(buffers=state.buffers.replace(number=number))
-    return _with_bounds(state, rows=rows)
+    return state.replace(buffers=state.buffers.replace(bounds=_bounds_of(state, rows)))
 
 
 @functools.partial(jax.jit, static_argnames="near")
@@ -161,11 +161,6 @@ def _put(state: Any, part: Any, place: jax.Array, *, rows: int) -> Any:
     old = state.replace(buffers=state.buffers.replace(bounds=None))
     after = jax.tree.map(into, old, part)
     return after.replace(buffers=after.buffers.replace(bounds=bounds))
-
-
-@functools.partial(jax.jit, static_argnames="rows")
-def _with_bounds(state: Any, *, rows: int) -> Any:
-    return state.replace(buffers=state.buffers.replace(bounds=_bounds_of(state, rows)))
 
 
 def _finish(state: Any) -> Any:

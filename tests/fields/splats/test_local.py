@@ -73,12 +73,16 @@ def test_a_step_on_a_part_is_a_step_on_everything(views, seed):
         whole, expected = STEP(whole, views)
         state, metrics = STEP(state, views, local=True)
         np.testing.assert_allclose(metrics["psnr"], expected["psnr"], rtol=1e-5)
+        if state.step == 4:  # relocations were due, and rows are sorted anew after them
+            whole = FIELD.local.prepare(whole)
         for name, new in vars(state.params).items():
             old, other = getattr(before.params, name), getattr(whole.params, name)
             np.testing.assert_allclose(new, other, atol=2e-5, err_msg=name)
             still = np.asarray(old) == np.asarray(other)
-            assert still.mean() > 0.5, "a window sees a small part"
-            np.testing.assert_array_equal(np.asarray(new)[still], np.asarray(other)[still])
+            if state.step < 4:
+                assert still.mean() > 0.5, "a window sees a small part"
+                np.testing.assert_array_equal(np.asarray(new)[still], np.asarray(other)[still])
+    whole = FIELD.local.finish(whole)
     assert state.step == whole.step == 4
     assert jax.tree.structure(FIELD.local.finish(state)) == jax.tree.structure(whole)
 
