@@ -1,9 +1,8 @@
 """Training steps, pure, for any field: on photographs alone, and with pseudo-labels beside them.
 
 `field`, `optimizer`, `config`, `spread` and `sequential` are static: bind them with
-`functools.partial` before `jax.jit`. A field that renders whole images compiles its rendering
-itself. Without `jax.jit` around it, a step of such a field runs a few compiled parts, and all kinds
-of steps share them.
+`functools.partial` before `jax.jit`. Without it, a step of a field that renders whole images runs a
+few compiled parts, and all kinds of steps share them.
 """
 
 import functools
@@ -50,23 +49,15 @@ def train_step(
       config: static.
       spread: how several draws are taken.
       sequential: static; see `rendered_loss`.
-      local: static; touch only the part of the field that the step sees, see `update_state`.
+      local: static; touch only what the step sees, see `update_state`.
 
     Returns:
       The next state, and metrics: `loss`, `skipped` and those of the field. A step whose loss or
       gradient is not finite changes nothing but the count of steps; then `skipped` is 1, else 0.
     """
-    loss_of = _bind_loss(field, sequential=sequential)
-
-    def draw(keys: DrawKeys, views: Views | Windows) -> Any:
-        return sample_batch(keys.batch, views, config.num_rays), keys.render
-
-    def loss(params: Any, buffers: Any, drawn: Any) -> Loss:
-        return loss_of(params, buffers, *drawn)
-
     return update_state(
         state,
-        DrawLoss(draw, loss, lambda drawn: (drawn[0].cameras,)),
+        _photograph_loss(field, config, sequential),
         views,
         field=field,
         optimizer=optimizer,
@@ -75,6 +66,21 @@ def train_step(
         lr_scale=lr_scale,
         local=local,
     )
+
+
+# The losses are the same objects in every step, so what is compiled for them is found again.
+@functools.cache
+def _photograph_loss(field: RadianceField, config: TrainConfig, sequential: bool) -> DrawLoss:
+    """Return the loss of one draw of `train_step`."""
+    loss_of = _bind_loss(field, sequential=sequential)
+
+    def draw(keys: DrawKeys, views: Views | Windows) -> Any:
+        return sample_batch(keys.batch, views, config.num_rays), keys.render
+
+    def loss(params: Any, buffers: Any, drawn: Any) -> Loss:
+        return loss_of(params, buffers, *drawn)
+
+    return DrawLoss(draw, loss, lambda drawn: (drawn[0].cameras,))
 
 
 def pseudo_step(
@@ -89,7 +95,7 @@ def pseudo_step(
 ) -> tuple[TrainState, Metrics]:
     """Take a `closeup_step` on photographs `views` with z-depths `depths[V, H, W]`.
 
-    Every step makes the blocks of `label_sources` anew: make them once in a long training.
+    Every step makes `label_sources` anew: make them once in a long training.
     """
     sources = label_sources(views, depths)
     return closeup_step(
@@ -124,10 +130,7 @@ def closeup_step(
       field: static; field to train.
       optimizer: static.
       config: static.
-      spread: how several draws are taken.
-      sequential: static; under `jax.vmap`, render the pixels of one member after another; see
-        `rendered_loss`.
-      local: static; as in `train_step`.
+      spread, sequential, local: static; as in `train_step`.
 
     Returns:
       The next state, and metrics with `label_coverage`, the share of labeled virtual pixels; unless
@@ -135,7 +138,7 @@ def closeup_step(
     """
     return update_state(
         state,
-        _closeup_loss(field, config, sequential=sequential),
+        _closeup_loss(field, config, sequential),
         (views, sources, settings),
         field=field,
         optimizer=optimizer,
@@ -146,7 +149,8 @@ def closeup_step(
     )
 
 
-def _closeup_loss(field: RadianceField, config: TrainConfig, *, sequential: bool) -> DrawLoss:
+@functools.cache
+def _closeup_loss(field: RadianceField, config: TrainConfig, sequential: bool) -> DrawLoss:
     """Return the loss of one draw of `closeup_step`."""
     rule, whole = LABEL_RULES[config.label_rule], config.num_label_rays is None
     loss_of = _bind_loss(field, sequential=sequential)
@@ -212,13 +216,28 @@ def labeled_step(
     Returns:
       The next state and metrics; the field's metrics of the labeled pixels as `label_<name>`.
     """
+    return update_state(
+        state,
+        _labeled_loss(field, config, sequential),
+        (views, labels, settings),
+        field=field,
+        optimizer=optimizer,
+        draws=config.num_windows,
+        spread=spread,
+        lr_scale=settings.lr_scale,
+        local=local,
+    )
+
+
+@functools.cache
+def _labeled_loss(field: RadianceField, config: TrainConfig, sequential: bool) -> DrawLoss:
+    """Return the loss of one draw of `labeled_step`."""
     loss_of = _bind_loss(field, sequential=sequential)
 
-    def draw(keys: DrawKeys, data: tuple[Views | Windows, Views | Windows, PseudoSettings]) -> Any:
+    def draw(keys: DrawKeys, data: Any) -> Any:
         views, labels, settings = data
-        batch = sample_batch(keys.batch, views, config.num_rays)
-        labeled = sample_labels(keys.label, labels, config.num_label_rays)
-        return (batch, keys.render), labeled, settings
+        photographs = sample_batch(keys.batch, views, config.num_rays), keys.render
+        return photographs, sample_labels(keys.label, labels, config.num_label_rays), settings
 
     def loss(params: Any, buffers: Any, drawn: Any) -> Loss:
         photographs, labeled, settings = drawn
@@ -229,17 +248,7 @@ def labeled_step(
             settings.label_loss_weight,
         )
 
-    return update_state(
-        state,
-        DrawLoss(draw, loss, lambda drawn: (drawn[0][0].cameras, drawn[1][0].cameras)),
-        (views, labels, settings),
-        field=field,
-        optimizer=optimizer,
-        draws=config.num_windows,
-        spread=spread,
-        lr_scale=settings.lr_scale,
-        local=local,
-    )
+    return DrawLoss(draw, loss, lambda drawn: (drawn[0][0].cameras, drawn[1][0].cameras))
 
 
 def run_steps(
