@@ -107,8 +107,7 @@ def update_state(
     if local and field.local is not None:
         drawn = of_draw.draw(keys, data)
         part, place = field.local.take(state, of_draw.cameras(drawn))
-        differentiate = jax.jit(_differentiate, static_argnums=0)
-        (value, metrics), gradients = differentiate(of_draw, part.params, part.buffers, drawn)
+        (value, metrics), gradients = _differentiate(of_draw, part.params, part.buffers, drawn)
         part, skipped = advance(part, key_adapt, value, gradients, scale, adapt=field.local.adapt)
         after = field.local.put(key_adapt, state, part, place)
         return after, {"loss": value, "skipped": skipped} | metrics

@@ -68,8 +68,6 @@ def train_step(
     )
 
 
-# The losses are the same objects in every step, so what is compiled for them is found again.
-@functools.cache
 def _photograph_loss(field: RadianceField, config: TrainConfig, sequential: bool) -> DrawLoss:
     """Return the loss of one draw of `train_step`."""
     loss_of = _bind_loss(field, sequential=sequential)
@@ -149,7 +147,6 @@ def closeup_step(
     )
 
 
-@functools.cache
 def _closeup_loss(field: RadianceField, config: TrainConfig, sequential: bool) -> DrawLoss:
     """Return the loss of one draw of `closeup_step`."""
     rule, whole = LABEL_RULES[config.label_rule], config.num_label_rays is None
@@ -229,7 +226,6 @@ def labeled_step(
     )
 
 
-@functools.cache
 def _labeled_loss(field: RadianceField, config: TrainConfig, sequential: bool) -> DrawLoss:
     """Return the loss of one draw of `labeled_step`."""
     loss_of = _bind_loss(field, sequential=sequential)
