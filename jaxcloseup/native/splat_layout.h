@@ -59,7 +59,7 @@ struct Band {
   float near;          // z-depth before which nothing is drawn
   const float* splats; // rows of the table of the band's splats
   const int32_t* list; // numbers of splats, tile after tile
-  const int32_t* starts;  // where each tile's list starts, and the end
+  const int64_t* starts;  // where each tile's list starts, and the end
 };
 
 // Images of `height` x `width`, one behind the other.
@@ -90,7 +90,7 @@ using FindTiles = void (*)(const Image&, int begin, int end, TileBox* boxes);
 // Of `count` splats, in each row of tiles of its box, the tiles in which a splat draws. A splat's
 // rows start at `starts` in `ranges`.
 using FindReach = void (*)(const Image&, int count, const int32_t* splats, const TileBox* boxes,
-                           const int32_t* starts, Range* ranges);
+                           const int64_t* starts, Range* ranges);
 
 // The functions, compiled for one instruction set.
 struct Passes {

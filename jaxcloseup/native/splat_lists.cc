@@ -70,12 +70,12 @@ void Listing::deal_out() {
   for (int band = 0; band < bands; band++) band_starts[band + 1] += band_starts[band];
   members.resize(band_starts.back());
   places.resize(starts.back());
-  std::vector<int32_t> next(band_starts.begin(), band_starts.end() - 1);
+  std::vector<int64_t> next(band_starts.begin(), band_starts.end() - 1);
   for (size_t i = 0; i < splats.size(); i++) {
     for (int band = of_bands[i].first; band <= of_bands[i].last; band++) {
-      const int place = next[band]++;
+      const int64_t place = next[band]++;
       members[place] = static_cast<int32_t>(i);
-      places[starts[i] + band - of_bands[i].first] = place - band_starts[band];
+      places[starts[i] + band - of_bands[i].first] = static_cast<int32_t>(place - band_starts[band]);
     }
   }
 }

@@ -15,10 +15,10 @@ struct Listing {
   int rows_each, bands;
   std::vector<TileBox> boxes;    // [N]
   std::vector<int32_t> splats;   // [S] indices, of equal depth by index
-  std::vector<int32_t> starts;   // [S + 1] where the rows of each start in `ranges`
+  std::vector<int64_t> starts;   // [S + 1] where the rows of each start in `ranges`
   std::vector<Range> ranges;     // tiles in which a splat draws, for each row of its box
   std::vector<Range> of_bands;   // [S] first and last band of each
-  std::vector<int32_t> band_starts;  // [bands + 1] where each band starts in `members`
+  std::vector<int64_t> band_starts;  // [bands + 1] where each band starts in `members`
   std::vector<int32_t> members;  // numbers of splats in `splats`, band after band
   // Place of each splat in its bands' members, at `starts`, one band behind the other.
   std::vector<int32_t> places;
@@ -33,7 +33,8 @@ struct Listing {
 struct BandLists {
   Band band;
   std::vector<float> rows;
-  std::vector<int32_t> list, starts, next;
+  std::vector<int32_t> list;
+  std::vector<int64_t> starts, next;
 
   void make(const Image& image, const Listing& listing, int number);
 };

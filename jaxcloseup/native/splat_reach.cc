@@ -62,7 +62,7 @@ void find_tiles(const Image& image, int begin, int end, TileBox* boxes) {
 // With the homography H, cutoff c and d = (1, q - anchor), a splat is at least ALPHA_MIN where
 // |(H[0].d, H[1].d)| <= c H[2].d, a quadratic form in q - anchor: within an ellipse. In a row of
 // tiles, its sides are farthest out as near to its leftmost and rightmost points as can be.
-void find_reach(const Image& image, int count, const int32_t* splats, const TileBox* boxes, const int32_t* starts,
+void find_reach(const Image& image, int count, const int32_t* splats, const TileBox* boxes, const int64_t* starts,
                 Range* ranges) {
   for (int begin = 0; begin < count; begin += LANES) {
     const int lanes = count - begin < LANES ? count - begin : LANES;
@@ -137,7 +137,7 @@ void OF_ISA(find_tiles_, ISA)(const Image& image, int begin, int end, TileBox* b
 }
 
 void OF_ISA(find_reach_, ISA)(const Image& image, int count, const int32_t* splats, const TileBox* boxes,
-                              const int32_t* starts, Range* ranges) {
+                              const int64_t* starts, Range* ranges) {
   find_reach(image, count, splats, boxes, starts, ranges);
 }
 

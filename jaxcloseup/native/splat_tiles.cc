@@ -131,7 +131,7 @@ void forward_tile(const Band& band, const Planes& out, int tile, const Pixels& p
     for (int f = 0; f < features + MOMENTS; f++) sums[f][j] = V{};
   }
   const int32_t* list = band.list + band.starts[tile];
-  const int count = band.starts[tile + 1] - band.starts[tile];
+  const int count = static_cast<int>(band.starts[tile + 1] - band.starts[tile]);
   Shade batch[BATCH][PARTS];
   for (int i = 0; i < count; i++) {
     if (i % BATCH == 0) {
@@ -216,7 +216,7 @@ void backward_tile(const Band& band, const Cotangents& in, float* all_sums, int 
   constexpr int SUMS = FEATURES ? (PAYLOAD_SUMS + FEATURES + 15) / 16 * 16 : MOST_FEATURES + PAYLOAD_SUMS;
   const int count = FEATURES ? SUMS : offside_sums(features), stride = sums_stride(features);
   const int32_t* list = band.list + band.starts[tile];
-  const int listed = band.starts[tile + 1] - band.starts[tile];
+  const int listed = static_cast<int>(band.starts[tile + 1] - band.starts[tile]);
   Shade batch[BATCH][PARTS];
   V passing[BATCH][PARTS];  // what each lets pass, inverted
   const int behind_all = last < listed ? last : listed;
@@ -337,7 +337,7 @@ void backward(const Band& band, const Cotangents& in, float* sums) {
 }  // namespace
 
 void OF_ISA(find_tiles_, ISA)(const Image&, int, int, TileBox*);
-void OF_ISA(find_reach_, ISA)(const Image&, int, const int32_t*, const TileBox*, const int32_t*, Range*);
+void OF_ISA(find_reach_, ISA)(const Image&, int, const int32_t*, const TileBox*, const int64_t*, Range*);
 
 extern const Passes OF_ISA(passes_, ISA) = {NAME(ISA), OF_ISA(find_tiles_, ISA), OF_ISA(find_reach_, ISA),
                                             forward, backward};

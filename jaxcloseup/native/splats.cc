@@ -93,7 +93,7 @@ ffi::Error count_splats(ffi::ThreadPool pool, Floats table, Floats box, Floats o
     parallel_for_with<BandLists>(pool, listing.bands, [&](BandLists& lists, int band) {
       lists.make(image, listing, band);
       const int first = lists.band.first_row * lists.band.columns, own = lists.band.rows * lists.band.columns;
-      for (int tile = 0; tile < own; tile++) out[first + tile] = lists.starts[tile + 1] - lists.starts[tile];
+      for (int tile = 0; tile < own; tile++) out[first + tile] = static_cast<int32_t>(lists.starts[tile + 1] - lists.starts[tile]);
     });
   }
   return ffi::Error::Success();
