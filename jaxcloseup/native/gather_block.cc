@@ -6,15 +6,8 @@
 // Compiled once for each instruction set; ISA names the result. Nothing of the standard library
 // may be instantiated here: the linker would keep one copy for all processors.
 #include "gather.h"
+#include "isa.h"
 #include "vectors.h"
-
-#ifndef ISA
-#define ISA baseline
-#endif
-#define NAMED(prefix, isa) prefix##isa
-#define OF_ISA(prefix, isa) NAMED(prefix, isa)
-#define STRING(name) #name
-#define NAME(name) STRING(name)
 
 namespace jaxcloseup {
 namespace {

@@ -5,13 +5,8 @@
 #include <cmath>
 
 #include "splat_surfels.h"
+#include "isa.h"
 #include "vectors.h"
-
-#ifndef ISA
-#define ISA baseline
-#endif
-#define NAMED(prefix, isa) prefix##isa
-#define OF_ISA(prefix, isa) NAMED(prefix, isa)
 
 namespace jaxcloseup {
 namespace {

@@ -4,13 +4,8 @@
 #include <cmath>
 
 #include "splat_layout.h"
+#include "isa.h"
 #include "vectors.h"
-
-#ifndef ISA
-#define ISA baseline
-#endif
-#define NAMED(prefix, isa) prefix##isa
-#define OF_ISA(prefix, isa) NAMED(prefix, isa)
 
 namespace jaxcloseup {
 namespace {

@@ -3,13 +3,8 @@
 // Compiled once for each instruction set; ISA names the result. Nothing of the standard library
 // may be instantiated here: the linker would keep one copy for all processors.
 #include "splat_layout.h"
+#include "isa.h"
 #include "vectors.h"
-
-#ifndef ISA
-#define ISA baseline
-#endif
-#define NAMED(prefix, isa) prefix##isa
-#define OF_ISA(prefix, isa) NAMED(prefix, isa)
 
 namespace jaxcloseup {
 namespace {
@@ -330,9 +325,6 @@ void backward(const Band& band, const Cotangents& in, float* sums) {
   if (band.features == 3) return backward_tiles<3>(band, in, sums);
   backward_tiles<0>(band, in, sums);
 }
-
-#define STRING(name) #name
-#define NAME(name) STRING(name)
 
 }  // namespace
 
