@@ -33,21 +33,22 @@ class BuildNative(build_ext):
         jaxlib = importlib.util.find_spec("jaxlib")
         if jaxlib is None:
             raise CompileError("the headers of jaxlib are missing")
-        self.compiler.include_dirs = [str(pathlib.Path(jaxlib.origin).parent / "include")]
+        self.compiler.include_dirs = []
+        common = [*FLAGS, "-isystem", str(pathlib.Path(jaxlib.origin).parent / "include")]
         options = {"output_dir": self.build_temp, "depends": extension.depends}
         once = [source for source in extension.sources if source not in OF_PROCESSOR]
-        objects = self.compiler.compile(once, extra_postargs=FLAGS, **options)
+        objects = self.compiler.compile(once, extra_postargs=common, **options)
         for name, flags in PROCESSORS.items():
             options["output_dir"] = str(pathlib.Path(self.build_temp, name))
-            extra = [*FLAGS, *flags, f"-DISA={name}"]
+            extra = [*common, *flags, f"-DISA={name}"]
             objects += self.compiler.compile(OF_PROCESSOR, extra_postargs=extra, **options)
         target = pathlib.Path(self.get_ext_fullpath(extension.name))
         target.parent.mkdir(parents=True, exist_ok=True)
         self.compiler.link_shared_object(objects, str(target), target_lang="c++")
 
     def get_ext_filename(self, fullname):
-        """Return the library's file, whose name has no version of Python."""
-        return str(pathlib.Path(*fullname.split("."))) + ".so"
+        """Return the library's file; by its dot nothing takes it for a module of Python."""
+        return str(pathlib.Path(*fullname.split("."))) + ".lib.so"
 
 
 class AnyPython(bdist_wheel):

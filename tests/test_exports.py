@@ -107,7 +107,7 @@ def test_the_wheel_has_every_file_of_the_package_and_no_other_package():
     data = {path for name in settings["package-data"]["jaxcloseup"] for path in ROOT.glob(name)}
     kinds = settings["exclude-package-data"]["jaxcloseup.native"]
     sources = {path for kind in kinds for path in (ROOT / "native").glob(kind)}
-    built = set((ROOT / "native").glob("_native*.so"))
+    built = set((ROOT / "native").glob("_native.lib.so"))
     assert len(sources) > 5 and len(built) <= 1
     for path in ROOT.rglob("*"):
         if path.is_file() and "__pycache__" not in path.parts:

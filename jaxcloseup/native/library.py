@@ -29,8 +29,8 @@ class LibraryError(OSError):
 
 def path() -> pathlib.Path | None:
     """Return the library's file, or None if it was not built."""
-    found = sorted(pathlib.Path(__file__).parent.glob("_native*.so"))
-    return found[0] if found else None
+    file = pathlib.Path(__file__).with_name("_native.lib.so")
+    return file if file.exists() else None
 
 
 @functools.cache

@@ -4,6 +4,7 @@ import dataclasses
 import importlib.metadata
 import os
 import pathlib
+import pkgutil
 import shutil
 import subprocess
 import sys
@@ -49,6 +50,12 @@ def test_without_a_compiler_nothing_is_built(tmp_path):
     assert done.returncode == 0, done.stderr
     assert 'extension "jaxcloseup.native._native" failed' in done.stdout + done.stderr
     assert not list(tmp_path.rglob("*.so"))
+
+
+def test_no_tool_takes_the_library_for_a_module():
+    """Makers of API pages import every module that they find in a folder."""
+    names = [found.name for found in pkgutil.iter_modules([str(PACKAGE / "native")])]
+    assert names == ["library"]
 
 
 @pytest.fixture
