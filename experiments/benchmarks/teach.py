@@ -70,8 +70,11 @@ def run_evidence(folder: pathlib.Path) -> tuple[str, list[Evidence]]:
         told = make_evidence(found, own, jnp.asarray(views.weight[index]))
         return sample_evidence(told, PIXELS // len(views), seed=index)
 
-    kinds = _held_out(scene, programs.preset.score_downscale)
+    kinds = _held_out(scene, _FINER)
     return scene.name, [evidence(views, i) for views in kinds for i in range(len(views))]
+
+
+_FINER = 4  # divisor of the photographs' size of the finer views among those that teach
 
 
 def _held_out(scene: Scene, finer: int | None) -> Iterator[Views]:

@@ -26,7 +26,7 @@ from experiments.studies.tables import (
 
 
 FLAGS = flags.FLAGS
-_GIVEN = ("--stages=control,detail", "--set=score_downscale=none")
+_GIVEN = ("--stages=control,detail", "--score_width=120")
 
 
 def define_flags() -> None:

@@ -40,8 +40,11 @@ def load_capture(
     format: str | None = None,
     split: str = "given",
     photographs: int | None = None,
+    pixels: int | None = None,
 ) -> Scene:
     """Load the capture in a folder, as `jaxcloseup.captures.load.load_scene` describes.
+
+    With `pixels`, the divisor is chosen, and that of `reading` does not count.
 
     Raises:
       SceneError: one sentence that names the file and the field and says what to do.
@@ -54,7 +57,8 @@ def load_capture(
             format=format,
             split=split,
             zoom=reading.zoom,
-            downscale=reading.downscale,
+            downscale=reading.downscale if pixels is None else None,
+            pixels=pixels or 1,
             photographs=photographs,
             find_points=functools.partial(_points_of, reading),
         )
@@ -65,7 +69,7 @@ def load_capture(
         ) from error
     for note in listing.notes:
         _log.info(note)
-    scene = _load(listing, reading)
+    scene = _load(listing, reading._replace(downscale=listing.downscale))
     scene.metadata.update(path=path, split=split)
     return scene
 

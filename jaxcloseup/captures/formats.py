@@ -1,15 +1,16 @@
 """Detect the format of a capture folder and list its photographs."""
 
+import math
 import pathlib
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxcloseup.captures.colmap import holds_model, read_colmap
 from jaxcloseup.captures.llff import read_llff
-from jaxcloseup.captures.photo_files import ENDINGS
+from jaxcloseup.captures.photo_files import ENDINGS, size_of_image
 from jaxcloseup.captures.photo_masks import attach_masks
 from jaxcloseup.captures.points import read_ply_points
 from jaxcloseup.captures.reduced_photos import attach_reduced
@@ -52,6 +53,7 @@ class Listing(NamedTuple):
     # `[P]` mean reprojection errors of the points, in pixels of the photographs' own size, NaN
     # where unknown; None if the format has none
     errors: np.ndarray | None
+    downscale: int  # divisor of the photographs' size, chosen where none was given
 
 
 class _Content(NamedTuple):
@@ -71,7 +73,8 @@ def read_listing(
     format: str | None = None,
     split: str,
     zoom: int = 1,
-    downscale: int = 1,
+    downscale: int | None = 1,
+    pixels: int = 1,
     photographs: int | None = None,
     find_points: FindPoints | None = None,
 ) -> Listing:
@@ -94,6 +97,9 @@ def read_listing(
     fewer = len(chosen) < len(train)
     frames = division.frames | {"train": [train[i] for i in chosen]}
     frames, masked = attach_masks(folder, frames)
+    if downscale is None:
+        sizes = (size_of_image(frame.file) or frame.size for frame in frames["train"])
+        downscale = fitting_divisor(filter(None, sizes), zoom**2 * pixels)
     frames, reduced = attach_reduced(scene, frames, downscale)
     keep = np.ones(len(points), bool)
     if fewer or len(frames) > 1:
@@ -117,7 +123,19 @@ def read_listing(
         notes=tuple(map(printable, notes)),
         times_nearer=division.times_nearer,
         errors=None if content.errors is None else content.errors[keep],
+        downscale=downscale,
     )
+
+
+def fitting_divisor(sizes: Iterable[tuple[int, int]], pixels: int) -> int:
+    """Return the divisor that brings most photographs next to a number of pixels, at least 1.
+
+    Args:
+      sizes: width and height of each photograph.
+      pixels: about how many a photograph keeps.
+    """
+    areas = [width * height for width, height in sizes]
+    return max(1, round(math.sqrt(float(np.median(areas or [1])) / pixels)))
 
 
 def _read_content(

@@ -16,8 +16,10 @@ padded with weight 0. Points come from the model, a PLY file, or triangulated fe
 import pathlib
 
 from jaxcloseup.captures import ALPHA_MODES, FORMATS, SPLITS, Reading, load_capture
+from jaxcloseup.captures.formats import fitting_divisor
 from jaxcloseup.captures.splits import spread
 from jaxcloseup.drawn_scenes import DRAWN_SCENES, draw_scene
+from jaxcloseup.drawn_scenes.drawn import HEIGHT, WIDTH
 from jaxcloseup.photos.scene import Scene, SceneError, SceneWarning, Surface, keep_photographs
 
 
@@ -29,7 +31,8 @@ _DEFAULT_ZOOM = 4
 def load_scene(
     name_or_path: str | pathlib.Path,
     *,
-    downscale: int = 1,
+    downscale: int | None = 1,
+    pixels: int = 8192,
     half_pixel: bool = False,
     background: float = 1.0,
     format: str | None = None,
@@ -46,7 +49,8 @@ def load_scene(
 
     Args:
       name_or_path: one of `DRAWN_SCENES`, or a folder; `./table` always names a folder.
-      downscale: divisor of the photographs' size, by averaging areas, 1 or more.
+      downscale: divisor of the photographs' size, by averaging areas; None: chosen by `pixels`.
+      pixels: about how many pixels photographs keep.
       half_pixel: whether the files put pixel centers at integers, as the paper's data does.
       background: gray level in [0, 1] behind transparent pixels.
       format: the only format to read, `transforms`, `colmap` or `llff`; None reads the first found.
@@ -68,19 +72,26 @@ def load_scene(
     """
     _check_options(downscale, background, format, split, zoom, alpha_mode, photographs)
     zoom = (zoom or _DEFAULT_ZOOM) if split == "zoom" else 1
-    reading = Reading(downscale, zoom, background, half_pixel, alpha_mode, invert_masks)
+    wanted = None if downscale else pixels
     path = pathlib.Path(name_or_path)
     if len(path.parts) == 1 and str(name_or_path) == path.name:
         if path.name in DRAWN_SCENES:
             _check_drawn(path.name, format, split, invert_masks, alpha_mode)
-            scene = draw_scene(path.name, downscale=downscale)
-            return keep_photographs(scene, spread(scene.name, len(scene.train), photographs))
+            return _draw(path.name, downscale, pixels, photographs)
         if not path.exists():
             raise SceneError(
                 f"{path} is neither a folder nor a built-in scene: choose one of "
                 f"{', '.join(DRAWN_SCENES)}, or give the path of a capture."
             )
-    return load_capture(path, reading, format=format, split=split, photographs=photographs)
+    reading = Reading(downscale or 1, zoom, background, half_pixel, alpha_mode, invert_masks)
+    return load_capture(
+        path, reading, format=format, split=split, photographs=photographs, pixels=wanted
+    )
+
+
+def _draw(name: str, downscale: int | None, pixels: int, photographs: int | None) -> Scene:
+    scene = draw_scene(name, downscale=downscale or fitting_divisor([(WIDTH, HEIGHT)], pixels))
+    return keep_photographs(scene, spread(scene.name, len(scene.train), photographs))
 
 
 def _check_drawn(
@@ -100,7 +111,7 @@ def _check_drawn(
 
 
 def _check_options(
-    downscale: int,
+    downscale: int | None,
     background: float,
     format: str | None,
     split: str,
@@ -108,7 +119,9 @@ def _check_options(
     alpha_mode: str,
     photographs: int | None,
 ) -> None:
-    if isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1:
+    if downscale is not None and (
+        isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1
+    ):
         raise SceneError(f"downscale must be a whole number of at least 1, got {downscale!r}.")
     if not 0 <= background <= 1:
         raise SceneError(f"background must be a gray level in [0, 1], got {background!r}.")

@@ -90,6 +90,15 @@ def pad_images(images: Sequence[np.ndarray], height: int, width: int) -> np.ndar
     return stack
 
 
+def size_of_image(path: pathlib.Path) -> tuple[int, int] | None:
+    """Return width and height that a file's header says; None where Pillow cannot read it."""
+    try:
+        with PIL.Image.open(path) as image:
+            return image.size
+    except (OSError, ValueError, PIL.Image.DecompressionBombError):
+        return None
+
+
 def _decode(path: pathlib.Path, data: np.ndarray) -> np.ndarray:
     image, large = None, _pixels(data) > MOST_PIXELS
     if not large and data.size and not _is_truncated_jpeg(data.tobytes()):

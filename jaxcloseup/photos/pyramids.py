@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.views import Views, to_float
 
 
-BUDGET = 2**29  # bytes that the photographs of a scene may take
+BUDGET = 5 * 2**28  # bytes that the photographs of a scene may take
 _BYTES_PER_PIXEL = 4 * 4 / 3  # colors and weight of the finest level, and of all halves of it
 
 
@@ -26,11 +27,14 @@ class Pyramid:
         int8 (127 means 1) or float.
       intrinsics: `[V, L, 4]` fx, fy, cx, cy of each level, in its own pixels.
       sizes: (height, width) of each level, static.
+      extents: `[V, L, 2]` int32 height and width of each image without its padding at the right and
+        the bottom; None: no image is padded.
     """
 
     values: jax.Array
     intrinsics: jax.Array
     sizes: tuple[tuple[int, int], ...] = struct.field(pytree_node=False)
+    extents: jax.Array | None = None
 
     def coarseness(self, view: int | jax.Array) -> jax.Array:
         """Return log2 of how much larger each level's pixels are than the finest ones, `[L]`."""
@@ -83,14 +87,19 @@ def scene_pyramid(scene: Scene, *, finest: int = 1, budget: int = BUDGET) -> tup
     train, coarse = scene.train, scene.metadata.get("downscale", 1)
     pixels = train.weight.size * coarse**2
     factor = max(finest, math.ceil(math.sqrt(pixels * _BYTES_PER_PIXEL / budget)))
+    own = scene.sizes("train")
     if scene.photographs_at is None or factor >= coarse:
-        return photograph_pyramid(train), coarse
-    finer, _ = scene.photographs_at(factor)
-    return photograph_pyramid(finer, train), factor
+        return photograph_pyramid(train, extents=[own]), coarse
+    finer, sizes = scene.photographs_at(factor)
+    return photograph_pyramid(finer, train, extents=[sizes, own]), factor
 
 
 def photograph_pyramid(
-    views: Views, coarsest: Views | None = None, *, least: tuple[int, int] | None = None
+    views: Views,
+    coarsest: Views | None = None,
+    *,
+    least: tuple[int, int] | None = None,
+    extents: Sequence[Sequence[tuple[int, int]]] = (),
 ) -> Pyramid:
     """Make a pyramid of photographs, halves of them, and the photographs as training reads them.
 
@@ -102,6 +111,8 @@ def photograph_pyramid(
       views: photographs at the finest size.
       coarsest: the last level, after halves that are at least 1.5 times as wide.
       least: without `coarsest`, smallest height and width of a half; None makes only one level.
+      extents: width and height of each photograph without padding, at the finest size and, with
+        `coarsest`, at that; by default none is padded.
     """
     height, width = views.rgb.shape[1:3]
     sizes = [(height, width)]
@@ -130,7 +141,21 @@ def photograph_pyramid(
         values[:, start:] = [_pixels(*level) for level in last]
         given = np.asarray(coarsest.cameras.intrinsics)[:, None]
         intrinsics = np.concatenate([intrinsics, given], axis=1)
-    return Pyramid(jnp.asarray(values), jnp.asarray(intrinsics), tuple(sizes))
+    unpadded = _extents(extents, sizes, len(halves))
+    return Pyramid(jnp.asarray(values), jnp.asarray(intrinsics), tuple(sizes), unpadded)
+
+
+def _extents(
+    given: Sequence[Sequence[tuple[int, int]]], sizes: Sequence[tuple[int, int]], halves: int
+) -> jax.Array | None:
+    """Return `Pyramid.extents`, of which `given` has the finest level and the coarsest."""
+    if not given:
+        return None
+    finest = np.asarray(given[0], np.int32)[:, ::-1]
+    levels = [finest // 2**level for level in range(halves)]
+    levels += [np.asarray(given[-1], np.int32)[:, ::-1]] * (len(sizes) - halves)
+    found = np.maximum(np.stack(levels, axis=1), 1)
+    return None if (found == np.asarray(sizes)).all() else jnp.asarray(found)
 
 
 def _bytes(views: Views) -> np.ndarray:

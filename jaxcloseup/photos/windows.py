@@ -23,8 +23,8 @@ class Windows:
     """Photographs of one capture at L sizes, V views.
 
     Attributes:
-      cameras: stacked cameras, with the size of all windows; of photographs, of their coarsest
-        level.
+      cameras: stacked cameras, with the size of all windows, which fit into every photograph at
+        every level.
       pyramid: `[V, P, 4]` colors and weights of the photographs.
       shares: `[L]` probability of each level, finest first.
       places: `[K, 3]` centers of windows, of which each is drawn alike: a view, and x and y as
@@ -49,7 +49,8 @@ class Windows:
 def photograph_windows(cameras: Camera, pyramid: Pyramid, *, whole_share: float) -> Windows:
     """Make windows of which a share is whole photographs of the coarsest level.
 
-    The other levels are equally likely.
+    Photographs of several sizes have windows of the size that all have in common there. Of the
+    other levels, each is three times as likely as the next coarser one: it shows more.
 
     Args:
       cameras: stacked cameras of the coarsest level.
@@ -57,7 +58,12 @@ def photograph_windows(cameras: Camera, pyramid: Pyramid, *, whole_share: float)
       whole_share: in [0, 1].
     """
     finer = len(pyramid.sizes) - 1
-    shares = [(1 - whole_share) / finer] * finer + [whole_share] if finer else [1.0]
+    often = [3.0**-level for level in range(finer)]
+    shares = [(1 - whole_share) * times / sum(often) for times in often]
+    shares = [*shares, whole_share] if finer else [1.0]
+    if pyramid.extents is not None:
+        height, width = np.asarray(pyramid.extents)[:, -1].min(axis=0).tolist()
+        cameras = cameras.replace(height=height, width=width)
     return Windows(cameras, pyramid, jnp.array(shares, jnp.float32))
 
 
@@ -132,20 +138,28 @@ def sample_window(key: jax.Array, windows: Windows) -> Batch:
     """
     key_view, key_level, key_y, key_x = jax.random.split(key, 4)
     level = jax.random.categorical(key_level, jnp.log(windows.shares))
-    sizes = jnp.asarray(windows.pyramid.sizes, jnp.int32)
     size = jnp.array(windows.size, jnp.int32)
-    room = sizes[level] - size + 1
     if windows.places is None:
         view = jax.random.randint(key_view, (), 0, len(windows))
+        room = _extent(windows, view, level) - size + 1
         corner = jnp.stack(
             [jax.random.randint(key_y, (), 0, room[0]), jax.random.randint(key_x, (), 0, room[1])]
         )
     else:
         view, center = _draw_place(key_view, windows.places, ())
-        extent = sizes[level].astype(center.dtype)
+        room = _extent(windows, view, level) - size + 1
+        # Places are shares of the padded photograph.
+        extent = jnp.asarray(windows.pyramid.sizes, jnp.int32)[level].astype(center.dtype)
         corner = jnp.floor(center * extent - size.astype(center.dtype) / 2).astype(jnp.int32)
         corner = jnp.clip(corner, 0, room - 1)
     return cut_window(windows, view, level, corner)
+
+
+def _extent(windows: Windows, view: jax.Array, level: jax.Array) -> jax.Array:
+    """Return height and width `[..., 2]` of photographs at their levels, without padding."""
+    if windows.pyramid.extents is not None:
+        return windows.pyramid.extents[view, level]
+    return jnp.asarray(windows.pyramid.sizes, jnp.int32)[level]
 
 
 def _draw_place(
@@ -166,9 +180,9 @@ def sample_window_pixels(key: jax.Array, windows: Windows, count: int) -> Batch:
     pyramid = windows.pyramid
     level = jax.random.categorical(key_level, jnp.log(windows.shares), shape=(count,))
     sizes, starts = (jnp.asarray(x, jnp.int32) for x in (pyramid.sizes, pyramid.starts))
-    height, width = sizes[level].T
     if windows.places is None:
         view = jax.random.randint(key_view, (count,), 0, len(windows))
+        height, width = _extent(windows, view, level).T
         y = jax.random.randint(key_y, (count,), 0, height)
         x = jax.random.randint(key_x, (count,), 0, width)
     else:
@@ -177,8 +191,8 @@ def sample_window_pixels(key: jax.Array, windows: Windows, count: int) -> Batch:
         extent = sizes[level].astype(center.dtype)
         size = jnp.array(windows.size, center.dtype)
         pixel = jnp.floor(center * extent + within * size[None]).astype(jnp.int32)
-        y, x = jnp.clip(pixel, 0, sizes[level] - 1).T
-    values = to_float(pyramid.values[view, starts[level] + y * width + x])
+        y, x = jnp.clip(pixel, 0, _extent(windows, view, level) - 1).T
+    values = to_float(pyramid.values[view, starts[level] + y * sizes[level, 1] + x])
     return Batch(
         cameras=camera_at(windows.cameras, view).replace(
             intrinsics=pyramid.intrinsics[view, level]

@@ -36,7 +36,8 @@ def results(psnr, *, weight=None, detail=None, **changes):
         "config": {"targets": None},
         "detail": detail and {"stage": detail},
         "history": {"closeup": [{"label_coverage": 0.254}]},
-        "finer_resolution": None,
+        "resolution": [120, 68],
+        "scored_at": None,
         **changes,
     }
 
@@ -89,15 +90,16 @@ def test_stages_without_labels_share_the_row_of_their_control(weight, targets, s
     assert [row[0] for row in table.rows] == stages
 
 
-def test_tables_show_the_finer_size_and_perceptual_distances():
-    found = results({"baseline": 20.0}, finer_resolution=[240, 135])
+def test_tables_show_the_reduced_size_and_perceptual_distances():
+    found = results({"baseline": 20.0})
     splits = found["stages"]["baseline"]
     splits["test"]["lpips_vgg"] = 0.25
-    splits["test_finer"] = {"psnr": 18.0}
+    splits["test"]["resolves"] = 7.46
+    splits["test_reduced"] = {"psnr": 22.0}
     table = run_tables(found)[0]
-    assert table.header[1:5] == ["PSNR (dB)", "at 240 x 135", "SSIM", "LPIPS (VGG)"]
-    assert table.rows == [["baseline", "20.00", "18.00", "0.5000", "0.2500", "1.23%"]]
-    assert len(table.header) == 6
+    assert table.header[1:5] == ["PSNR (dB)", "SSIM", "resolves (px)", "LPIPS (VGG)"]
+    assert table.rows == [["baseline", "20.00", "0.5000", "7.5", "0.2500", "1.23%", "22.00"]]
+    assert table.header[5:] == ["depth off by", "at 120 x 68"]
 
 
 def test_stages_are_never_cut_in_a_narrow_terminal(capsys, monkeypatch):

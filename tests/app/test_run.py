@@ -109,7 +109,7 @@ def test_a_run_leaves_what_it_takes_to_render_it(finished, capture_folder):
 def test_surfels_run_through_all_stages_from_random_points(capture_folder, tmp_path, capsys):
     """A coarse model becomes finer, and learns from windows of photographs twice as large."""
     coarse = CoarseConfig(dataclasses.replace(TINY_SURFELS.field, capacity=500), steps=20)
-    steps = {"downscale": 2, "score_downscale": 1, "coarse": coarse, "windows": WindowConfig()}
+    steps = {"downscale": 2, "coarse": coarse, "windows": WindowConfig()}
     steps["targets"] = TargetConfig("residual", lr_scale=2.0)
     fine = dataclasses.replace(TINY_SURFELS.field, capacity=800, selective_adam=True)
     preset = dataclasses.replace(TINY_SURFELS, field=fine, **steps)
@@ -133,9 +133,9 @@ def test_surfels_run_through_all_stages_from_random_points(capture_folder, tmp_p
     assert ("control" in stages) == (not use_labels)
     assert {"baseline", "closeup", "test_time"} <= set(stages)
     assert stages["baseline"]["test"]["psnr"] > 10
-    assert results["resolution"] == [16, 12] and results["finer_resolution"] == [32, 24]
-    assert stages["baseline"]["test_finer"]["psnr"] > 10
-    assert stages["baseline"]["test_finer"]["psnr"] != stages["baseline"]["test"]["psnr"]
+    assert results["resolution"] == [16, 12] and results["scored_at"] == [32, 24]
+    assert stages["baseline"]["test_reduced"]["psnr"] > 10
+    assert stages["baseline"]["test_reduced"]["psnr"] != stages["baseline"]["test"]["psnr"]
     assert len(results["gate"]["left_out"]) == 6
     if not use_labels:
         assert stages["closeup"] == stages["control"]

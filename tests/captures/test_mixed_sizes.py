@@ -53,24 +53,24 @@ def picture(path):
 def test_padding_is_neither_scored_nor_written(scene, tmp_path):
     assert scene.train.rgb.shape[1:3] == (32, 32)
     assert scene.camera("test", 1).width == 24 and scene.sizes("train") == [ALONG, ACROSS]
-    targets = targets_by_split(scene, jnp.ones((2, 32, 32)), None, render, finer=1)
-    scores, seen = evaluate(render, targets["test"])
+    targets = targets_by_split(scene, jnp.ones((2, 32, 32)), None, render, divisor=1)
+    scores, seen = evaluate(render, targets["test_reduced"])
     write_truth(tmp_path / "truth", targets)
     write_renders(tmp_path / "renders", seen, scene)
     for name, size in SIZES.items():
-        for folder in ("renders/rgb", "renders/depth", "truth/test/rgb"):
+        for folder in ("renders/rgb", "renders/depth", "truth/test_reduced/rgb"):
             assert picture(tmp_path / folder / f"{name}.png")[1] == size
-        assert picture(tmp_path / "truth" / "test_finer" / "rgb" / f"{name}.png")[1] == (
+        assert picture(tmp_path / "truth" / "test" / "rgb" / f"{name}.png")[1] == (
             2 * size[0],
             2 * size[1],
         )
         assert picture(tmp_path / "renders/rgb" / f"{name}.png")[0].all()
-    folders = str(tmp_path / "renders" / "rgb"), str(tmp_path / "truth" / "test" / "rgb")
+    folders = str(tmp_path / "renders" / "rgb"), str(tmp_path / "truth" / "test_reduced" / "rgb")
     again = evaluate_folders(*folders, None, NO_PERCEPTUAL)
     assert again["psnr"] == pytest.approx(scores["psnr"], abs=1e-4)
 
     images = {("baseline", "test"): {name: one.rgb for name, one in seen.items()}}
-    (along, across) = comparisons(tmp_path / "compare", {"test": targets["test"]}, images)
+    (along, across) = comparisons(tmp_path / "compare", {"test": targets["test_reduced"]}, images)
     assert along.image.shape[0] < across.image.shape[0]
 
 

@@ -364,24 +364,26 @@ def test_held_out_parts_of_photographs_are_not_read(capture_folder):
     assert scene_pyramid(scene)[0].sizes[0] == scene.train.rgb.shape[1:3]
 
 
-def test_views_are_scored_finer_only_where_finer_photographs_are_kept(capture_folder, capsys):
+def test_views_are_scored_at_their_own_size_only_where_finer_photographs_are_kept(
+    capture_folder, capsys
+):
     scene = load_scene(str(capture_folder), downscale=4)
     depths = jnp.ones(scene.train.weight.shape)
 
     def score(scene):
         flat = lambda camera: SimpleNamespace(depth=jnp.ones((camera.height, camera.width)))  # noqa: E731
-        targets = targets_by_split(scene, depths, None, flat, finer=2)
+        targets = targets_by_split(scene, depths, None, flat, divisor=2)
         return {split: views[0].rgb.shape[:2] for split, views in targets.items()}
 
     sizes = score(scene)
     assert set(sizes.values()) == {(6, 8), (12, 16)}
     assert all(
-        sizes[split] == ((12, 16) if split.endswith("_finer") else (6, 8)) for split in sizes
+        sizes[split] == ((6, 8) if split.endswith("_reduced") else (12, 16)) for split in sizes
     )
 
     def gone(factor, split):
         raise SceneError("images/000.png is not there")
 
     kept = score(dataclasses.replace(scene, photographs_at=gone))
-    assert kept == {split: size for split, size in sizes.items() if size == (6, 8)}
+    assert kept == {split: (6, 8) for split, size in sizes.items() if size == (12, 16)}
     assert "size of training alone: images/000.png is not there" in capsys.readouterr().out

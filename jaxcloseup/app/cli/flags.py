@@ -40,6 +40,13 @@ with topic("What is trained") as _TRAINED:
         lower_bound=1,
     )
     flags.DEFINE_integer(
+        "score_width",
+        None,
+        "about how many pixels the longer side of held-out views has when they are scored; "
+        "default: as the photographs, or 960 where these are larger than a screen",
+        lower_bound=1,
+    )
+    flags.DEFINE_integer(
         "windows",
         None,
         "number of photographs' windows, and of pseudo-labels, in a training step; devices or CPU "
@@ -146,7 +153,11 @@ def preset_from_flags() -> Preset:
         )
     preset = presets[FLAGS.preset]
     _help_settings(preset)
-    given = {"downscale": FLAGS.downscale, "num_windows": FLAGS.windows}
+    given = {
+        "downscale": FLAGS.downscale,
+        "score_width": FLAGS.score_width,
+        "num_windows": FLAGS.windows,
+    }
     flagged = [f"{name}={value}" for name, value in given.items() if value is not None]
     return with_settings(preset, [*FLAGS.set, *flagged])
 
@@ -165,7 +176,10 @@ def names_from_flags() -> dict[str, str]:
 def load_options_from_flags(preset: Preset) -> dict[str, Any]:
     """Return what `load_scene` takes beside a scene's name."""
     options = {name: FLAGS[name].value for name in ("half_pixel", "format", "split")}
-    return {"downscale": preset.downscale, **options, **_changed_capture_flags()}
+    sized = {"downscale": preset.downscale}
+    if preset.downscale is None:
+        sized["pixels"] = preset.step_pixels
+    return {**sized, **options, **_changed_capture_flags()}
 
 
 def _changed_capture_flags() -> dict[str, Any]:

@@ -69,11 +69,16 @@ class Preset:
     labels: LabelConfig = setting(help="how close-ups are drawn and labeled")
     baseline_steps: int = setting(help="steps of stage 1, on photographs alone", low=1)
     closeup_steps: int = setting(help="steps of stage 2 with labels, and of its control", low=1)
-    downscale: int = setting(1, "divisor of the photographs' size", low=1)
-    score_downscale: int | None = setting(
+    downscale: int | None = setting(
+        1, "divisor of the photographs' size; none: as `step_pixels` needs", low=1
+    )
+    step_pixels: int = setting(
+        8192, "about how many pixels photographs keep, and steps read, without `downscale`", low=256
+    )
+    score_width: int | None = setting(
         None,
-        "divisor of the photographs' size at which held-out views are scored too, if finer; "
-        "none scores no finer views",
+        "about how many pixels the longer side of held-out views has when they are scored; none: "
+        "as the photographs, or 960 where these are larger than a screen",
         low=1,
     )
     gated: bool = setting(

@@ -7,12 +7,16 @@ from jaxcloseup.app.methods.gaussians import GaussianTrainingConfig
 from jaxcloseup.app.methods.method import Preset
 
 
+_MOST = 1024  # a divisor that no photograph is reduced by: the filter is that of reduced ones
+
+
 def with_filters(preset: Preset) -> Preset:
     """Return the preset with both filters, in space for photographs as large as steps read."""
-    finest = preset.downscale if preset.windows is None else preset.windows.finest
+    reduced = preset.downscale or _MOST
+    finest = reduced if preset.windows is None else preset.windows.finest
     coarse = preset.coarse
     if coarse is not None:
-        coarse = dataclasses.replace(coarse, field=_filtered(coarse.field, preset.downscale))
+        coarse = dataclasses.replace(coarse, field=_filtered(coarse.field, reduced))
     field = _filtered(preset.field, finest)
     return dataclasses.replace(preset, method="mip_gaussians", field=field, coarse=coarse)
 

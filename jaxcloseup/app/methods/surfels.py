@@ -93,11 +93,11 @@ QUICK = dataclasses.replace(
     REDUCED,
     field=dataclasses.replace(
         REDUCED.field,
-        capacity=60_000,
+        capacity=300_000,
         sh_every=1,
         regularize_from=1,
         means_lr=(4e-4, 1.6e-5),
-        means_lr_steps=2400,
+        means_lr_steps=6800,
         sh_lr=7.5e-3,
         scale_lr=1.5e-2,
         color_ridge=0.1,
@@ -110,10 +110,10 @@ QUICK = dataclasses.replace(
         raster=RasterizeConfig(capacity=2**17, antialias=True),
     ),
     coarse=CoarseConfig(field=_COARSE, steps=1500),
-    windows=WindowConfig(),
+    windows=WindowConfig(whole_share=0.05),
     targets=TargetConfig("residual", label_loss_weight=0.7, lr_scale=10.0, control_lr_scale=2.0),
-    score_downscale=4,
-    baseline_steps=2500,
+    baseline_steps=7000,
+    downscale=None,
 )
 
 
@@ -122,7 +122,7 @@ STANDARD = dataclasses.replace(
     QUICK,
     field=dataclasses.replace(
         QUICK.field,
-        capacity=120_000,
+        capacity=500_000,
         raster=dataclasses.replace(QUICK.field.raster, capacity=2**18, block=128),
     ),
     coarse=CoarseConfig(
@@ -133,8 +133,7 @@ STANDARD = dataclasses.replace(
         ),
         steps=1500,
     ),
-    downscale=4,
-    score_downscale=2,
+    step_pixels=4 * QUICK.step_pixels,
 )
 
 

@@ -91,7 +91,7 @@ def paper_preset(method: str, field: Any, *, rays: int, steps: int, closeup_step
 
 
 def quick_preset(method: str, field: Any, *, rays: int, steps: int, finest: int = 1) -> Preset:
-    """Return a short training on photographs reduced eightfold, with windows up to `finest`."""
+    """Return a short training on reduced photographs, with windows up to `finest`."""
     return Preset(
         method=method,
         field=field,
@@ -100,6 +100,7 @@ def quick_preset(method: str, field: Any, *, rays: int, steps: int, finest: int 
         targets=QUICK_TARGETS,
         baseline_steps=steps,
         closeup_steps=200,
-        downscale=8,
+        downscale=None,
+        score_width=120,  # single rays take a minute for an image of 960 x 540
         windows=WindowConfig(finest=finest),
     )

@@ -14,7 +14,7 @@ from jaxcloseup.app.report.headline import all_scores, compare_psnr, score_table
 from jaxcloseup.app.report.page import fill_page
 from jaxcloseup.app.report.record_table import Table
 from jaxcloseup.app.report.showcase import best_middle_worst
-from jaxcloseup.app.score.metrics_text import FINER, SPLIT_TITLES
+from jaxcloseup.app.score.metrics_text import SPLIT_TITLES
 from jaxcloseup.app.store.stored_run import RunError
 from jaxcloseup.io.files import write_file, write_json
 
@@ -41,9 +41,9 @@ class View(NamedTuple):
 
 def comparison_tables(runs: Sequence[Finished]) -> list[Table]:
     """Return a table for each kind of view, with a row for each run."""
-    sizes = (run.results.get("finer_resolution") for run in runs)
-    finer_size = next((size for size in sizes if size), None)
-    return score_tables(_scores(runs), finer_size=finer_size, row="run")
+    first, *others = (run.results["resolution"] for run in runs)
+    alike = all(size == first for size in others)
+    return score_tables(_scores(runs), reduced_size=first if alike else None, row="run")
 
 
 def _scores(runs: Sequence[Finished]) -> dict[str, Mapping[str, Any]]:
@@ -158,7 +158,7 @@ def _record(run: Finished) -> dict[str, Any]:
 
 def _views(runs: Sequence[Finished]) -> list[View]:
     """Read the views with the best, middle and worst mean PSNR."""
-    for split in (f"test{FINER}", "test", f"test_far{FINER}", "test_far"):
+    for split in ("test", "test_far"):
         if all(run.psnr(split) for run in runs):
             break
     else:

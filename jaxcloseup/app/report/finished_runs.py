@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxcloseup.app.score.metrics_text import FINER, SPLIT_TITLES
+from jaxcloseup.app.score.metrics_text import REDUCED, SPLIT_TITLES
+from jaxcloseup.app.score.scores import CURVE
 from jaxcloseup.app.store.stored_run import RunError, read_fields
 from jaxcloseup.captures.photo_files import read_image
 from jaxcloseup.photos.scene import SceneError
@@ -95,7 +96,7 @@ def _is_split(scores: Any) -> bool:
         and all(
             _is_number(value)
             for key, value in scores.items()
-            if not key.endswith("reason") and key != "views"
+            if not key.endswith("reason") and key not in ("views", CURVE)
         )
         and all(
             isinstance(view, dict) and _is_number(view.get("psnr"))
@@ -110,17 +111,15 @@ def _is_number(value: Any) -> bool:
 
 def _check_alike(first: Finished, run: Finished) -> None:
     """Raise a RunError if two runs cannot be compared."""
-    (size, finer), (other, other_finer) = (
-        (each.results["resolution"], each.results.get("finer_resolution")) for each in (first, run)
+    size, other = (
+        each.results.get("scored_at") or each.results["resolution"] for each in (first, run)
     )
-    if size == other and finer and other_finer:
-        size, other = finer, other_finer
     if first.results["scene"] != run.results["scene"]:
         why = f"shows {first.results['scene']} and {run.name} shows {run.results['scene']}"
         advice = "name runs of one scene"
     elif size != other:
         why = f"has views of {_pixels(size)} and {run.name} of {_pixels(other)}"
-        advice = "name runs with one --downscale"
+        advice = "name runs with one --score_width"
     elif _views(first) != _views(run) or first.photographs != run.photographs:
         why = f"and {run.name} have other photographs, or another split of them"
         advice = "name runs with one --split of the same photographs"
@@ -134,7 +133,7 @@ def _views(run: Finished) -> dict[str, list[str]]:
     return {
         split: sorted(run.scores.get(split, {"views": ()})["views"])
         for split in SPLIT_TITLES
-        if not split.endswith(FINER)
+        if not split.endswith(REDUCED)
     }
 
 

@@ -7,7 +7,7 @@ from jaxcloseup.app.report.record_table import Table, print_tables
 from jaxcloseup.app.score.metrics_text import (
     COLUMNS,
     DEPTH_ERRORS,
-    FINER,
+    REDUCED,
     SPLIT_TITLES,
     format_metric,
 )
@@ -89,37 +89,38 @@ def run_tables(results: Mapping[str, Any]) -> list[Table]:
             if stage in names and control in names:
                 del names[stage]
                 names[control] = f"{control}, {stage}"
-    return score_tables(results["stages"], finer_size=results["finer_resolution"], names=names)
+    return score_tables(results["stages"], reduced_size=results["resolution"], names=names)
 
 
 def score_tables(
     stages: Mapping[str, Splits],
     *,
-    finer_size: tuple[int, int] | None,
+    reduced_size: tuple[int, int] | None,
     names: Mapping[str, str] | None = None,
     row: str = "stage",
 ) -> list[Table]:
-    """Return a table of at most six columns for each kind of view.
+    """Return a table of at most seven columns for each kind of view.
 
     Args:
       stages: metrics by stage and split.
-      finer_size: width and height of the finer views, or None without any.
+      reduced_size: width and height of reduced views, or None where rows differ in it.
       names: text of each stage that has a row; default: all stages, by their names.
       row: what a row is.
     """
     tables = []
     for split, title in SPLIT_TITLES.items():
         scores = {stage: splits[split] for stage, splits in stages.items() if split in splits}
-        if not scores or split.endswith(FINER):
+        if not scores or split.endswith(REDUCED):
             continue
-        finer = {stage: stages[stage].get(split + FINER, {}) for stage in scores}
-        columns = [(COLUMNS["psnr"], "psnr", scores)]
-        if finer_size and _known(finer.values(), ["psnr"]):
-            columns.append((f"at {finer_size[0]} x {finer_size[1]}", "psnr", finer))
-        columns.append((COLUMNS["ssim"], "ssim", scores))
+        reduced = {stage: stages[stage].get(split + REDUCED, {}) for stage in scores}
+        columns = [(COLUMNS["psnr"], "psnr", scores), (COLUMNS["ssim"], "ssim", scores)]
+        if _known(scores.values(), ["resolves"]):
+            columns.append((COLUMNS["resolves"], "resolves", scores))
         for keys in (_LAST, DEPTH_ERRORS):
             known = _known(scores.values(), keys)[:1]
             columns += [(_SHORT.get(key, COLUMNS[key]), key, scores) for key in known]
+        if reduced_size and _known(reduced.values(), ["psnr"]):
+            columns.append((f"at {reduced_size[0]} x {reduced_size[1]}", "psnr", reduced))
         body = [
             [name, *(_cell(key, values[stage].get(key)) for _, key, values in columns)]
             for stage, name in (names or {stage: stage for stage in stages}).items()

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from jaxcloseup.app.report.page import Picture
-from jaxcloseup.app.score.metrics_text import FINER, SPLIT_TITLES
+from jaxcloseup.app.score.metrics_text import REDUCED, SPLIT_TITLES
 from jaxcloseup.app.score.targets import Target
 from jaxcloseup.artifacts.images import colorize_depth, colorize_error, side_by_side, write_png
 from jaxcloseup.captures.load import Scene
@@ -48,8 +48,8 @@ def comparisons(
     """
     pictures: list[Picture] = []
     written: set[str] = set()
-    # Finer views show the same, larger.
-    shown = {split: views for split, views in targets.items() if split + FINER not in targets}
+    # Reduced views show the same, smaller.
+    shown = {split: views for split, views in targets.items() if not split.endswith(REDUCED)}
     for split, views in shown.items():
         stages = [stage for stage, rendered in images if rendered == split]
         for target in views if stages else ():
@@ -59,7 +59,7 @@ def comparisons(
             truth = np.asarray(target.rgb)
             write_png(folder / f"{name}.png", _comparison(truth, seen))
             brief = {stage: seen[stage] for stage in stages if stage in (in_report or stages)}
-            section = SPLIT_TITLES[split.removesuffix(FINER)]
+            section = SPLIT_TITLES[split]
             pictures.append(Picture(section, target.name, _comparison(truth, brief)))
     return pictures
 

@@ -21,12 +21,12 @@ from jaxcloseup.app.run.manifest import (
     write_dataparser_transforms,
     write_manifest,
 )
+from jaxcloseup.app.run.photograph_sizes import describe_training
 from jaxcloseup.app.run.plan import in_words, plan_run
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.stage_names import STAGES
 from jaxcloseup.app.run.stages import Outcome, run_stages
 from jaxcloseup.app.run.timers import timed, timed_compiling
-from jaxcloseup.app.score.metrics_text import FINER
 from jaxcloseup.app.score.scores import NO_PERCEPTUAL, Perceptual
 from jaxcloseup.app.view.approach import approach
 from jaxcloseup.artifacts.checkpoints import Checkpoints
@@ -61,20 +61,15 @@ def run(
       tensorboard: whether to write event files, beside `stats/train.jsonl`.
     """
     scene = dataclasses.replace(scene, train=jax.device_put(scene.train))
-    size = scene.train.cameras
-    print(
-        f"{scene.name}: {len(scene.train)} training photographs of {size.width} x {size.height}, "
-        f"depth {scene.near:.3g} to {scene.far:.3g}"
-    )
+    print(describe_training(preset, scene))
     training = Training(
         Programs(preset, scene),
         Checkpoints(output_dir / "checkpoints", identity_of(scene, preset, names) | {"seed": seed}),
         TrainLog(output_dir, tensorboard=tensorboard),
         save_every,
     )
-    load_options = {"downscale": preset.downscale} if load_options is None else load_options
     about = {**names, "seed": seed, "config": plain_config(preset), "versions": versions()}
-    manifest = about | about_scene(scene, load_options)
+    manifest = about | about_scene(scene, load_options or {})
     write_manifest(output_dir, manifest)
     write_dataparser_transforms(output_dir, scene)
     with progress.showing(
@@ -94,7 +89,7 @@ def run(
 def _dolly(training: Training, outcome: Outcome) -> list[np.ndarray]:
     """Return frames of a camera that comes near, for the report; none without close-ups."""
     targets = outcome.held_out.targets
-    views = targets.get(f"test{FINER}") or targets.get("test")
+    views = targets.get("test")
     if not views:
         return []
     with timed(training.seconds, "dolly"):

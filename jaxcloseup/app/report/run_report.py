@@ -22,10 +22,11 @@ from jaxcloseup.app.report.showcase import Exhibit, exhibits
 from jaxcloseup.app.run.gate import verdict
 from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.loop import Training
+from jaxcloseup.app.run.photograph_sizes import finest_read
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.stages import Outcome
 from jaxcloseup.app.run.timers import timed
-from jaxcloseup.app.score.metrics_text import FINER, SPLIT_TITLES
+from jaxcloseup.app.score.metrics_text import SPLIT_TITLES
 from jaxcloseup.app.score.targets import Target
 from jaxcloseup.artifacts.images import encode_webp_animation
 from jaxcloseup.io.files import write_file, write_json
@@ -63,7 +64,7 @@ def report_run(
         pictures = comparisons(output_dir / "compare", targets, outcome.images, in_report=brief)
         pictures += label_pictures(
             run_keys(about["seed"]).pictures,
-            targets.get("test", []),
+            outcome.held_out.reduced("test"),
             output_dir / "labels",
             scene=scene,
             sources=outcome.start.sources,
@@ -75,7 +76,7 @@ def report_run(
         "scene": scene.name,
         **about,
         "resolution": [size.width, size.height],
-        "finer_resolution": _finer_resolution(targets),
+        "scored_at": _size(targets),
         "stages": outcome.scores,
         **outcome.evidence,
         "seconds": training.seconds,
@@ -94,13 +95,12 @@ def report_run(
 def _showcase(programs: Programs, outcome: Outcome) -> list[Exhibit]:
     """Return the close-ups at the top of the page, as the best stage renders them."""
     targets, stage = outcome.held_out.targets, best_stage(outcome.scores)
-    split = next((name for name in (f"test{FINER}", "test") if targets.get(name)), None)
-    if split is None:
+    if not targets.get("test"):
         return []
-    views = outcome.scores[stage][split]["views"]
+    views = outcome.scores[stage]["test"]["views"]
     return exhibits(
-        targets[split],
-        outcome.images[stage, split],
+        targets["test"],
+        outcome.images[stage, "test"],
         {name: view["psnr"] for name, view in views.items() if view["psnr"] is not None},
         render_depth=lambda camera: label_depth(programs.render(outcome.start.state, camera)),
         sources=outcome.start.sources,
@@ -111,18 +111,16 @@ def _showcase(programs: Programs, outcome: Outcome) -> list[Exhibit]:
 
 def _loaded_photographs(programs: Programs, outcome: Outcome) -> Pyramid:
     """Return the finest photographs that stages have read; a report reads and draws no others."""
-    windows, finest = programs.preset.windows, programs.preset.downscale
-    if outcome.evidence["detail"] is not None:
-        finest = 1
-    elif windows is not None:
-        finest = windows.finest
+    finest = (
+        finest_read(programs.preset, programs.scene) if outcome.evidence["detail"] is None else 1
+    )
     return programs.pyramid(finest)[0]
 
 
-def _finer_resolution(targets: Mapping[str, Sequence[Target]]) -> list[int] | None:
-    """Return width and height of the views at the finer size, or None without these."""
-    for split, views in targets.items():
-        if split.endswith(FINER) and views:
+def _size(targets: Mapping[str, Sequence[Target]]) -> list[int] | None:
+    """Return width and height of the views that are scored first, or None without any."""
+    for views in targets.values():
+        if views:
             return [views[0].camera.width, views[0].camera.height]
     return None
 
@@ -147,14 +145,12 @@ def write_report(
     labels, gate, detail = results["labels"], results["gate"], results["detail"]
     sections = by_section(pictures)
     views = {title: shown for title, shown in sections.items() if title in SPLIT_TITLES.values()}
-    sizes = [results["resolution"], results["finer_resolution"]]
-    (width, height), *finer = [size for size in sizes if size]
     page = fill_page(
         "run.html",
         title=results["scene"],
         verdict=conclusion(results),
         results=results,
-        sizes=" and ".join([f"{width} x {height} pixels", *(f"{w} x {h}" for w, h in finer)]),
+        size=" x ".join(map(str, results["scored_at"] or results["resolution"])),
         exhibits=exhibits,
         stage=best_stage(results["stages"]),
         dolly=dolly and f"data:image/webp;base64,{base64.b64encode(dolly).decode()}",

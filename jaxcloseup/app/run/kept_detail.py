@@ -18,7 +18,8 @@ import numpy as np
 import jaxcloseup
 from jaxcloseup.app import progress
 from jaxcloseup.app.run.manifest import hash_data
-from jaxcloseup.app.run.programs import Programs, describe_photographs
+from jaxcloseup.app.run.photograph_sizes import describe_photographs
+from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.residuals import render_residuals, reproduced
 from jaxcloseup.detail.add import Detail, Detailed, add_to_rendering, label_with_detail
 from jaxcloseup.detail.weights import DetailWeights, known_weights

@@ -57,10 +57,16 @@ def about_scene(scene: Scene, load_options: Mapping[str, Any]) -> dict[str, Any]
     path = scene.metadata.get("path")
     return {
         "scene": scene.name if path is None else str(pathlib.Path(path).resolve()),
-        "load_options": dict(load_options),
+        "load_options": _with_divisor(load_options, scene),
         "data_sha256": hash_data(scene),
         "data_sha256_of": _HASHED,
     }
+
+
+def _with_divisor(load_options: Mapping[str, Any], scene: Scene) -> dict[str, Any]:
+    """Return options that load the scene again, with the divisor that was chosen, if it was."""
+    options = {name: value for name, value in load_options.items() if name != "pixels"}
+    return options | {"downscale": scene.metadata.get("downscale", 1)}
 
 
 def identity_of(scene: Scene, preset: Preset, names: Mapping[str, str]) -> dict[str, Any]:

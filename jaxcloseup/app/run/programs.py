@@ -24,6 +24,7 @@ from jaxcloseup.app.run.devices import (
     one_copy,
     place,
 )
+from jaxcloseup.app.run.photograph_sizes import describe_photographs, finest_read
 from jaxcloseup.app.run.step_data import ArmsData, StepData
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
@@ -129,9 +130,10 @@ class Programs:
     def photographs(self) -> Views | Windows:
         """Return what steps learn from: reduced photographs, or windows or pixels of finer ones."""
         views, windows = self.scene.train, self.preset.windows
-        if windows is None or windows.finest >= self.preset.downscale:
+        finest = finest_read(self.preset, self.scene)
+        if windows is None or finest >= self.scene.metadata.get("downscale", 1):
             return views
-        pyramid, divisor = self.pyramid(windows.finest)
+        pyramid, divisor = self.pyramid(finest)
         if len(pyramid.sizes) == 1:
             return views
         parts = "pixels" if self.method.renders_pixels else "windows"
@@ -268,13 +270,6 @@ def _run_in_parts(
         total = metrics if total is None else jax.tree.map(jnp.add, total, metrics)
         jax.block_until_ready(total)
     return state, jax.tree.map(lambda leaf: leaf / count, total)
-
-
-def describe_photographs(pyramid: Pyramid, divisor: int) -> str:
-    """Return in words what the finest level of `Programs.pyramid` is."""
-    height, width = pyramid.sizes[0]
-    share = f"1 / {divisor} of their size" if divisor > 1 else "their own size"
-    return f"photographs of {width} x {height} pixels, {share}"
 
 
 def _checked(metrics: dict[str, Any], count: int) -> dict[str, Any]:

@@ -13,10 +13,10 @@ from jaxcloseup.app.run.loop import Training
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.timers import timed
 from jaxcloseup.app.score.ladder import describe_ladder, ladder_targets
-from jaxcloseup.app.score.metrics_text import describe_split
+from jaxcloseup.app.score.metrics_text import REDUCED, describe_split
 from jaxcloseup.app.score.renders import write_renders
 from jaxcloseup.app.score.scores import Perceptual, evaluate
-from jaxcloseup.app.score.targets import Target, exact_depths, targets_by_split
+from jaxcloseup.app.score.targets import Target, exact_depths, score_divisor, targets_by_split
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.training.state import TrainState
@@ -35,14 +35,17 @@ class HeldOut(NamedTuple):
         """Return targets and ladder together."""
         return {**self.targets, **self.ladder}
 
+    def reduced(self, split: str) -> Sequence[Target]:
+        """Return the views of a split at the size of training; none if the split has none."""
+        return self.targets.get(split + REDUCED, self.targets.get(split, ()))
+
 
 def hold_out(programs: Programs, start: LabelStart) -> HeldOut:
     """Return the views to score on. Coverage is that of `start`, so that all are scored alike."""
     scene, render = programs.scene, functools.partial(programs.render, start.state)
     exact = exact_depths(scene, scene.train.cameras) if scene.surface else None
-    finer = programs.preset.score_downscale
-    finer = finer if finer and finer < programs.preset.downscale else None
-    targets = targets_by_split(scene, start.sources.depths, exact, render, finer=finer)
+    divisor = score_divisor(scene, programs.preset.score_width)
+    targets = targets_by_split(scene, start.sources.depths, exact, render, divisor=divisor)
     return HeldOut(targets, {} if exact is None else ladder_targets(scene, exact), exact)
 
 

@@ -185,7 +185,7 @@ def add_detail_stage(run: Run, get_detail: GetDetail) -> tuple[dict[str, Any], R
     scorer.score("detail", state, render)
     with timed(run.training.seconds, "expected_errors"):
         splits = (name for name in programs.scene.names if name != "train")
-        targets = [target for name in splits for target in scorer.held_out.targets[name]]
+        targets = [target for name in splits for target in scorer.held_out.reduced(name)]
         errors = compare_errors(detail_of, targets)
     return {"stage": run.stage, **about, "errors": errors}, render
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxcloseup.app.run.keys import RunKeys, run_keys
 from jaxcloseup.app.run.loop import Training, TrainingError, train_stage
+from jaxcloseup.app.run.photograph_sizes import finest_read
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.step_data import TrainData
 from jaxcloseup.app.run.timers import timed
@@ -51,7 +52,7 @@ def _refine_coarse(training: Training, stage: str, keys: RunKeys) -> TrainState:
         TrainData(coarse.programs.photographs),
         steps=preset.coarse.steps,
     )
-    pyramid, _ = programs.pyramid(preset.windows.finest)
+    pyramid, _ = programs.pyramid(finest_read(preset, programs.scene))
 
     def render(params: Any, buffers: Any, camera: Camera) -> Rendering:
         return programs.render(state.replace(params=params, buffers=buffers), camera)

@@ -4,16 +4,18 @@ from collections.abc import Mapping
 from typing import Any
 
 
-FINER = "_finer"  # end of the name of a split that is scored at a finer size
+REDUCED = "_reduced"  # end of the name of a split that is scored at the size of training too
 SPLIT_TITLES = {
     "test": "Close-ups",
     "test_far": "Ordinary views",
-    f"test{FINER}": "Close-ups, finer",
-    f"test_far{FINER}": "Ordinary views, finer",
+    f"test{REDUCED}": "Close-ups, reduced",
+    f"test_far{REDUCED}": "Ordinary views, reduced",
 }
 COLUMNS = {
     "psnr": "PSNR (dB)",
     "ssim": "SSIM",
+    "resolves": "resolves (px)",
+    "could_resolve": "photographs hold (px)",
     "lpips_vgg": "LPIPS (VGG)",
     "lpips_alex": "LPIPS (AlexNet)",
     "cc_psnr": "PSNR, color-corrected (dB)",
@@ -32,8 +34,10 @@ DEPTH_ERRORS = ("depth_error_median", "point_depth_error_median")
 
 
 def describe_split(split: Mapping[str, Any]) -> str:
-    """Return a split's PSNR and median relative depth error as one line."""
+    """Return a split's PSNR, the finest period resolved, and depth error as one line."""
     text = f"PSNR {format_metric('psnr', split['psnr'])} dB"
+    if split.get("resolves") is not None:
+        text += f", resolves {format_metric('resolves', split['resolves'])} px"
     for key in DEPTH_ERRORS:
         if split.get(key) is not None:
             text += f", depth off by {split[key]:.2%}"
@@ -44,4 +48,6 @@ def format_metric(key: str, value: float | None) -> str:
     """Format a metric's value; "-" stands for a metric that could not be computed."""
     if value is None:
         return "-"
+    if "resolve" in key:
+        return f"{value:.1f}"
     return f"{value:.2f}" if "psnr" in key or "normal" in key else f"{value:.4f}"

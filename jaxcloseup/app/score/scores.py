@@ -21,10 +21,14 @@ from jaxcloseup.metrics.perceptual import (
     load_lpips,
     lpips,
 )
+from jaxcloseup.metrics.resolution import SMALLEST as SMALLEST_RINGS
+from jaxcloseup.metrics.resolution import resolved_period, ring_correlation
 
 
 Metrics = dict[str, jax.Array | float]
+View = dict[str, float | str | list[float] | None]  # metrics of one view by name
 SEEN_BY = (1, 3)  # least numbers of photographs, for metrics of the seen pixels alone
+CURVE = "ring_correlation"  # the one metric that is a list, of which `resolves` is made
 
 
 class Perceptual(NamedTuple):
@@ -57,9 +61,7 @@ def find_perceptual(folder: str | None = None) -> Perceptual:
 NO_PERCEPTUAL = Perceptual({}, dict.fromkeys(BACKBONES, "LPIPS was not requested"))
 
 
-def score(
-    rendering: Rendering, target: Target, perceptual: Perceptual = NO_PERCEPTUAL
-) -> dict[str, float | str | None]:
+def score(rendering: Rendering, target: Target, perceptual: Perceptual = NO_PERCEPTUAL) -> View:
     """Return the metrics of one view on 8-bit colors, cropped to the pixels that count.
 
     Args:
@@ -87,6 +89,8 @@ def score(
         values[f"coverage_seen{least}"] = share
     if target.surface is not None:
         values |= surface_error(target.camera, rendering, target.surface)
+    if target.could_resolve is not None:
+        values["could_resolve"] = target.could_resolve
     if target.landmarks is not None:
         values |= point_depth_error(np.asarray(rendering.depth), target.landmarks)
     return score_image(image, truth, weight, perceptual, values)
@@ -98,7 +102,7 @@ def score_image(
     weight: jax.Array,
     perceptual: Perceptual = NO_PERCEPTUAL,
     more: Metrics | None = None,
-) -> dict[str, float | str | None]:
+) -> View:
     """Return the metrics of an image, on 8-bit colors.
 
     Args:
@@ -110,12 +114,17 @@ def score_image(
 
     Returns:
       Each metric by name. A metric that cannot be computed is None, and `<metric>_reason` says why;
-      so is the infinite PSNR of equal images.
+      so is the infinite PSNR of equal images. `resolves` is the finest period in pixels that the
+      image resolves, and `ring_correlation` the curve it is read from, where the image is so large.
     """
     image, truth = _as_8_bits(image, truth)
     values = dict(_full_metrics(image, truth, weight)) | dict(more or {})
     finite, side = bool(np.isfinite(image).all()), min(truth.shape[:2])
-    result: dict[str, float | str | None] = {}
+    result: View = {}
+    if finite and side >= SMALLEST_RINGS:
+        curve = np.asarray(_ring_correlation(image, truth, weight))
+        values["resolves"] = resolved_period(curve)
+        result[CURVE] = curve.tolist()
     for key, value in values.items():
         known = bool(np.isfinite(value))
         result[key] = float(value) if known else None
@@ -141,6 +150,8 @@ def _why_unknown(key: str, value: float, side: int, *, finite: bool) -> str:
     """Explain why a metric is not finite, for an image whose shorter side has `side` pixels."""
     if not finite:
         return _NOT_FINITE
+    if key == "resolves":
+        return "no period is resolved"
     if np.isposinf(value):
         return "equals the truth"
     if "ssim" in key and side < SSIM_TAPS:
@@ -149,7 +160,15 @@ def _why_unknown(key: str, value: float, side: int, *, finite: bool) -> str:
 
 
 def summarize(views: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the mean over views of every metric that some view has, and each view's in `views`."""
+    """Return the mean over views of every metric that some view has, and each view's in `views`.
+
+    `resolves` is read from the mean of the views' curves, which stays beside it.
+    """
+    curves = [values[CURVE] for values in views.values() if CURVE in values]
+    views = {
+        name: {key: value for key, value in values.items() if key != CURVE}
+        for name, values in views.items()
+    }
     keys = sorted({key for values in views.values() for key in values if "_reason" not in key})
     summary: dict[str, Any] = {}
     for key in keys:
@@ -158,7 +177,11 @@ def summarize(views: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
         if not known:
             reasons = (values.get(f"{key}_reason") for values in views.values())
             summary[f"{key}_reason"] = next(filter(None, reasons))
-    return summary | {"views": {name: dict(values) for name, values in views.items()}}
+    if summary.get("resolves") is not None:
+        curve = np.mean(curves, axis=0)
+        period = resolved_period(curve)
+        summary |= {"resolves": period if np.isfinite(period) else None, CURVE: curve.tolist()}
+    return summary | {"views": views}
 
 
 def evaluate(
@@ -196,6 +219,11 @@ def _as_8_bits(image: jax.Array, truth: jax.Array) -> tuple[jax.Array, jax.Array
 def _full_metrics(image: jax.Array, truth: jax.Array, weight: jax.Array) -> Metrics:
     metrics = {"psnr": psnr, "cc_psnr": cc_psnr, "ssim": _ssim}
     return {name: metric(image, truth, weight=weight) for name, metric in metrics.items()}
+
+
+@jax.jit
+def _ring_correlation(image: jax.Array, truth: jax.Array, weight: jax.Array) -> jax.Array:
+    return ring_correlation(image, truth, weight=weight)
 
 
 @jax.jit

@@ -6,16 +6,20 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcloseup.app import progress
-from jaxcloseup.app.score.metrics_text import FINER
+from jaxcloseup.app.score.metrics_text import REDUCED
 from jaxcloseup.app.score.surface_error import Landmarks, find_landmarks
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.photos.scene import Scene, SceneError, Surface
-from jaxcloseup.photos.support import count_seen
+from jaxcloseup.photos.support import find_support
 from jaxcloseup.photos.views import Views, camera_at, to_float
-from jaxcloseup.photos.windows import in_quarters
+
+
+_SCREEN = 1920  # longest side in pixels of views that are scored at the photographs' own size
+_COMMON_WIDTH = 960  # of larger ones; the paper's
 
 
 class Target(NamedTuple):
@@ -31,6 +35,9 @@ class Target(NamedTuple):
     surface: Surface | None = None  # the exact surface, or None where it is unknown
     # visible points of the capture, or None where the exact surface is known
     landmarks: Landmarks | None = None
+    # finest period in pixels that photographs of their own size hold of most of the view; None
+    # where none sees it
+    could_resolve: float | None = None
 
 
 def exact_depths(scene: Scene, cameras: Camera) -> jax.Array:
@@ -56,7 +63,7 @@ def make_targets(
     split: str,
     train_depths: jax.Array,
     render: Callable[[Camera], Rendering],
-    finer: tuple[Views, Sequence[tuple[int, int]]] | None = None,
+    photographs: tuple[Views, Sequence[tuple[int, int]]] | None = None,
 ) -> list[Target]:
     """Return the held-out views of a split, with the number of photographs that saw each pixel.
 
@@ -68,15 +75,12 @@ def make_targets(
       split: name of the split.
       train_depths: `[V, H, W]` depths of the training views.
       render: `camera -> Rendering` of the baseline.
-      finer: the split's photographs at another size, as `Scene.photographs_at` returns them;
-        default: the scene's.
+      photographs: the split's photographs at another size, as `Scene.photographs_at` returns
+        them; default: the scene's.
     """
-    views, sizes = finer or (getattr(scene, split), scene.sizes(split))
+    views, sizes = photographs or (getattr(scene, split), scene.sizes(split))
     surface = _geometry(scene.surface) if scene.surface else None
-    if surface and finer:
-        # Quarters of finer views are mostly as large as the others: one program serves both.
-        surface = functools.partial(in_quarters, surface)
-    count = jax.jit(count_seen)
+    find, own = jax.jit(find_support), scene.metadata.get("downscale", 1)
     rgb_of, weight_of = jax.device_get((views.rgb, views.weight))
 
     def make(i: int) -> Target:
@@ -86,10 +90,14 @@ def make_targets(
         landmarks = None if exact else find_landmarks(whole, scene.points)
         depth = exact.depth if exact else render(camera).depth
         pixels = pixel_grid(camera.height, camera.width)
-        seen = count(camera, pixels, depth, scene.train, train_depths)[:height, :width]
+        support = find(camera, pixels, depth, scene.train, train_depths)
+        seen, footprint = (np.asarray(image)[:height, :width] for image in support)
+        # A period takes two pixels, of the photograph or of the view.
+        held = max(2.0, 2 * float(np.median(footprint[seen > 0])) / own) if seen.any() else None
         rgb = jnp.asarray(to_float(rgb_of[i, :height, :width]))
         weight = jnp.asarray(weight_of[i, :height, :width])
-        return Target(scene.names[split][i], camera, rgb, weight, seen, exact, landmarks)
+        name, counts = scene.names[split][i], jnp.asarray(seen)
+        return Target(name, camera, rgb, weight, counts, exact, landmarks, held)
 
     return list(progress.each(make, range(len(sizes)), f"truth of {split}"))
 
@@ -100,7 +108,7 @@ def targets_by_split(
     exact: jax.Array | None,
     render: Callable[[Camera], Rendering],
     *,
-    finer: int | None = None,
+    divisor: int | None = None,
 ) -> dict[str, list[Target]]:
     """Return `make_targets` for every split except the training views.
 
@@ -109,19 +117,39 @@ def targets_by_split(
       train_depths: `[V, H, W]` rendered depths of the training views.
       exact: `[V, H, W]` exact depths, which are used instead; None on captures.
       render: `camera -> Rendering` of the baseline.
-      finer: divisor of the photographs' size at which the views are scored too, in further
-        splits, named with `FINER`; None without these.
+      divisor: of the photographs' own size, at which the splits' views are scored; those at the
+        size of training get further splits, named with `REDUCED`. None: the size of training.
     """
     seen_from = train_depths if exact is None else exact
     splits = [split for split in scene.names if split != "train"]
-    targets = {split: make_targets(scene, split, seen_from, render) for split in splits}
-    if finer is None or scene.photographs_at is None:
-        return targets
+    reduced = {split: make_targets(scene, split, seen_from, render) for split in splits}
+    if divisor is None or scene.photographs_at is None:
+        return reduced
+    targets = {}
     for split in splits:
         try:
-            photographs = scene.photographs_at(finer, split)
+            photographs = scene.photographs_at(divisor, split)
         except SceneError as error:  # such as full-size photographs that were not kept
             print(f"views are scored at the size of training alone: {error}")
-            break
-        targets[split + FINER] = make_targets(scene, split, seen_from, render, photographs)
-    return targets
+            return reduced
+        targets[split] = make_targets(scene, split, seen_from, render, photographs)
+    return targets | {split + REDUCED: views for split, views in reduced.items()}
+
+
+def score_divisor(scene: Scene, width: int | None) -> int | None:
+    """Return the divisor of the photographs' own size at which views are scored.
+
+    Args:
+      scene: the scene.
+      width: about how many pixels the longer side of views has; None: as many as the photographs
+        if these are no larger than a screen, else `_COMMON_WIDTH`.
+
+    Returns:
+      None where photographs are trained on at this size, or have no finer one.
+    """
+    reduced = scene.metadata.get("downscale", 1)
+    side = reduced * max(scene.train.cameras.width, scene.train.cameras.height)
+    if width is None:
+        width = side if side <= _SCREEN else _COMMON_WIDTH
+    divisor = max(1, round(side / width))
+    return divisor if divisor < reduced and scene.photographs_at else None

@@ -12,6 +12,9 @@ from jaxcloseup.app.methods.settings import check_value, is_plain, plain_config
 from jaxcloseup.setting import Limits, limits_of
 
 
+_RETIRED = {"score_downscale"}  # settings that said nothing about what was trained
+
+
 def preset_from_config(stored: Mapping[str, Any]) -> tuple[Preset, dict[str, Any]]:
     """Return the preset whose `plain_config` a run stored.
 
@@ -28,6 +31,7 @@ def preset_from_config(stored: Mapping[str, Any]) -> tuple[Preset, dict[str, Any
       ValueError: the configuration has another form, or a value that `--set` would refuse; names
         the field.
     """
+    stored = {name: value for name, value in stored.items() if name not in _RETIRED}
     if "method" not in stored:
         raise ValueError("config lacks method")
     if stored["method"] not in list(METHODS):  # which may be anything

@@ -37,7 +37,7 @@ from jaxcloseup.training.state import TrainState
 
 SplatTrainingConfig = SurfelTrainingConfig | GaussianTrainingConfig
 _REPLACED = 0.2  # share of all splats that target views may replace
-_REFINED_AT = 4  # times the photographs' training size, at which new surfels are looked for
+_REFINED_AT = 8  # times the photographs' training size, at which new surfels are looked for
 
 
 def make_field(config: SplatTrainingConfig, scene: Scene, growth: int) -> RadianceField:

@@ -1,0 +1,42 @@
+"""At which sizes a run reads its photographs, and how programs say it."""
+
+import math
+
+from jaxcloseup.app.methods.method import Preset
+from jaxcloseup.app.methods.registry import METHODS
+from jaxcloseup.photos.pyramids import Pyramid
+from jaxcloseup.photos.scene import Scene
+
+
+def finest_read(preset: Preset, scene: Scene) -> int:
+    """Return the divisor of the finest photographs that steps read.
+
+    It is larger than the preset's where stage 1 would not read each pixel about once: what finer
+    photographs show is left to detail.
+    """
+    views, divisor = scene.train, scene.metadata.get("downscale", 1)
+    if preset.windows is None:
+        return divisor
+    if METHODS[preset.method].renders_pixels:
+        return preset.windows.finest
+    each = views.cameras.height * views.cameras.width
+    times = math.sqrt(views.weight.size * divisor**2 / (preset.baseline_steps * each))
+    return max(preset.windows.finest, math.ceil(times - 0.5))
+
+
+def describe_training(preset: Preset, scene: Scene) -> str:
+    """Return in one line what a run reads: photographs, their sizes, and why these."""
+    size, divisor = scene.train.cameras, scene.metadata.get("downscale", 1)
+    text = f"{scene.name}: {len(scene.train)} training photographs of {size.width} x {size.height}"
+    if divisor > 1:
+        text += f", 1 / {divisor} of their size"
+    if preset.downscale is None:
+        text += f", so that a step reads about {preset.step_pixels} pixels"
+    return f"{text}; depth {scene.near:.3g} to {scene.far:.3g}"
+
+
+def describe_photographs(pyramid: Pyramid, divisor: int) -> str:
+    """Return in words what the finest level of `Programs.pyramid` is."""
+    height, width = pyramid.sizes[0]
+    share = f"1 / {divisor} of their size" if divisor > 1 else "their own size"
+    return f"photographs of {width} x {height} pixels, {share}"
