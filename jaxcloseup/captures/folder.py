@@ -107,6 +107,10 @@ def _load(listing: Listing, reading: Reading) -> Scene:
         "format": listing.format,
         "notes": listing.notes,
     }
+    if reading.zoom == 1:
+        metadata["own_sizes"] = {
+            split: [photo.own_size for photo in part] for split, part in parts.items()
+        }
     if listing.errors is not None:
         metadata["seen"] = [frame.seen for frame in listing.frames["train"]]
         metadata["point_errors"] = listing.errors

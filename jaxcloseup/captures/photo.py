@@ -46,6 +46,12 @@ class Photo(NamedTuple):
         """Return width and height in pixels."""
         return self.rgb.shape[1], self.rgb.shape[0]
 
+    @property
+    def own_size(self) -> tuple[int, int]:
+        """Return width and height of the photograph before it was reduced."""
+        own = self.frame.size if self.frame.reduced else None
+        return own or self.stored_size
+
     def intrinsics(self, half_pixel: bool) -> np.ndarray:
         """Compute fx, fy, cx, cy `[4]` in pixels; `half_pixel` as in `Reading`."""
         whole = resized_intrinsics(self.frame, self.stored_size, self.scaled, half_pixel)

@@ -78,7 +78,9 @@ class Scene:
       near: lower bound of z-depth in the scene, in world units.
       far: upper bound of z-depth in the scene, in world units.
       names: for each split present, the names of its photographs in order.
-      metadata: extra facts from the loader, such as source paths and downscale; `seen`, for each
+      metadata: extra facts from the loader, such as source paths and downscale; `own_sizes`, width
+        and height of each photograph of a split before it was reduced, by `own_scale` if that is
+        not their ratio; `seen`, for each
         training photograph the indices of the points that it shows, and `point_errors`, their mean
         reprojection errors `[P]` in pixels of the photographs' own size, where the files list them.
       surface: renders a `Camera` to its exact `Surface`; None for photographed scenes.
@@ -111,6 +113,17 @@ class Scene:
         width, height = self.sizes(split)[index]
         return camera_at(getattr(self, split).cameras, index).replace(width=width, height=height)
 
+    def own_camera(self, split: str, index: int) -> Camera:
+        """Return the camera of one photograph at its own size, before it was reduced."""
+        camera, own = self.camera(split, index), self.metadata.get("own_sizes")
+        if own is None:
+            return camera
+        width, height = own[split][index]
+        ratio = self.metadata.get("own_scale")
+        x, y = (width / camera.width, height / camera.height) if ratio is None else (ratio, ratio)
+        intrinsics = camera.intrinsics * jnp.array([x, y, x, y], jnp.float32)
+        return camera.replace(intrinsics=intrinsics, width=width, height=height)
+
 
 def keep_photographs(scene: Scene, chosen: Sequence[int]) -> Scene:
     """Return the scene with some training photographs, and the points that two of them see.
@@ -138,8 +151,12 @@ def keep_photographs(scene: Scene, chosen: Sequence[int]) -> Scene:
     for view in range(len(rows)):
         pixels, depth = map(np.asarray, points_to_pixels(camera_at(train.cameras, view), points))
         times_seen += np.all((pixels >= 0) & (pixels < size), axis=-1) & (depth > 0)
+    metadata = dict(scene.metadata)
+    if own := metadata.get("own_sizes"):
+        metadata["own_sizes"] = own | {"train": [own["train"][i] for i in chosen]}
     return dataclasses.replace(
         scene,
+        metadata=metadata,
         train=train,
         points=scene.points[times_seen > 1],
         rgb=scene.rgb[times_seen > 1],

@@ -14,7 +14,7 @@ from jaxcloseup.app.score.renders import write_renders, write_truth
 from jaxcloseup.app.score.scores import NO_PERCEPTUAL, evaluate
 from jaxcloseup.app.score.targets import targets_by_split
 from jaxcloseup.app.view import frames
-from jaxcloseup.app.view.camera_paths import orbit, view_shots
+from jaxcloseup.app.view.camera_paths import orbit, resized_shots, view_shots
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.fields.contract import Rendering
 
@@ -74,15 +74,18 @@ def test_padding_is_neither_scored_nor_written(scene, tmp_path):
     assert along.image.shape[0] < across.image.shape[0]
 
 
-def test_views_are_rendered_at_their_own_size(scene, tmp_path):
+def test_views_are_rendered_at_the_size_of_their_files(scene, tmp_path):
     programs = SimpleNamespace(scene=scene, render=lambda state, camera: render(camera))
     frames.render_shots(tmp_path, programs, None, view_shots(scene, "test"), sources=None)
     for name, size in SIZES.items():
         for kind in ("rgb", "depth"):
             image, found = picture(tmp_path / kind / f"{name}.png")
-            assert found == size and image.all(axis=-1).all()
+            assert found == tuple(2 * side for side in size) and image.all(axis=-1).all()
+    halves = resized_shots(view_shots(scene, "test"), None, None, 0.5)
+    assert halves.sizes == [ALONG, ACROSS]
+    np.testing.assert_allclose(halves.cameras.intrinsics, scene.test.cameras.intrinsics, rtol=1e-6)
 
 
 def test_an_orbit_has_the_size_of_the_first_photograph(scene):
     cameras = orbit(scene, 2).cameras
-    assert (cameras.width, cameras.height) == ALONG
+    assert (cameras.width, cameras.height) == (64, 48)

@@ -53,7 +53,7 @@ with topic("Cameras"):
         "level cameras say; give it where an orbit is tilted",
     )
     flags.DEFINE_string("from", None, "training view from which to render a dolly towards --pixel")
-    flags.DEFINE_list("pixel", None, "x,y: pixel of the --from view, at the view's training size")
+    flags.DEFINE_list("pixel", None, "x,y: pixel of the --from photograph at its own size")
     flags.DEFINE_float("magnification", 4.0, "how many times nearer to the surface a dolly ends")
     flags.DEFINE_integer(
         "frames", 60, "number of frames of an orbit or a dolly", lower_bound=1, upper_bound=100_000
@@ -64,18 +64,19 @@ with topic("Cameras"):
     flags.DEFINE_integer(
         "width",
         None,
-        "frame width of an orbit or a dolly in pixels; default: from --height, or the training "
-        "views'",
+        "width of images in pixels; default: from --height or --scale, or the photographs' own",
         lower_bound=1,
         upper_bound=2**31 - 1,
     )
     flags.DEFINE_integer(
         "height",
         None,
-        "frame height of an orbit or a dolly in pixels; default: from --width, or the training "
-        "views'",
+        "height of images in pixels; default: from --width or --scale, or the photographs' own",
         lower_bound=1,
         upper_bound=2**31 - 1,
+    )
+    flags.DEFINE_float(
+        "scale", None, "size of images as a multiple of the photographs' own, such as 0.5"
     )
 with topic("Pictures"):
     flags.DEFINE_bool(
@@ -94,7 +95,8 @@ with topic("Pictures"):
     )
 # Flags that only these camera sources accept.
 _ONLY_WITH = {
-    **dict.fromkeys(("frames", "width", "height"), ("orbit", "from")),
+    "frames": ("orbit", "from"),
+    **dict.fromkeys(("width", "height", "scale"), ("views", "orbit", "from")),
     **dict.fromkeys(("pixel", "magnification"), ("from",)),
     "up": ("orbit",),
     "camera_transform": ("camera_path", "target"),
@@ -164,16 +166,20 @@ def _cameras(
             _pixel(),
             magnification=FLAGS.magnification,
             frames=FLAGS.frames,
-            width=FLAGS.width,
-            height=FLAGS.height,
+            resize=_resize,
         )
     if source == "views":
         shots = camera_paths.view_shots(scene, FLAGS.views)
     else:
         shots = camera_paths.orbit(scene, FLAGS.frames, up=_up())
-        cameras = camera_paths.resized(shots.cameras, FLAGS.width, FLAGS.height)
-        shots = shots._replace(cameras=cameras)
+    shots = _resize(shots)
     return scene, lambda programs, state: shots
+
+
+def _resize(shots: "Shots") -> "Shots":
+    from jaxcloseup.app.view.camera_paths import resized_shots
+
+    return resized_shots(shots, FLAGS.width, FLAGS.height, FLAGS.scale)
 
 
 def _camera_source() -> str:
@@ -192,6 +198,10 @@ def _camera_source() -> str:
             raise CameraError(f"--{flag} does not apply to --{given[0]}: leave it out")
     if FLAGS.target_steps is not None and not (FLAGS.fine_tune or given[0] == "target"):
         raise CameraError("--target_steps needs --fine_tune or --target: leave it out, or add one")
+    if FLAGS.scale is not None and not (
+        0 < FLAGS.scale < float("inf") and FLAGS.width is None and FLAGS.height is None
+    ):
+        raise CameraError(f"--scale={FLAGS.scale:g} must be above 0, without --width and --height")
     if FLAGS.fps is not None and not 0 < FLAGS.fps <= 1000:
         raise CameraError(f"--fps={FLAGS.fps:g} must be above 0 and at most 1000")
     if given[0] == "from":

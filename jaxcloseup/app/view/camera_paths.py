@@ -43,7 +43,7 @@ class Shots(NamedTuple):
 
 
 def view_shots(scene: Scene, split: str) -> Shots:
-    """Return the cameras of a split, named after their photographs.
+    """Return the cameras of a split at the photographs' own size, named after these.
 
     Raises:
       CameraError: the scene has no such split.
@@ -53,14 +53,20 @@ def view_shots(scene: Scene, split: str) -> Shots:
         raise CameraError(
             f"--views={split}: {scene.name} has no such split: choose " + ", ".join(scene.names)
         )
-    return Shots(views.cameras, list(scene.names[split]), sizes=scene.sizes(split))
+    own = [scene.own_camera(split, i) for i in range(len(views))]
+    sizes = [(camera.width, camera.height) for camera in own]
+    width, height = np.max(sizes, axis=0).tolist()
+    check_memory(width, height, "--width")
+    intrinsics = jnp.stack([camera.intrinsics for camera in own])
+    cameras = views.cameras.replace(intrinsics=intrinsics, width=width, height=height)
+    return Shots(cameras, list(scene.names[split]), sizes=sizes)
 
 
 def orbit(scene: Scene, frames: int, *, up: Sequence[float] | None = None) -> Shots:
     """Return cameras on a circle around the training cameras' focus point, looking at it.
 
     The circle has the training cameras' median height above that point and their median distance
-    from the vertical through it. Lens and image size are those of the first training view.
+    from the vertical through it. Lens and image size are those of the first training photograph.
 
     Args:
       scene: the scene with the training cameras.
@@ -84,7 +90,7 @@ def orbit(scene: Scene, frames: int, *, up: Sequence[float] | None = None) -> Sh
     for angle in np.arange(frames) * (2 * np.pi / frames):
         position = radius * (np.cos(angle) * east + np.sin(angle) * north) + height * axis
         poses.append(look_at(center + position, center, axis))
-    first = scene.camera("train", 0)
+    first = scene.own_camera("train", 0)
     intrinsics = np.tile(np.asarray(first.intrinsics), (frames, 1))
     return numbered_shots(poses, intrinsics, first.height, first.width)
 
@@ -137,7 +143,7 @@ def check_pixel(camera: Camera, pixel: tuple[float, float]) -> tuple[int, int]:
     if not (0 <= x < camera.width and 0 <= y < camera.height):
         raise CameraError(
             f"--pixel={x:g},{y:g} is outside the view: choose a pixel within the "
-            f"{camera.width} x {camera.height} pixels that the view was trained with"
+            f"{camera.width} x {camera.height} pixels of the photograph"
         )
     return int(y), int(x)
 
@@ -189,6 +195,29 @@ def resized(camera: Camera, width: int | None, height: int | None) -> Camera:
     scale = jnp.array([x, y, x, y], jnp.float32)
     scale = scale.reshape((1,) * (camera.intrinsics.ndim - 1) + (4,))
     return camera.replace(intrinsics=camera.intrinsics * scale, height=height, width=width)
+
+
+def resized_shots(
+    shots: Shots, width: int | None, height: int | None, scale: float | None = None
+) -> Shots:
+    """Change the size of all images; the fields of view stay.
+
+    Args:
+      shots: cameras, whose images may differ in size.
+      width: new width in pixels of the largest image; None keeps the aspect ratio.
+      height: new height in pixels of the largest; None keeps the aspect ratio.
+      scale: factor on both, without `width` and `height`; None: 1.
+
+    Raises:
+      CameraError: such images do not fit into memory.
+    """
+    before = shots.cameras
+    if scale is not None:
+        width, height = (max(1, round(scale * side)) for side in (before.width, before.height))
+    cameras = resized(before, width, height)
+    x, y = cameras.width / before.width, cameras.height / before.height
+    sizes = shots.sizes and [(max(1, round(x * w)), max(1, round(y * h))) for w, h in shots.sizes]
+    return shots._replace(cameras=cameras, sizes=sizes)
 
 
 def check_memory(width: int, height: int, given_by: str) -> None:

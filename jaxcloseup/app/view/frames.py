@@ -65,11 +65,12 @@ def render_shots(
         frame: tuple[tuple[str, Camera], tuple[int, int]],
     ) -> tuple[str, dict[str, Image], bool]:
         (name, camera), size = frame
+        camera = camera.replace(width=size[0], height=size[1])
         seen = programs.render(state, camera)
         images = draw_pictures(
-            programs, seen, camera, sources=sources, detail=detail, limits=limits, size=size
+            programs, seen, camera, sources=sources, detail=detail, limits=limits
         )
-        solid = np.asarray(seen.alpha)[: size[1], : size[0]] >= SOLID
+        solid = np.asarray(seen.alpha) >= SOLID
         return name, images, not solid.any()
 
     frames = list(zip(cameras, sizes, strict=True))
@@ -119,7 +120,6 @@ def draw_pictures(
     sources: LabelSources | None,
     detail: Detail | None = None,
     limits: tuple[float, float] | None = None,
-    size: tuple[int, int] | None = None,
 ) -> dict[str, Image]:
     """Return the images of `render_pictures` from a rendering.
 
@@ -130,30 +130,23 @@ def draw_pictures(
       sources: as in `render_pictures`.
       detail: as in `render_pictures`.
       limits: nearest and farthest depth of the color scale; default: `depth_range` of the image.
-      size: width and height of the images, without the camera's padding at the right and the
-        bottom; default: the camera's.
     """
-    width, height = size or (camera.width, camera.height)
-
-    def crop(image: jax.typing.ArrayLike) -> np.ndarray:
-        return np.asarray(image)[:height, :width]
-
     scene = programs.scene
     depth = label_depth(seen, near=0, far=scene.far)
     near, far = limits or depth_range([depth], scene)
-    solid = crop(seen.alpha) >= SOLID
-    depth_colors = colorize_depth(crop(seen.depth), near=near, far=far, valid=solid)
-    images: dict[str, Image] = {"rgb": crop(seen.rgb), "depth": depth_colors}
+    solid = np.asarray(seen.alpha) >= SOLID
+    depth_colors = colorize_depth(np.asarray(seen.depth), near=near, far=far, valid=solid)
+    images: dict[str, Image] = {"rgb": np.asarray(seen.rgb), "depth": depth_colors}
     if seen.normal is not None:
-        images["normals"] = colorize_normals(np.where(solid[..., None], crop(seen.normal), 0))
+        images["normals"] = colorize_normals(np.where(solid[..., None], np.asarray(seen.normal), 0))
     if sources is not None:
         pixels = pixel_grid(camera.height, camera.width)
         support = _support(camera, pixels, depth, sources.views, sources.depths)
-        images["support"] = colorize_support(*map(crop, support))
+        images["support"] = colorize_support(*map(np.asarray, support))
     if detail is not None:
         sharper = detailed(programs, detail, camera, seen)
-        images |= {"rgb": crop(sharper.rgb), "trust": crop(sharper.weight)}
-        images["error"] = colorize_expected_error(crop(sharper.error))
+        images |= {"rgb": np.asarray(sharper.rgb), "trust": np.asarray(sharper.weight)}
+        images["error"] = colorize_expected_error(np.asarray(sharper.error))
     return images
 
 

@@ -4,6 +4,7 @@ import pathlib
 from collections.abc import Callable, Iterator
 
 import cv2
+import jax
 import numpy as np
 
 from jaxcloseup.app.run.fine_tuning import fine_tune, tuned_detail
@@ -12,14 +13,7 @@ from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.labels import start_labels
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.store.stored_run import StoredRun, restore
-from jaxcloseup.app.view.camera_paths import (
-    CameraError,
-    Shots,
-    check_pixel,
-    dolly,
-    find_view,
-    resized,
-)
+from jaxcloseup.app.view.camera_paths import CameraError, Shots, check_pixel, dolly, find_view
 from jaxcloseup.app.view.frames import render_shots
 from jaxcloseup.artifacts.video import write_video
 from jaxcloseup.labels.rules import label_depth
@@ -34,27 +28,26 @@ def dolly_towards(
     *,
     magnification: float,
     frames: int,
-    width: int | None,
-    height: int | None,
+    resize: Callable[[Shots], Shots],
 ) -> Callable[[Programs, TrainState], Shots]:
     """Return a function that makes a dolly towards the surface at a pixel, for a trained state.
 
     Args:
       scene: what was photographed.
       view: name of the training view from which the dolly begins.
-      pixel: (x, y) in it.
+      pixel: (x, y) in the photograph at its own size.
       magnification: how many times nearer to the surface the dolly ends.
       frames: number of cameras.
-      width: of frames; None: by `height`, or the view's.
-      height: of frames; None: by `width`, or the view's.
+      resize: gives frames, which have the photograph's own size, another one.
 
     Raises:
       CameraError: there is no such view or pixel, frames are too large, and, from the function, the
         state shows no surface at the pixel.
     """
-    camera = scene.camera("train", find_view(scene, view))
+    camera = scene.own_camera("train", find_view(scene, view))
     row, column = check_pixel(camera, pixel)
-    resized(camera, width, height)  # refuses what is too large
+    # Refuses what is too large.
+    resize(Shots(jax.tree.map(lambda leaf: leaf[None], camera), [view]))
 
     def make(programs: Programs, state: TrainState) -> Shots:
         seen = label_depth(programs.render(state, camera), near=0, far=scene.far)
@@ -65,8 +58,7 @@ def dolly_towards(
                 f"--pixel={x:g},{y:g}: the stage renders no surface at this pixel of {view}: "
                 "choose another pixel"
             )
-        shots = dolly(camera, pixel, depth, magnification=magnification, frames=frames)
-        return shots._replace(cameras=resized(shots.cameras, width, height))
+        return resize(dolly(camera, pixel, depth, magnification=magnification, frames=frames))
 
     return make
 
