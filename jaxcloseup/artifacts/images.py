@@ -171,6 +171,16 @@ def color_counts(count: Image) -> tuple[np.ndarray, np.ndarray]:
     return colors, legend(_LEGEND_WIDTH)
 
 
+def color_errors(error: Image) -> tuple[np.ndarray, np.ndarray]:
+    """Return uint8 colors `[..., 3]` of expected errors `[...]`, as `colorize_expected_error`.
+
+    The second array is their legend, an image.
+    """
+    error = np.asarray(error)
+    colors, legend = _in_steps(255 * np.nan_to_num(error), np.isnan(error), _ERRORS, "more")
+    return colors, legend(_LEGEND_WIDTH)
+
+
 def _panel(values: np.ndarray, unseen: np.ndarray, steps: Sequence[int], last: str) -> np.ndarray:
     """Draw an image of values in steps above its legend; small images are enlarged to fit it."""
     image, legend = _in_steps(values, unseen, steps, last)

@@ -18,7 +18,7 @@ __all__, __getattr__, __dir__ = lazy_names(
         ),
         "gather": "gather_parts",
         "gather_sums": "GatherSettings Gathered Reader gather_points",
-        "support": "Support find_support count_seen count_seen_points",
+        "support": "Support find_support count_seen",
         "depth_maps": (
             "DepthMaps Fused GatherSources fuse fuse_grid gather_sources prepare_depth_maps"
         ),

@@ -88,19 +88,3 @@ def count_seen(
 ) -> jax.Array:
     """Return the `count` of `find_support` alone, `[...]` int32."""
     return find_support(camera, pixels, depth, views, depths, tolerance=tolerance).count
-
-
-def count_seen_points(
-    points: jax.Array, views: Views, depths: jax.Array, *, tolerance: float = 0.02
-) -> jax.Array:
-    """Count the photographs that saw each point `[..., 3]` of a surface, see `find_support`."""
-
-    def add_view(
-        count: jax.Array, view: tuple[Camera, jax.Array, jax.Array]
-    ) -> tuple[jax.Array, None]:
-        source, depth, weight = view
-        *_, weight = sample_where_visible(source, depth, weight, points, tolerance)
-        return count + (weight > 0).astype(jnp.int32), None
-
-    none = jnp.zeros(points.shape[:-1], jnp.int32)
-    return jax.lax.scan(add_view, none, (views.cameras, depths, views.weight))[0]

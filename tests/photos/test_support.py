@@ -7,7 +7,7 @@ import plane
 import pytest
 
 from jaxcloseup.geometry.cameras import pixel_grid
-from jaxcloseup.photos.support import count_seen, count_seen_points, find_support
+from jaxcloseup.photos.support import count_seen, find_support
 
 
 GRID = pixel_grid(plane.HEIGHT, plane.WIDTH)
@@ -105,14 +105,3 @@ def test_count_seen_equals_the_count_of_find_support(capture):
     views, depths = capture
     data = plane.camera_above(0.2, 0.1, 5.0), GRID, jnp.full(GRID.shape[:2], 5.0), views, depths
     np.testing.assert_array_equal(jax.jit(count_seen)(*data), support(*data).count)
-
-
-def test_points_of_a_surface_are_counted_as_pixels_that_show_them(capture):
-    views, depths = capture
-    camera = plane.camera_above(0.8, 0.0, 5.0, tilt=0.1)
-    _, depth, points = plane.photograph(camera)
-    expected, clearance = oracle(camera, depth, views)[::2]
-    found = jax.jit(count_seen_points)(jnp.asarray(points, jnp.float32), views, depths)
-    sure = clearance > 0.01
-    np.testing.assert_array_equal(np.asarray(found)[sure], expected[sure])
-    assert len(set(expected[sure].tolist())) > 2

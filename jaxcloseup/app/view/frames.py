@@ -87,31 +87,6 @@ def render_shots(
     return [output_dir / kind for kind in images]
 
 
-def render_pictures(
-    programs: Programs,
-    state: TrainState,
-    camera: Camera,
-    *,
-    sources: LabelSources | None,
-    detail: Detail | None = None,
-) -> dict[str, Image]:
-    """Render one camera's images by kind: `rgb`, `depth`, `normals`, `support`, `trust`, `error`.
-
-    `normals` needs a field that renders them, `support` needs `sources`, and two need `detail`:
-    `trust`, the share of the photographs' detail that was added, from black to white, and `error`,
-    the expected error.
-
-    Args:
-      programs: the run's compiled programs.
-      state: the state to render.
-      camera: camera of the images.
-      sources: the training photographs with their depths, or None to leave out support.
-      detail: detail of the state, or None to render the state alone.
-    """
-    seen = programs.render(state, camera)
-    return draw_pictures(programs, seen, camera, sources=sources, detail=detail)
-
-
 def draw_pictures(
     programs: Programs,
     seen: Rendering,
@@ -121,14 +96,18 @@ def draw_pictures(
     detail: Detail | None = None,
     limits: tuple[float, float] | None = None,
 ) -> dict[str, Image]:
-    """Return the images of `render_pictures` from a rendering.
+    """Return a camera's images by kind: `rgb`, `depth`, `normals`, `support`, `trust`, `error`.
+
+    `normals` needs a field that renders them, `support` needs `sources`, and two need `detail`:
+    `trust`, the share of the photographs' detail that was added, from black to white, and `error`,
+    the expected error.
 
     Args:
       programs: the run's compiled programs.
       seen: their rendering of `camera`.
       camera: camera of the images.
-      sources: as in `render_pictures`.
-      detail: as in `render_pictures`.
+      sources: the training photographs with their depths, or None to leave out support.
+      detail: detail of the state, or None to draw the state alone.
       limits: nearest and farthest depth of the color scale; default: `depth_range` of the image.
     """
     scene = programs.scene

@@ -1,11 +1,14 @@
 """Render and fine-tune one run for all visitors of the viewer. Needs Viser."""
 
+import contextlib
 import functools
 import pathlib
 import queue
+import threading
 import time
 import traceback
 from collections.abc import Callable
+from typing import NamedTuple
 
 import cv2
 import jax
@@ -13,28 +16,60 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcloseup.app.run.fine_tuning import fine_tune, tuned_detail
-from jaxcloseup.app.run.kept_detail import detail_getter
+from jaxcloseup.app.run.kept_detail import detail_getter, detailed
 from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.labels import LabelStart, start_labels
 from jaxcloseup.app.run.loop import TrainingError
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.view.camera_paths import focus_point
-from jaxcloseup.app.view.frames import render_pictures
 from jaxcloseup.app.view.orientation import up_direction
 from jaxcloseup.app.view.picking import rank_views, ray_camera
 from jaxcloseup.app.view.server import Server
-from jaxcloseup.artifacts.images import Image, to_uint8
+from jaxcloseup.artifacts.images import color_counts, color_errors, to_uint8
 from jaxcloseup.artifacts.viewer_gaussians import Gaussians
-from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.detail.add import Detail
+from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.labels.rules import label_depth
-from jaxcloseup.photos.support import count_seen_points
+from jaxcloseup.photos.support import find_support
 from jaxcloseup.training.state import TrainState
 
 
 _BUSY = "The viewer is still busy: wait until it has finished, and try again."
 _THUMBNAIL = 80  # width of a photograph's thumbnail, in pixels
 
-_count_seen = jax.jit(count_seen_points)
+_find_support = jax.jit(find_support)
+
+
+PICTURE, SUPPORT, TRUST, ERROR = SHOWN = (
+    "picture",
+    "photographs that saw it",
+    "trust in detail",
+    "expected error",
+)
+_TINT = 0.6  # share of colors that are laid over a picture
+
+
+class Prepared(NamedTuple):
+    """What renders cameras: a state, a function that finds its detail, and a sentence about it."""
+
+    state: TrainState
+    detail: Callable[[], Detail]
+    said: str
+
+
+class _Job(NamedTuple):
+    """A job of a visitor, see `Viewer.later`."""
+
+    what: str
+    work: Callable[[], str]
+    say: Callable[[str], None]
+    yielding: bool
+
+
+def _laid_over(
+    picture: np.ndarray, colors: np.ndarray, legend: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    return to_uint8((_TINT * colors + (1 - _TINT) * picture) / 255), legend
 
 
 class ViewError(Exception):
@@ -71,7 +106,8 @@ class Viewer:
         self.programs, self.state, self.scene = programs, state, programs.scene
         self.title = f"{self.scene.name}, {stage}"
         self._keys, self._find = run_keys(seed), detail_getter(programs, state, kept)
-        self._jobs: queue.Queue = queue.Queue(maxsize=1)
+        self._jobs: queue.Queue[_Job] = queue.Queue(maxsize=1)
+        self._queueing = threading.Lock()
         cameras = self.scene.train.cameras
         positions, rotations = (np.asarray(a) for a in (cameras.position, cameras.rotation))
         near, far = self.scene.near, self.scene.far
@@ -82,10 +118,7 @@ class Viewer:
         self.size = float(min(0.2 * gap, 0.04 * self.distance)) or 0.01 * self.distance
         self.thumbnails = [self._thumbnail(i) for i in range(len(positions))]
         server.scene.set_up_direction(up_direction(self.scene))
-        if programs.method.gaussians is not None:
-            # The background that the run's own renderer uses.
-            background = programs.method.background(programs.preset.field)
-            server.scene.set_background_image(to_uint8(np.full((1, 1), background)))
+        server.scene.set_background_image(self.background())
         server.gui.set_panel_label(self.title)
 
     def work(self, timeout: float | None = None) -> None:
@@ -97,7 +130,7 @@ class Viewer:
         Raises:
           queue.Empty: no job arrived within `timeout` seconds.
         """
-        what, job, say = self._jobs.get(timeout=timeout)
+        what, job, say, _ = self._jobs.get(timeout=timeout)
 
         def tell(sentence: str) -> None:
             say(sentence)
@@ -113,18 +146,35 @@ class Viewer:
             traceback.print_exc()
             tell(f"{what} failed ({type(error).__name__}): see the terminal for details.")
 
-    def later(self, what: str, job: Callable[[], str], say: Callable[[str], None]) -> None:
+    @property
+    def busy(self) -> bool:
+        """Return whether a job already waits, so that no other one can."""
+        return self._jobs.full()
+
+    def later(
+        self,
+        what: str,
+        job: Callable[[], str],
+        say: Callable[[str], None],
+        *,
+        yielding: bool = False,
+    ) -> None:
         """Queue a job for the main thread, or say that the viewer is busy.
 
         Args:
           what: description of the job.
           job: does the work, and returns a sentence.
           say: shows a sentence to the visitor who asked.
+          yielding: whether the next job may take this one's place while it waits.
         """
-        try:
-            self._jobs.put_nowait((what, job, say))
-        except queue.Full:
-            say(_BUSY)
+        with self._queueing:
+            with contextlib.suppress(queue.Empty):
+                waiting = self._jobs.get_nowait()
+                if not waiting.yielding:
+                    self._jobs.put_nowait(waiting)
+                    say(_BUSY)
+                    return
+            self._jobs.put_nowait(_Job(what, job, say, yielding))
 
     def _thumbnail(self, index: int) -> np.ndarray:
         camera = self.scene.camera("train", index)
@@ -159,32 +209,55 @@ class Viewer:
         shown = f"{np.count_nonzero(ranks)} of {len(ranks)} photographs show that point"
         return int(ranks.argmax()), point, shown
 
-    def render(
-        self, camera: Camera, *, tuned: bool, detail: bool, say_steps: Callable[[int, int], None]
-    ) -> tuple[dict[str, Image], str]:
-        """Return pictures of a camera by kind, and a description of the work.
+    def prepare(
+        self, camera: Camera, *, tuned: bool, say_steps: Callable[[int, int], None]
+    ) -> Prepared:
+        """Return what renders a camera, with the detail of the photographs.
 
         Args:
           camera: the camera.
           tuned: whether to fine-tune a copy of the state for this camera first.
-          detail: whether to add the photographs' detail.
           say_steps: takes the number of finished steps of fine-tuning, and of all.
         """
-        start, state = self.labels, self.state
-        cameras = jax.tree.map(lambda leaf: leaf[None], camera)
-        if tuned:
-            same = start.state is self.state
-            find = self._find if same else detail_getter(self.programs, start.state)
-            state = fine_tune(self.programs, start, cameras, find, report=say_steps)
-        added = self._find()[0] if detail else None
-        if added is not None and tuned and state is not start.state:
-            added = tuned_detail(self.programs, state, cameras, added)
-        images = render_pictures(self.programs, state, camera, sources=start.sources, detail=added)
-        if tuned and state is start.state:
-            return images, (
-                "The gate let no labels in for this camera, so nothing was fine-tuned; rendered"
-            )
-        return images, "Fine-tuned and rendered" if tuned else "Rendered"
+        if not tuned:
+            return Prepared(self.state, lambda: self._find()[0], "Rendered")
+        start, cameras = self.labels, jax.tree.map(lambda leaf: leaf[None], camera)
+        same = start.state is self.state
+        find = self._find if same else detail_getter(self.programs, start.state)
+        state = fine_tune(self.programs, start, cameras, find, report=say_steps)
+        if state is start.state:
+            said = "The gate let no labels in for this camera, so nothing was fine-tuned; rendered"
+            return Prepared(state, lambda: self._find()[0], said)
+        detail = tuned_detail(self.programs, state, cameras, self._find()[0])
+        return Prepared(state, lambda: detail, "Fine-tuned and rendered")
+
+    def look(
+        self, prepared: Prepared, camera: Camera, *, detail: bool, shown: str = PICTURE
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """Return what a camera sees, uint8 `[H, W, 3]`, and a legend if colors need one.
+
+        Args:
+          prepared: what renders.
+          camera: the camera.
+          detail: whether to add the photographs' detail.
+          shown: one of `SHOWN`; what is not the picture itself is laid over it.
+        """
+        seen = self.programs.render(prepared.state, camera)
+        sharper = None
+        if detail or shown in (TRUST, ERROR):
+            sharper = detailed(self.programs, prepared.detail(), camera, seen)
+        picture = to_uint8(sharper.rgb if sharper is not None and detail else seen.rgb)
+        if shown == SUPPORT:
+            sources = self.labels.sources
+            depth = label_depth(seen, near=0, far=self.scene.far)
+            pixels = pixel_grid(camera.height, camera.width)
+            counts = _find_support(camera, pixels, depth, sources.views, sources.depths).count
+            return _laid_over(picture, *color_counts(counts))
+        if sharper is not None and shown == TRUST:
+            return to_uint8(sharper.weight), None
+        if sharper is not None and shown == ERROR:
+            return _laid_over(picture, *color_errors(sharper.error))
+        return picture, None
 
     def drawn(self, position: np.ndarray | None = None) -> Gaussians | None:
         """Return the Gaussians that represent the state, colored as seen from a position `[3]`."""
@@ -193,13 +266,12 @@ class Viewer:
             return None
         return gaussians(self.state.params, self.state.buffers, position)
 
-    @functools.cached_property
-    def counts(self) -> np.ndarray:
-        """Return how many photographs saw each Gaussian, or each point of a scene without any."""
-        drawn = self.drawn()
-        points = self.scene.points if drawn is None else drawn.means
-        sources = self.labels.sources
-        return np.asarray(_count_seen(jnp.asarray(points), sources.views, sources.depths))
+    def background(self) -> np.ndarray | None:
+        """Return what is behind the drawn scene, as the run's own renderer has it."""
+        method = self.programs.method
+        if method.gaussians is None:
+            return None
+        return to_uint8(np.full((1, 1), method.background(self.programs.preset.field)))
 
     @functools.cached_property
     def labels(self) -> LabelStart:

@@ -5,21 +5,24 @@ import threading
 import time
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from viser.transforms import SO3
 
+from jaxcloseup.app.view.drawn_scene import add_frustum, add_scene, quaternion, same
 from jaxcloseup.app.view.picking import closeup_camera, vertical_fov, viewer_camera
 from jaxcloseup.app.view.server import Server
-from jaxcloseup.app.view.viewer import Viewer
-from jaxcloseup.artifacts.images import color_counts, encode_png, to_uint8
-from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.app.view.viewer import PICTURE, SHOWN, Prepared, Viewer
+from jaxcloseup.artifacts.images import encode_png
+from jaxcloseup.geometry.cameras import Camera, pixels_to_points
 
 
-_HELP = """Click on the scene to place the red close-up camera in front of that point.
-Click on a training camera to move there.
-"Render" renders what the red camera sees, or your own view if there is no red camera."""
-_MIN_WIDTH = 360  # the page enlarges narrower pictures to at least this width, in pixels
-_REST = 0.3  # seconds without a move before colors change to those of the new position
+_HELP = """Click on the scene, or give a pixel of a photograph, to come near to that point.
+Drag to move; click on a training camera to move there.
+When you rest, the window shows the scene as the run renders it, with detail."""
+_REST = 0.3  # seconds without a move before the window is rendered
+_MOST_PIXELS = 2_000_000  # of a rendered window; larger windows show it enlarged
+_SAME = 1e-4  # of the distance from the scene, up to which positions are one
 _TINT = 0.7  # share of the colors of support, if these are shown
 
 
@@ -51,15 +54,15 @@ class Visitor:
     def __init__(self, viewer: Viewer, client: Any) -> None:
         """Fill the page of a client of Viser's server."""
         self._viewer, self._client = viewer, client
-        self._camera: Camera | None = None  # the close-up camera
         self._aim: tuple[Camera, np.ndarray] | None = None  # source camera, point
-        self._picture: np.ndarray | None = None
+        self._history: list[tuple[Camera, float]] = []  # cameras, and how far ahead their point is
+        self._prepared: Prepared | None = None  # what rendered the window last
+        self._rendered: Camera | None = None  # the window's camera while its render is shown
         self._visited = -np.inf  # time of the last visit to a camera, seconds
         self._rest: threading.Timer | None = None
-        self._counts: np.ndarray | None = None  # numbers of photographs, while support is shown
         self._drawing = threading.Lock()
         self._gone = False
-        self._drawn = self._add_scene()
+        self._drawn = add_scene(client.scene, viewer)
         self._cameras = client.scene.add_frame("/cameras", show_axes=False)
         self._frustums = [self._add_photograph(i) for i in range(len(viewer.thumbnails))]
         self._add_controls()
@@ -79,100 +82,126 @@ class Visitor:
     def _say_steps(self, done: int, steps: int) -> None:
         self._say(f"fine-tuning for this camera: {done} of {steps} steps ...")
 
-    def _add_scene(self) -> Any:
-        scene, viewer = self._client.scene, self._viewer
-        gaussians = viewer.drawn()
-        if gaussians is not None:
-            # Viser stores covariances in 16 bits, so scale the largest radius to 100 units.
-            variances = np.trace(gaussians.covariances, axis1=1, axis2=2)
-            unit = np.sqrt(variances.max(initial=1e-18)) / 100
-            return scene.add_gaussian_splats(
-                "/surfels",
-                gaussians.means / unit,
-                gaussians.covariances / unit**2,
-                gaussians.rgb,
-                gaussians.opacities[:, None],
-                scale=unit,
-            )
-        if len(viewer.scene.points):
-            size = 0.003 * viewer.distance
-            points, rgb = viewer.scene.points, to_uint8(viewer.scene.rgb[None])[0]
-            return scene.add_point_cloud("/points", points, rgb, point_size=size)
-        return None
-
     def _on_move(self, _: Any) -> None:
-        """Draw the colors of the new position once the camera rests: Viser has one color each."""
+        """Show the drawn scene while the camera moves, and render the window once it rests."""
+        rendered = self._rendered
+        if rendered is not None:
+            if self._still(rendered):
+                return
+            self._hide_render()
         if self._rest is not None:
             self._rest.cancel()
-        self._rest = threading.Timer(_REST, self._draw)
+        self._rest = threading.Timer(_REST, self._on_rest)
         self._rest.daemon = True
         self._rest.start()
 
+    def _still(self, camera: Camera) -> bool:
+        """Return whether the visitor has the camera that was rendered."""
+        return same(camera, self._own_camera(), within=_SAME * self._viewer.distance)
+
+    def _on_rest(self) -> None:
+        self._draw()  # Viser has one color of each surfel, that of one position
+        rendered = self._rendered
+        shown = rendered is not None and self._still(rendered)
+        if self._gone or shown or not self._automatic.value:
+            return
+        if self._viewer.busy:
+            self._on_move(None)  # try again later
+        else:
+            self._viewer.later(
+                "rendering the window", self._render_window, self._say, yielding=True
+            )
+
+    def _hide_render(self) -> None:
+        if self._rendered is None:
+            return
+        self._rendered = self._prepared = None
+        with self._client.atomic():
+            self._client.scene.set_background_image(self._viewer.background())
+            if self._drawn is not None:
+                self._drawn.visible = True
+
+    def _render_window(self, *, tuned: bool = False) -> str:
+        """Render what the window shows, and show it until the camera moves."""
+        camera, viewer, rendered = self._own_camera(), self._viewer, self._rendered
+        if not tuned and rendered is not None and self._still(rendered):
+            return "Rendered"  # a click has rendered it meanwhile
+        prepared = viewer.prepare(camera, tuned=tuned, say_steps=self._say_steps)
+        self._show(prepared, camera)
+        return prepared.said
+
+    def _show(self, prepared: Prepared, camera: Camera) -> None:
+        picture, legend = self._viewer.look(
+            prepared, camera, detail=self._sharpen.value, shown=self._shown.value
+        )
+        self._prepared, self._rendered = prepared, camera
+        with self._client.atomic():
+            self._client.scene.set_background_image(picture, format="jpeg", jpeg_quality=95)
+            if self._drawn is not None:
+                self._drawn.visible = False
+        self._legend.visible = legend is not None
+        if legend is not None:
+            self._legend.image = legend
+        if not self._still(camera):  # the camera moved on meanwhile
+            self._on_move(None)
+
+    def _show_again(self, _: Any) -> None:
+        """Show the window's render with what the switches say now."""
+        prepared, camera = self._prepared, self._rendered
+        if prepared is None or camera is None:
+            self._on_move(None)
+            return
+
+        def show() -> str:
+            self._show(prepared, camera)
+            return "Rendered"
+
+        self._viewer.later("rendering the window", show, self._say)
+
     def _draw(self) -> None:
+        """Color the drawn surfels as they are seen from here."""
         with self._drawing:
             if self._drawn is None or self._gone:
                 return
-            gaussians, counts = self._viewer.drawn(self._client.camera.position), self._counts
-            rgb = to_uint8(self._viewer.scene.rgb[None])[0] if gaussians is None else gaussians.rgb
-            if counts is not None:
-                tint, plain = color_counts(counts)[0], to_uint8(rgb[None])[0]
-                rgb = np.rint(_TINT * tint + (1 - _TINT) * plain).astype(np.uint8)
-            if gaussians is None:
-                self._drawn.colors = rgb
-            else:
-                self._drawn.rgbs = rgb
+            gaussians = self._viewer.drawn(self._client.camera.position)
+            if gaussians is not None:
+                self._drawn.rgbs = gaussians.rgb
 
     def _add_photograph(self, index: int) -> Any:
         viewer = self._viewer
         camera = viewer.scene.camera("train", index)
         name = f"/cameras/{viewer.scene.names['train'][index]}"
-        frustum = self._add_frustum(name, camera, viewer.thumbnails[index])
+        scene = self._client.scene
+        frustum = add_frustum(scene, name, camera, viewer.size, viewer.thumbnails[index])
         frustum.on_click(lambda _: self._visit(index))
         return frustum
 
-    def _add_frustum(self, name: str, camera: Camera, image: np.ndarray | None = None) -> Any:
-        return self._client.scene.add_camera_frustum(
-            name,
-            vertical_fov(camera),
-            camera.width / camera.height,
-            scale=self._viewer.size,
-            thickness=1.5,
-            thickness_units="screen",
-            color=(150, 150, 150) if image is not None else (220, 0, 0),
-            image=image,
-            wxyz=_quaternion(camera),
-            position=np.asarray(camera.position),
-        )
-
     def _add_controls(self) -> None:
-        gui = self._client.gui
-        # Status and picture come first, so that nobody has to scroll to them.
-        black = np.zeros((1, 1, 3), np.uint8)
-        self._status = gui.add_markdown("")
-        self._image = gui.add_image(black, label="rendered", format="png", visible=False)
+        gui, viewer = self._client.gui, self._viewer
+        self._status = gui.add_markdown("")  # first, so that nobody has to scroll to it
         self._nearer = gui.add_slider("times nearer", 1, 16, 0.5, 4)
         self._nearer.on_update(lambda _: self._place())
+        self._automatic = gui.add_checkbox("render when at rest", initial_value=True)
         self._sharpen = gui.add_checkbox("detail of the photographs", initial_value=True)
-        shown = gui.add_checkbox("training cameras", initial_value=True)
-        shown.on_update(lambda _: setattr(self._cameras, "visible", shown.value))
-        self._supported = gui.add_checkbox("support", initial_value=False)
-        self._supported.on_update(lambda _: self._on_support())
-        _, legend = color_counts(np.zeros(1))
-        self._legend = gui.add_image(
-            legend, label="photographs that saw it", format="png", visible=False
-        )
+        self._shown = gui.add_dropdown("window shows", SHOWN, initial_value=PICTURE)
+        for control in (self._automatic, self._sharpen, self._shown):
+            control.on_update(self._show_again)
+        none = np.zeros((1, 1, 3), np.uint8)
+        self._legend = gui.add_image(none, label="colors", format="png", visible=False)
+        cameras = gui.add_checkbox("training cameras", initial_value=True)
+        cameras.on_update(lambda _: setattr(self._cameras, "visible", cameras.value))
+        names, first = viewer.scene.names["train"], viewer.scene.own_camera("train", 0)
+        self._photograph = gui.add_dropdown("photograph", names, initial_value=names[0])
+        middle = (first.width / 2, first.height / 2)
+        self._pixel = gui.add_vector2("pixel x, y", initial_value=middle, min=(0, 0), step=1)
         buttons = {
-            "Place camera here": self._on_here,
-            "Render": functools.partial(self._on_render, tuned=False),
-            "Fine-tune and render": functools.partial(self._on_render, tuned=True),
+            "Go to the pixel": self._on_pixel,
+            "Back": self._on_back,
+            "Fine-tune and render": self._on_tune,
             "Download PNG": self._on_download,
         }
         for name, call in buttons.items():
             gui.add_button(name).on_click(call)
-        self._support = gui.add_image(black, label="support", format="png", visible=False)
-        self._error = gui.add_image(
-            black, label="expected error, in gray levels of 255", format="png", visible=False
-        )
         gui.add_markdown(_HELP)
 
     def _visit(self, index: int) -> None:
@@ -188,80 +217,75 @@ class Visitor:
             ray = np.array(event.ray_origin), np.array(event.ray_direction)
             self._viewer.later("finding that surface", lambda: self._aim_at(*ray), self._say)
 
-    def _on_here(self, _: Any) -> None:
-        self._aim = None
-        self._show_camera(self._own_camera())
+    def _on_pixel(self, _: Any) -> None:
+        scene = self._viewer.scene
+        camera = scene.own_camera("train", scene.names["train"].index(self._photograph.value))
+        pixel = jnp.asarray(self._pixel.value, jnp.float32)
+        if not (0 <= pixel[0] < camera.width and 0 <= pixel[1] < camera.height):
+            self._say(f"The photograph has {camera.width} x {camera.height} pixels: choose one.")
+            return
+        start = np.asarray(camera.position)
+        ray = start, np.asarray(pixels_to_points(camera, pixel, jnp.float32(1))) - start
+        self._viewer.later("finding that surface", lambda: self._aim_at(*ray), self._say)
 
-    def _on_support(self) -> None:
-        self._legend.visible = self._supported.value
-        if self._supported.value:
-            self._viewer.later("counting photographs", self._show_counts, self._say)
-        else:
-            self._counts = None
-            self._draw()
+    def _on_back(self, _: Any) -> None:
+        """Go back to the close-up before this one."""
+        if len(self._history) < 2:
+            self._say("There is no earlier close-up.")
+            return
+        self._history.pop()
+        self._aim = None  # the slider moves along the ray of the newest click alone
+        self._bring(*self._history[-1])
 
-    def _show_counts(self) -> str:
-        self._counts = self._viewer.counts
-        self._draw()
-        return "Colors show how many photographs saw the surface"
-
-    def _on_render(self, _: Any, *, tuned: bool) -> None:
-        here = self._own_camera()
-        what = "fine-tuning for this camera" if tuned else "rendering"
-
-        def render() -> str:  # by then, an earlier click may have moved the close-up camera
-            return self._render(here if self._camera is None else self._camera, tuned)
-
-        self._viewer.later(what, render, self._say)
+    def _on_tune(self, _: Any) -> None:
+        tune = functools.partial(self._render_window, tuned=True)
+        self._viewer.later("fine-tuning for this camera", tune, self._say)
 
     def _on_download(self, _: Any) -> None:
-        if self._picture is None:
-            self._say("There is no picture yet: render one first.")
-        else:
-            name = f"{self._viewer.title.replace(', ', '_')}.png"
-            self._client.send_file_download(name, encode_png(self._picture), save_immediately=True)
+        self._viewer.later("rendering at the photographs' size", self._download, self._say)
+
+    def _download(self) -> str:
+        viewer, prepared = self._viewer, self._prepared
+        camera = self._own_camera(viewer.scene.own_camera("train", 0))
+        if prepared is None:
+            prepared = viewer.prepare(camera, tuned=False, say_steps=self._say_steps)
+        shown, detail = self._shown.value, self._sharpen.value
+        picture, _ = viewer.look(prepared, camera, detail=detail, shown=shown)
+        name = f"{viewer.title.replace(', ', '_')}.png"
+        self._client.send_file_download(name, encode_png(picture), save_immediately=True)
+        return f"Sent {camera.width} x {camera.height} pixels"
 
     def _aim_at(self, origin: np.ndarray, direction: np.ndarray) -> str:
-        """Put the close-up camera in front of the first surface along a ray."""
+        """Come near to the first surface along a ray."""
         best, point, shown = self._viewer.find_surface(origin, direction)
         scene = self._viewer.scene
         self._aim = scene.camera("train", best), point
-        self._place()
-        return f"{shown}; the close-up camera starts from {scene.names['train'][best]}"
+        self._history.append(self._place() or (self._own_camera(), 1.0))
+        prepared = self._viewer.prepare(self._own_camera(), tuned=False, say_steps=self._say_steps)
+        if self._automatic.value:
+            self._show(prepared, self._own_camera())
+        return f"{shown}; this close-up starts from {scene.names['train'][best]}"
 
-    def _place(self) -> None:
-        """Put the close-up camera as near to the point as the slider says."""
+    def _place(self) -> tuple[Camera, float] | None:
+        """Move as near to the point as the slider says; return the camera, and how far it is."""
         aim = self._aim  # read once: another thread may reset it
         if aim is None:
-            return
+            return None
         source, point = aim
         camera = closeup_camera(source, point, self._nearer.value)
-        self._show_camera(camera)
-        self._bring(camera, float(np.linalg.norm(point - np.asarray(camera.position))))
+        distance = float(np.linalg.norm(point - np.asarray(camera.position)))
+        self._bring(camera, distance)
+        return camera, distance
 
-    def _show_camera(self, camera: Camera) -> None:
-        self._camera = camera
-        self._add_frustum("/closeup", camera)
-
-    def _render(self, camera: Camera, tuned: bool) -> str:
-        images, said = self._viewer.render(
-            camera, tuned=tuned, detail=self._sharpen.value, say_steps=self._say_steps
-        )
-        self._picture = picture = to_uint8(images["rgb"])
-        factor = -(-_MIN_WIDTH // picture.shape[1])
-        self._image.image = picture.repeat(factor, axis=0).repeat(factor, axis=1)
-        self._support.image = images["support"]
-        self._image.visible = self._support.visible = True
-        self._error.visible = "error" in images
-        if self._error.visible:
-            self._error.image = images["error"]
-        return said
-
-    def _own_camera(self) -> Camera:
-        """Return the visitor's camera, with the first photograph's image size."""
+    def _own_camera(self, like: Camera | None = None) -> Camera:
+        """Return the visitor's camera, with the window's size or that of another camera."""
         camera = self._client.camera
+        if like is None:
+            width, height = camera.image_width, camera.image_height
+            smaller = min(1.0, (_MOST_PIXELS / max(1, width * height)) ** 0.5)
+            width, height = (max(1, round(smaller * side)) for side in (width, height))
+            like = self._viewer.scene.camera("train", 0).replace(width=width, height=height)
         rotation = SO3(camera.wxyz).as_matrix()
-        like = self._viewer.scene.camera("train", 0)
         return viewer_camera(rotation, camera.position, camera.fov, like)
 
     def _bring(self, camera: Camera, distance: float) -> None:
@@ -271,10 +295,6 @@ class Visitor:
         with client.atomic():
             client.camera.position = position
             client.camera.look_at = position + distance * forward
-            client.camera.wxyz = _quaternion(camera)
+            client.camera.wxyz = quaternion(camera)
             client.camera.fov = vertical_fov(camera)
             client.camera.near, client.camera.far = distance / 100, 1000 * distance
-
-
-def _quaternion(camera: Camera) -> np.ndarray:
-    return SO3.from_matrix(np.asarray(camera.rotation, np.float64)).wxyz
