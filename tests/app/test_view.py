@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from absl import flags
 from absl.testing import flagsaver
-from browser import click_in_the_middle, free_port, open_browser, press, wait
+from browser import click_in_the_middle, free_port, open_browser, wait
 from reference_splats import sh_color
 from tiny_runs import TINY
 

@@ -8,6 +8,8 @@ what the photographs show beyond them; `test_time` learns labels of the very clo
 scored. The scene is a built-in one or a folder.
 """
 
+from typing import TYPE_CHECKING
+
 from absl import flags
 
 from jaxcloseup.app.cli.flags import (
@@ -19,8 +21,12 @@ from jaxcloseup.app.cli.flags import (
 from jaxcloseup.app.cli.output_folder import choose_output_dir, lock_output_dir, prepare_to_stop
 from jaxcloseup.app.cli.start import in_one_sentence, loading, set_up
 from jaxcloseup.app.cli.topics import share
+from jaxcloseup.app.methods.method import Preset
 from jaxcloseup.app.run.stage_names import STAGES
 
+
+if TYPE_CHECKING:
+    from jaxcloseup.photos.scene import Scene
 
 FLAGS = flags.FLAGS
 share(TRAINING)
@@ -36,6 +42,13 @@ flags.DEFINE_integer(
 )
 flags.DEFINE_integer(
     "save_every", 1000, "steps between checkpoints; each stage's end is kept too", lower_bound=1
+)
+flags.DEFINE_float(
+    "minutes",
+    None,
+    "train stage 1 for about so many minutes on this computer: steps are timed first, and the "
+    "settings that repeat the training are printed",
+    lower_bound=0.1,
 )
 flags.DEFINE_list("stages", list(STAGES), "stages to run; baseline always runs")
 
@@ -64,6 +77,8 @@ def main(_: list[str]) -> None:
         load_options = load_options_from_flags(preset)
         with progress.showing(), progress.saying(f"loading {FLAGS.scene}"):
             scene = load(FLAGS.scene, load_options)
+        if FLAGS.minutes is not None:
+            preset = _fitted(preset, scene)
         perceptual = find_perceptual(FLAGS.lpips_weights)
         lock = lock_output_dir(output_dir)
     expected = (TrainingError, CheckpointError, SceneError, OSError)
@@ -82,6 +97,25 @@ def main(_: list[str]) -> None:
         )
     print_results(results)
     print(f"report: {output_dir / 'report.html'}")
+
+
+def _fitted(preset: Preset, scene: "Scene") -> Preset:
+    from jaxcloseup.app import progress
+    from jaxcloseup.app.run.minutes import fit_minutes
+
+    with progress.showing(), progress.saying("timing steps"):
+        preset, given = fit_minutes(preset, scene, FLAGS.minutes)
+    repeat = " ".join(f"--set={text}" for text in given)
+    print(f"{FLAGS.minutes:g} minutes of training, as {repeat} repeats it")
+    return preset
+
+
+@flags.multi_flags_validator(
+    ["minutes"],
+    message="--resume needs the settings that --minutes printed: give them instead of it",
+)
+def _new(values: dict[str, float | None]) -> bool:
+    return values["minutes"] is None or not FLAGS.resume
 
 
 @flags.multi_flags_validator(["stages"], message=f"--stages takes names of {', '.join(STAGES)}")

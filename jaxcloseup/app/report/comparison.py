@@ -11,7 +11,7 @@ from jaxcloseup.app.methods.settings import GROUPS
 from jaxcloseup.app.report.audits import zoom_plots
 from jaxcloseup.app.report.finished_runs import Finished
 from jaxcloseup.app.report.headline import all_scores, compare_psnr, score_tables
-from jaxcloseup.app.report.page import fill_page
+from jaxcloseup.app.report.page import QUALITIES, fill_page
 from jaxcloseup.app.report.record_table import Table
 from jaxcloseup.app.report.showcase import best_middle_worst
 from jaxcloseup.app.score.metrics_text import SPLIT_TITLES
@@ -20,7 +20,6 @@ from jaxcloseup.io.files import write_file, write_json
 
 
 MOST_BYTES = 3_000_000  # of the page
-_QUALITIES = (90, 75, 50, 25)  # of pictures; the first that makes the page small enough is taken
 
 
 class Render(NamedTuple):
@@ -136,7 +135,7 @@ def write_comparison(folder: pathlib.Path, runs: Sequence[Finished]) -> None:
             "differences": {name: values for name, *values in differ.rows},
         },
     )
-    for quality in _QUALITIES:
+    for quality in QUALITIES:
         page = fill_page("comparison.html", title=title, quality=quality, **data)
         if len(page) <= MOST_BYTES:
             break

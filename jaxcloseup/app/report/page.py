@@ -20,12 +20,16 @@ _TEMPLATES = jinja2.Environment(
 _TEMPLATES.filters["webp"] = lambda image, quality: webp_data_uri(image, quality=quality)
 
 
+QUALITIES = (90, 75, 50, 25)  # of pictures; the first that makes a page small enough is taken
+
+
 class Picture(NamedTuple):
     """A picture on a page."""
 
     section: str  # heading that groups pictures
     caption: str  # text below the picture
     image: np.ndarray  # uint8 `[H, W, 3]`, a row of panels
+    file: str = ""  # the same at its full size, from the page's folder; empty if there is none
 
 
 def fill_page(template: str, *, title: str, **data: Any) -> bytes:

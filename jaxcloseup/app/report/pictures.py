@@ -3,6 +3,7 @@
 import pathlib
 from collections.abc import Callable, Mapping, Sequence
 
+import cv2
 import jax
 import numpy as np
 
@@ -44,7 +45,7 @@ def comparisons(
       in_report: stages that the report shows; default: all.
 
     Returns:
-      The pictures, for the report.
+      The pictures, reduced for the report.
     """
     pictures: list[Picture] = []
     written: set[str] = set()
@@ -60,7 +61,9 @@ def comparisons(
             write_png(folder / f"{name}.png", _comparison(truth, seen))
             brief = {stage: seen[stage] for stage in stages if stage in (in_report or stages)}
             section = SPLIT_TITLES[split]
-            pictures.append(Picture(section, target.name, _comparison(truth, brief)))
+            small = {stage: fit_page(image) for stage, image in brief.items()}
+            row = _comparison(fit_page(truth), small)
+            pictures.append(Picture(section, target.name, row, f"{folder.name}/{name}.png"))
     return pictures
 
 
@@ -73,6 +76,15 @@ def _comparison(truth: np.ndarray, seen: Mapping[str, np.ndarray]) -> np.ndarray
 
 def _row(panels: Mapping[str, np.ndarray | jax.Array]) -> np.ndarray:
     return side_by_side(map(enlarge, panels.values()), labels=list(panels))
+
+
+def fit_page(image: np.ndarray, most: int = 320) -> np.ndarray:
+    """Return an image `[H, W, ...]` that is at most `most` wide, by averaging areas."""
+    height, width = image.shape[:2]
+    if width <= most:
+        return image
+    size = (most, max(1, round(height * most / width)))
+    return cv2.resize(np.asarray(image), size, interpolation=cv2.INTER_AREA)
 
 
 def enlarge(image: np.ndarray | jax.Array) -> np.ndarray:

@@ -16,8 +16,8 @@ from jaxcloseup.app.report.audits import (
     zoom_plots,
 )
 from jaxcloseup.app.report.headline import all_scores, best_stage, conclusion, run_tables
-from jaxcloseup.app.report.page import Picture, by_section, fill_page
-from jaxcloseup.app.report.pictures import comparisons, label_pictures
+from jaxcloseup.app.report.page import QUALITIES, Picture, by_section, fill_page
+from jaxcloseup.app.report.pictures import comparisons, fit_page, label_pictures
 from jaxcloseup.app.report.showcase import Exhibit, exhibits
 from jaxcloseup.app.run.gate import verdict
 from jaxcloseup.app.run.keys import run_keys
@@ -35,6 +35,8 @@ from jaxcloseup.photos.pyramids import Pyramid
 
 
 _FPS = 12
+_DOLLY_WIDTH = 480  # in pixels, on the page
+_MOST_BYTES = 4_000_000  # of the page
 
 
 def report_run(
@@ -85,11 +87,17 @@ def report_run(
     write_json(output_dir / "results.json", results)
     moving = b""
     if dolly:
-        moving = encode_webp_animation([*dolly, *dolly[-2:0:-1]], fps=_FPS)  # there and back
+        moving = encode_webp_animation(_there_and_back(dolly), fps=_FPS)
         write_file(output_dir / "dolly.webp", moving)
+        small = [fit_page(frame, _DOLLY_WIDTH) for frame in dolly]
+        moving = encode_webp_animation(_there_and_back(small), fps=_FPS, quality=70)
     shown = _showcase(programs, outcome)
     write_report(output_dir / "report.html", results, shown, pictures, dolly=moving)
     return results
+
+
+def _there_and_back(frames: Sequence[np.ndarray]) -> list[np.ndarray]:
+    return [*frames, *frames[-2:0:-1]]
 
 
 def _showcase(programs: Programs, outcome: Outcome) -> list[Exhibit]:
@@ -145,8 +153,7 @@ def write_report(
     labels, gate, detail = results["labels"], results["gate"], results["detail"]
     sections = by_section(pictures)
     views = {title: shown for title, shown in sections.items() if title in SPLIT_TITLES.values()}
-    page = fill_page(
-        "run.html",
+    data = dict(
         title=results["scene"],
         verdict=conclusion(results),
         results=results,
@@ -166,4 +173,8 @@ def write_report(
         detail_table=detail_table(detail) if detail else None,
         config=json.dumps({key: results[key] for key in ("config", "versions")}, indent=1),
     )
+    for quality in QUALITIES:
+        page = fill_page("run.html", quality=quality, **data)
+        if len(page) <= _MOST_BYTES:
+            break
     write_file(path, page)

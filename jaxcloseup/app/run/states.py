@@ -42,8 +42,7 @@ def train_baseline(training: Training, stage: str, keys: RunKeys) -> TrainState:
 def _refine_coarse(training: Training, stage: str, keys: RunKeys) -> TrainState:
     """Train `preset.coarse`, and give its state the room and the detail of the preset itself."""
     programs, preset = training.programs, training.programs.preset
-    assert preset.coarse is not None and preset.windows is not None
-    assert programs.method.refine is not None
+    assert preset.coarse is not None
     coarse = dataclasses.replace(training, programs=programs.coarse)
     state: Any = train_stage(
         coarse,
@@ -52,16 +51,23 @@ def _refine_coarse(training: Training, stage: str, keys: RunKeys) -> TrainState:
         TrainData(coarse.programs.photographs),
         steps=preset.coarse.steps,
     )
+    with timed(training.seconds, f"refine_{stage}"):
+        return refine_state(programs, state)
+
+
+def refine_state(programs: Programs, state: TrainState) -> TrainState:
+    """Return the state of a coarse model with the room and the detail of the preset itself."""
+    preset = programs.preset
+    assert programs.method.refine is not None
     pyramid, _ = programs.pyramid(finest_read(preset, programs.scene))
 
     def render(params: Any, buffers: Any, camera: Camera) -> Rendering:
         return programs.render(state.replace(params=params, buffers=buffers), camera)
 
     key_fine, key_refine = jax.random.split(jax.random.fold_in(state.key, state.step))
-    with timed(training.seconds, f"refine_{stage}"):
-        params, buffers = programs.method.refine(
-            key_refine, preset.field, state.params, state.buffers, render, programs.scene, pyramid
-        )
+    params, buffers = programs.method.refine(
+        key_refine, preset.field, state.params, state.buffers, render, programs.scene, pyramid
+    )
     moments = jax.jit(programs.optimizer.init)(params)
     return TrainState(jnp.zeros_like(state.step), params, buffers, moments, key_fine)
 

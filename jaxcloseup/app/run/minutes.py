@@ -1,0 +1,74 @@
+"""A preset that trains for a given time on this computer: steps are timed before the run."""
+
+import math
+import time
+from typing import Any
+
+import jax
+
+from jaxcloseup.app.methods.method import Preset
+from jaxcloseup.app.methods.settings import settings_of, with_settings
+from jaxcloseup.app.run.keys import run_keys
+from jaxcloseup.app.run.programs import Programs
+from jaxcloseup.app.run.states import initial_state, refine_state
+from jaxcloseup.app.run.step_data import TrainData
+from jaxcloseup.photos.scene import Scene
+
+
+_USUAL = 5.0  # minutes for which a preset's number of surfels was chosen
+_WARMING, _TIMED = 15, 60  # steps: the first compile programs
+_FEWEST = 100  # steps
+
+
+def fit_minutes(preset: Preset, scene: Scene, minutes: float) -> tuple[Preset, list[str]]:
+    """Return the preset whose stage 1 takes so many minutes here, and the settings that make it.
+
+    The number of steps follows from their time on this computer, the schedules of learning rates
+    from the number of steps, and the number of surfels from the minutes, as their square root. The
+    same settings repeat the training anywhere.
+
+    Args:
+      preset: what is trained.
+      scene: what was photographed.
+      minutes: wall time of stage 1 with its coarse model, without compiling.
+    """
+    given: list[str] = []
+    if preset.coarse is not None:
+        times = math.sqrt(minutes / _USUAL)
+        given.append(f"capacity={max(1000, 1000 * round(preset.field.capacity * times / 1000))}")
+        preset = with_settings(preset, given)
+    before, step = _time_steps(preset, scene)
+    steps = max(_FEWEST, 10 * round((60 * minutes - before) / step / 10))
+    given += [f"baseline_steps={steps}", *_schedules(preset, steps)]
+    return with_settings(preset, given), given
+
+
+def _schedules(preset: Preset, steps: int) -> list[str]:
+    """Return the settings that stretch schedules of learning rates to a number of steps."""
+    share = steps / preset.baseline_steps
+    names = [name for name in settings_of(preset) if name in ("means_lr_steps", "lr_decay_steps")]
+    values = {name: settings_of(preset)[name].value for name in names}
+    return [f"{name}={max(1, round(share * value))}" for name, value in values.items()]
+
+
+def _time_steps(preset: Preset, scene: Scene) -> tuple[float, float]:
+    """Return the seconds before the first step of stage 1, and those of a step."""
+    programs, keys, before = Programs(preset, scene), run_keys(0), 0.0
+    if preset.coarse is None:
+        state = initial_state(programs, keys)
+    else:
+        coarse = programs.coarse
+        state = initial_state(coarse, keys)
+        state, each = _steps(coarse, state, TrainData(coarse.photographs))
+        start = time.perf_counter()
+        state = jax.block_until_ready(refine_state(programs, state))
+        before = preset.coarse.steps * each + time.perf_counter() - start
+    return before, _steps(programs, state, TrainData(programs.photographs))[1]
+
+
+def _steps(programs: Programs, state: Any, data: TrainData) -> tuple[Any, float]:
+    """Return the state after some steps, and the seconds of one of the later ones."""
+    state, _ = programs.run(state, data, count=_WARMING)
+    start = time.perf_counter()
+    state, _ = programs.run(state, data, count=_TIMED)
+    return state, (time.perf_counter() - start) / _TIMED
