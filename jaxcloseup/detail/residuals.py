@@ -11,6 +11,7 @@ from jaxcloseup.detail.add import Detail
 from jaxcloseup.detail.features import blur_images
 from jaxcloseup.detail.weights import DetailWeights
 from jaxcloseup.fields.contract import Rendering
+from jaxcloseup.fields.padding import render_unpadded
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.geometry.numerics import matmul
 from jaxcloseup.labels.rules import label_depth
@@ -100,7 +101,7 @@ def render_residuals(
             camera = pyramid.camera(camera_at(cameras, view), view, level)
             photograph = pyramid.image(view, level)
             if level >= rendered:
-                rendering = render(camera)
+                rendering = render_unpadded(render, camera, pyramid.size_of(view, level))
                 rgb, shown_by = rendering.rgb, camera
             else:
                 assert enlarge is not None, "levels that are not rendered need `enlarge`"

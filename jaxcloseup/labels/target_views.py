@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxcloseup.fields.contract import Rendering
+from jaxcloseup.fields.padding import render_unpadded
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points, points_to_pixels
 from jaxcloseup.geometry.masks import depth_consistent, in_bounds
 from jaxcloseup.geometry.warp import backward_warp
@@ -24,6 +25,7 @@ def render_depths(
     far: float = math.inf,
     key: jax.Array | None = None,
     depth: Callable[..., jax.Array] = label_depth,
+    sizes: Sequence[tuple[int, int]] | None = None,
     each: Callable[[Callable[[int], Any], Sequence[int]], Iterable[Any]] = map,
 ) -> jax.Array:
     """Render the z-depths `[V, H, W]` of whole views, for labels and anchors.
@@ -37,13 +39,17 @@ def render_depths(
       far: largest one.
       key: consumed by the renderings; None renders deterministically.
       depth: that of a `LabelRule`.
+      sizes: width and height of each view without padding, whose depth is 0; None: none is padded.
       each: like `map`; may show progress.
     """
     count = cameras.intrinsics.shape[0]
     keys = [None] * count if key is None else jax.random.split(key, count)
 
     def one_view(view: int) -> jax.Array:
-        return depth(render(camera_at(cameras, view), keys[view]), near=near, far=far)
+        camera = camera_at(cameras, view)
+        size = (camera.width, camera.height) if sizes is None else sizes[view]
+        seen = render_unpadded(render, camera, size, keys[view])
+        return depth(seen, near=near, far=far)
 
     return jnp.stack(list(each(one_view, range(count))))
 

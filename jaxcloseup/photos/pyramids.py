@@ -66,6 +66,14 @@ class Pyramid:
         flat = self.values[view, self.pixels_of(index)]
         return flat.reshape(*self.sizes[index], flat.shape[-1])
 
+    def size_of(self, view: int, index: int) -> tuple[int, int]:
+        """Return width and height of one view's image at one level, without its padding."""
+        extent = (
+            self.sizes[index] if self.extents is None else np.asarray(self.extents)[view, index]
+        )
+        height, width = map(int, extent)
+        return width, height
+
     def camera(self, camera: Camera, view: int, index: int) -> Camera:
         """Return the camera of one view's image at one level, given any camera with its pose."""
         height, width = self.sizes[index]

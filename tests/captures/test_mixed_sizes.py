@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import cv2
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -16,7 +17,11 @@ from jaxcloseup.app.score.targets import targets_by_split
 from jaxcloseup.app.view import frames
 from jaxcloseup.app.view.camera_paths import orbit, resized_shots, view_shots
 from jaxcloseup.captures.load import load_scene
+from jaxcloseup.detail.residuals import render_residuals
 from jaxcloseup.fields.contract import Rendering
+from jaxcloseup.labels.target_views import render_depths
+from jaxcloseup.photos.pyramids import scene_pyramid
+from jaxcloseup.photos.windows import photograph_windows, sample_window, sample_window_pixels
 
 
 ALONG, ACROSS = (32, 24), (24, 32)  # width, height
@@ -89,3 +94,35 @@ def test_views_are_rendered_at_the_size_of_their_files(scene, tmp_path):
 def test_an_orbit_has_the_size_of_the_first_photograph(scene):
     cameras = orbit(scene, 2).cameras
     assert (cameras.width, cameras.height) == (64, 48)
+
+
+def test_nothing_is_computed_on_padding(scene, key):
+    """Depths, residuals and windows of the training photographs cost the sum of their pixels."""
+    counted = []
+
+    def count(camera, *_):
+        counted.append(camera.height * camera.width)
+        return render(camera)
+
+    own, finer = ALONG[0] * ALONG[1] + ACROSS[0] * ACROSS[1], scene.photographs_at(1)
+    depths = render_depths(count, scene.train.cameras, far=9, sizes=scene.sizes("train"))
+    assert sum(counted) == own
+    np.testing.assert_array_equal(np.asarray(depths) > 0, np.asarray(scene.train.weight) > 0)
+
+    counted.clear()
+    pyramid, divisor = scene_pyramid(scene)
+    assert divisor == 1 and pyramid.sizes == ((64, 64), (32, 32))
+    shown, depths = render_residuals(count, scene.train.cameras, pyramid, near=0.0, far=9.0)
+    assert sum(counted) == 5 * own
+    for level, views in enumerate((finer[0], scene.train)):
+        padded = np.asarray(views.weight) == 0
+        assert padded.any() and not np.asarray(shown.level(level))[padded].any()
+
+    windows = photograph_windows(scene.train.cameras, pyramid, whole_share=0.5)
+    assert windows.size == (24, 24)  # what both have in common
+    drawn = jax.jit(jax.vmap(lambda key: sample_window(key, windows)))(jax.random.split(key, 500))
+    assert np.asarray(drawn.weight).min() == 1
+    center = np.asarray(drawn.cameras.intrinsics)[:, 2:]
+    assert np.ptp(center, axis=0).min() > 24  # windows lie in several places
+    pixels = sample_window_pixels(key, windows, 500)
+    assert np.asarray(pixels.weight).min() == 1

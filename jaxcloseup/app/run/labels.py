@@ -1,7 +1,7 @@
 """Labels of a run: the depths and photographs that they are made from, and labeled views."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -47,6 +47,7 @@ def start_labels(
         near=scene.near,
         key=rule.depth_key(keys.depths),
         depth=rule.depth,
+        sizes=scene.sizes("train"),
     )
     return LabelStart(state, jax.jit(label_sources)(scene.train, depths))
 
@@ -59,11 +60,13 @@ def rendered_depths(
     near: float = 0.0,
     key: jax.Array | None = None,
     depth: Callable[..., jax.Array] = label_depth,
+    sizes: Sequence[tuple[int, int]] | None = None,
 ) -> jax.Array:
     """Render the depths `[V, H, W]` of stacked cameras, for labels and anchors.
 
     `near` is 0 by default, because close-ups may be nearer to the surface than any photograph.
-    Without a key, rendering is deterministic; `depth` is that of a `LabelRule`.
+    Without a key, rendering is deterministic; `depth` is that of a `LabelRule`, and `sizes` are
+    those of views without padding.
     """
     return render_depths(
         render,
@@ -72,6 +75,7 @@ def rendered_depths(
         far=scene.far,
         key=key,
         depth=depth,
+        sizes=sizes,
         each=lambda one_view, views: progress.each(one_view, views, "rendering depths"),
     )
 

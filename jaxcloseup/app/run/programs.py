@@ -28,7 +28,7 @@ from jaxcloseup.app.run.photograph_sizes import describe_photographs, finest_rea
 from jaxcloseup.app.run.step_data import ArmsData, StepData
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
-from jaxcloseup.photos.pyramids import Pyramid, scene_pyramid
+from jaxcloseup.photos.pyramids import Pyramid, photograph_pyramid, scene_pyramid
 from jaxcloseup.photos.scene import Scene, SceneError
 from jaxcloseup.photos.views import Views
 from jaxcloseup.photos.windows import Windows, in_quarters, photograph_windows
@@ -132,13 +132,21 @@ class Programs:
         views, windows = self.scene.train, self.preset.windows
         finest = finest_read(self.preset, self.scene)
         if windows is None or finest >= self.scene.metadata.get("downscale", 1):
-            return views
+            return self._whole()
         pyramid, divisor = self.pyramid(finest)
         if len(pyramid.sizes) == 1:
-            return views
+            return self._whole()
         parts = "pixels" if self.method.renders_pixels else "windows"
         print(f"learning from {parts} of {describe_photographs(pyramid, divisor)}")
         return photograph_windows(views.cameras, pyramid, whole_share=windows.whole_share)
+
+    def _whole(self) -> Views | Windows:
+        """Return reduced photographs, or windows of the size that all have where sizes differ."""
+        views, sizes = self.scene.train, self.scene.sizes("train")
+        if len(set(sizes)) == 1:
+            return views
+        pyramid = photograph_pyramid(views, extents=[sizes])
+        return photograph_windows(views.cameras, pyramid, whole_share=1.0)
 
     def make_room(self, growth: int) -> None:
         """Grow the room to at least `growth` times the preset's."""

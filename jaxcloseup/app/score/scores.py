@@ -191,23 +191,16 @@ def evaluate(
 ) -> tuple[dict[str, Any], dict[str, Rendering]]:
     """Render and score every target; return the summary and the renderings by name.
 
-    Renderings have their photograph's own size, and no `aux`.
+    Renderings have the size of their target, and no `aux`.
     """
 
     def seen(target: Target) -> Rendering:
-        return without_padding(jax.device_get(render(target.camera)), *target.weight.shape)
+        return jax.device_get(render(target.camera)._replace(aux=()))
 
     names = [target.name for target in targets]
     renderings = dict(zip(names, progress.each(seen, targets, "rendering views"), strict=True))
     scores = {t.name: score(renderings[t.name], t, perceptual) for t in targets}
     return summarize(scores), renderings
-
-
-def without_padding(rendering: Rendering, height: int, width: int) -> Rendering:
-    """Return the upper left `height` x `width` pixels of a rendering; the rest is padding."""
-    images = {name: getattr(rendering, name) for name in ("rgb", "depth", "alpha", "normal")}
-    cut = {name: image[:height, :width] for name, image in images.items() if image is not None}
-    return rendering._replace(**cut, aux=())
 
 
 def _as_8_bits(image: jax.Array, truth: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -26,9 +26,7 @@ class Target(NamedTuple):
     """A held-out view of `[H, W]` pixels, the size of its photograph."""
 
     name: str  # name of its photograph
-    # its camera, padded at the right and the bottom to the size of its split, so that all views of
-    # a split share compiled programs
-    camera: Camera
+    camera: Camera  # its camera
     rgb: jax.Array  # `[H, W, 3]` the photograph, float in [0, 1]
     weight: jax.Array  # `[H, W]` weights
     seen: jax.Array  # `[H, W]` number of training photographs that saw the surface at each pixel
@@ -84,14 +82,14 @@ def make_targets(
     rgb_of, weight_of = jax.device_get((views.rgb, views.weight))
 
     def make(i: int) -> Target:
-        camera, (width, height) = camera_at(views.cameras, i), sizes[i]
-        whole = camera.replace(width=width, height=height)  # without padding
+        width, height = sizes[i]  # without padding
+        camera = camera_at(views.cameras, i).replace(width=width, height=height)
         exact = surface(camera) if surface else None
-        landmarks = None if exact else find_landmarks(whole, scene.points)
+        landmarks = None if exact else find_landmarks(camera, scene.points)
         depth = exact.depth if exact else render(camera).depth
         pixels = pixel_grid(camera.height, camera.width)
         support = find(camera, pixels, depth, scene.train, train_depths)
-        seen, footprint = (np.asarray(image)[:height, :width] for image in support)
+        seen, footprint = map(np.asarray, support)
         # A period takes two pixels, of the photograph or of the view.
         held = max(2.0, 2 * float(np.median(footprint[seen > 0])) / own) if seen.any() else None
         rgb = jnp.asarray(to_float(rgb_of[i, :height, :width]))
