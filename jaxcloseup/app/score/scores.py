@@ -81,19 +81,17 @@ def score(rendering: Rendering, target: Target, perceptual: Perceptual = NO_PERC
     image, truth = _as_8_bits(image, truth)
     seen = crop(target.seen)
     values: Metrics = {}
-    for least in SEEN_BY:
-        counted = np.where(seen >= least, weight, 0)
-        for key, value in _masked_metrics(image, truth, counted).items():
-            values[f"{key}_seen{least}"] = value
+    masks = {f"seen{least}": np.where(seen >= least, weight, 0) for least in SEEN_BY}
+    for name, counted in masks.items():
         share = (counted > 0).sum() / max((np.asarray(weight) > 0).sum(), 1)
-        values[f"coverage_seen{least}"] = share
+        values[f"coverage_{name}"] = share
     if target.surface is not None:
         values |= surface_error(target.camera, rendering, target.surface)
     if target.could_resolve is not None:
         values["could_resolve"] = target.could_resolve
     if target.landmarks is not None:
         values |= point_depth_error(np.asarray(rendering.depth), target.landmarks)
-    return score_image(image, truth, weight, perceptual, values)
+    return score_image(image, truth, weight, perceptual, values, masks)
 
 
 def score_image(
@@ -102,6 +100,7 @@ def score_image(
     weight: jax.Array,
     perceptual: Perceptual = NO_PERCEPTUAL,
     more: Metrics | None = None,
+    masks: Mapping[str, np.ndarray] | None = None,
 ) -> View:
     """Return the metrics of an image, on 8-bit colors.
 
@@ -111,6 +110,7 @@ def score_image(
       weight: `[H, W]` weight of each pixel.
       perceptual: LPIPS networks; they see the true image at pixels without weight.
       more: other metrics of the image, to add to the result.
+      masks: further weights by name; PSNR and SSIM with these have the names as their ending.
 
     Returns:
       Each metric by name. A metric that cannot be computed is None, and `<metric>_reason` says why;
@@ -118,7 +118,7 @@ def score_image(
       image resolves, and `ring_correlation` the curve it is read from, where the image is so large.
     """
     image, truth = _as_8_bits(image, truth)
-    values = dict(_full_metrics(image, truth, weight)) | dict(more or {})
+    values = dict(_metrics(image, truth, weight, dict(masks or {}))) | dict(more or {})
     finite, side = bool(np.isfinite(image).all()), min(truth.shape[:2])
     result: View = {}
     if finite and side >= SMALLEST_RINGS:
@@ -199,7 +199,11 @@ def evaluate(
 
     names = [target.name for target in targets]
     renderings = dict(zip(names, progress.each(seen, targets, "rendering views"), strict=True))
-    scores = {t.name: score(renderings[t.name], t, perceptual) for t in targets}
+
+    def scored(target: Target) -> View:
+        return score(renderings[target.name], target, perceptual)
+
+    scores = dict(zip(names, progress.each(scored, targets, "scoring views"), strict=True))
     return summarize(scores), renderings
 
 
@@ -209,19 +213,20 @@ def _as_8_bits(image: jax.Array, truth: jax.Array) -> tuple[jax.Array, jax.Array
 
 
 @jax.jit
-def _full_metrics(image: jax.Array, truth: jax.Array, weight: jax.Array) -> Metrics:
-    metrics = {"psnr": psnr, "cc_psnr": cc_psnr, "ssim": _ssim}
-    return {name: metric(image, truth, weight=weight) for name, metric in metrics.items()}
+def _metrics(
+    image: jax.Array, truth: jax.Array, weight: jax.Array, masks: Mapping[str, jax.Array]
+) -> Metrics:
+    # In one program, all weights share one map of SSIM.
+    found: Metrics = {"cc_psnr": cc_psnr(image, truth, weight=weight)}
+    for ending, counted in {"": weight, **{f"_{name}": w for name, w in masks.items()}}.items():
+        found[f"psnr{ending}"] = psnr(image, truth, weight=counted)
+        found[f"ssim{ending}"] = _ssim(image, truth, weight=counted)
+    return found
 
 
 @jax.jit
 def _ring_correlation(image: jax.Array, truth: jax.Array, weight: jax.Array) -> jax.Array:
     return ring_correlation(image, truth, weight=weight)
-
-
-@jax.jit
-def _masked_metrics(image: jax.Array, truth: jax.Array, weight: jax.Array) -> Metrics:
-    return {"psnr": psnr(image, truth, weight=weight), "ssim": _ssim(image, truth, weight=weight)}
 
 
 @jax.jit
