@@ -52,7 +52,7 @@ class Pyramid:
         start, (height, width) = self.starts[index], self.sizes[index]
         return slice(start, start + height * width)
 
-    def level_near(self, width: int) -> int:
+    def level_near(self, width: float) -> int:
         """Return the finest level that is not 1.5 times as wide as `width`; there must be one."""
         return [finer < 1.5 * width for _, finer in self.sizes].index(True)
 

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from jaxcloseup.app import progress
+from jaxcloseup.app.run.photograph_sizes import finest_read
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.detail import residuals
 from jaxcloseup.detail.residuals import Residuals
@@ -19,7 +20,8 @@ from jaxcloseup.photos.pyramids import Pyramid
 from jaxcloseup.training.state import TrainState
 
 
-# How many times finer than reduced photographs a state is rendered; for finer ones it is enlarged.
+# How many times finer than reduced photographs a state is rendered at least, and as fine as steps
+# read photographs; for finer ones the render is enlarged.
 FINER = 4
 FINER_RAYS = 1  # the same for fields that render single rays, and so whole images slowly
 
@@ -29,11 +31,12 @@ def render_residuals(
 ) -> Residuals:
     """Render photographs' views, and subtract the renders from the photographs at every level.
 
-    The levels go up to `FINER` (or `FINER_RAYS`) times the reduced photographs' size. `views` are
-    indices of photographs, all by default.
+    Renders are as fine as the photographs that steps read: what is finer, the state has not
+    learned. `views` are indices of photographs, all by default.
     """
     scene = programs.scene
-    most = FINER_RAYS if programs.method.renders_pixels else FINER
+    read = scene.metadata.get("downscale", 1) / finest_read(programs.preset, scene)
+    most = FINER_RAYS if programs.method.renders_pixels else max(FINER, read)
     return residuals.render_residuals(
         lambda camera: programs.render(state, camera),
         scene.train.cameras,
