@@ -1,6 +1,6 @@
 """Learn how far to trust the detail of photographs, from the true close-ups of runs.
 
-The suite reads the stage `control` of every run in `outputs/teach`, of two scenes or more, and
+The suite reads the stage `baseline` of every run in `outputs/teach`, of two scenes or more, and
 writes `outputs/teach/detail_weights.npz`, as the package's `jaxcloseup/detail/weights.npz` was
 made. It compares the detail of photographs in each held-out view with the truth. Small networks,
 each without one scene, learn how much detail to add and the error that remains. Each is tested on
@@ -33,7 +33,7 @@ from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.views import Views, camera_at, to_float
 
 
-FOLDER, STAGE = pathlib.Path("outputs/teach"), "control"
+FOLDER, STAGE = pathlib.Path("outputs/teach"), "baseline"
 
 
 def run(folder: pathlib.Path = FOLDER) -> None:
@@ -70,19 +70,19 @@ def run_evidence(folder: pathlib.Path) -> tuple[str, list[Evidence]]:
         told = make_evidence(found, own, jnp.asarray(views.weight[index]))
         return sample_evidence(told, PIXELS // len(views), seed=index)
 
-    kinds = _held_out(scene, _FINER)
+    kinds = _held_out(scene)
     return scene.name, [evidence(views, i) for views in kinds for i in range(len(views))]
 
 
-_FINER = 4  # divisor of the photographs' size of the finer views among those that teach
+_FINER = 4, 1  # divisors of the photographs' size of the finer views among those that teach
 
 
-def _held_out(scene: Scene, finer: int | None) -> Iterator[Views]:
+def _held_out(scene: Scene) -> Iterator[Views]:
     for split in ("test", "test_far"):
         if getattr(scene, split) is not None:
             yield getattr(scene, split)
-            if finer is not None and scene.photographs_at:
-                yield scene.photographs_at(finer, split)[0]
+            if scene.photographs_at:
+                yield from (scene.photographs_at(divisor, split)[0] for divisor in _FINER)
 
 
 def _describe(weights: DetailWeights, views: Sequence[Evidence]) -> str:
