@@ -9,27 +9,27 @@ from jaxcloseup.photos.scene import Scene
 
 # Seconds of a step, or of a whole part, of a default run of `table` on two cores.
 _STEP = {
-    "coarse_baseline": 0.044,
-    "baseline": 0.1,
-    "control": 0.1,
-    "closeup": 0.2,
-    "test_time_control": 0.1,
-    "test_time": 0.2,
+    "coarse_baseline": 0.014,
+    "baseline": 0.04,
+    "control": 0.05,
+    "closeup": 0.16,
+    "test_time_control": 0.05,
+    "test_time": 0.09,
 }
 _PART = {
-    "refine_baseline": 11,
-    "depths": 30,
-    "gate": 5,
+    "refine_baseline": 9,
+    "depths": 27,
+    "gate": 3,
     "closeup_labels": 30,
-    "detail": 46,
+    "detail": 20,
     "test_time_labels": 2,
-    "audit": 10,
-    "dolly": 10,
-    "report": 4,
-    "baseline_evaluation": 10,
-    "detail_evaluation": 15,
+    "audit": 5,
+    "dolly": 11,
+    "report": 6,
+    "baseline_evaluation": 13,
+    "detail_evaluation": 20,
 }
-_EVALUATION = 3.5  # seconds of any other
+_EVALUATION = 10  # seconds of any other
 _RAYS = 8  # times as long for images of a field that renders single rays
 _WORDS = {
     "depths": "rendering depths of the photographs, and what is scored",
