@@ -74,7 +74,7 @@ def _rings(height: int, width: int) -> tuple[int, np.ndarray, np.ndarray]:
     down, right = np.meshgrid(np.fft.fftfreq(height), np.fft.rfftfreq(width), indexing="ij")
     # What is finer than half a period in a pixel, diagonally, belongs to the last ring.
     which = np.minimum((np.hypot(down, right) * 2 * rings).astype(np.int32), rings - 1)
-    # Of a real image's frequencies only half are computed; each stands for its opposite too.
+    # Only half of a real image's frequencies are computed: each stands for its opposite too.
     times = np.where((right == 0) | (right == 0.5), 1, 2).astype(np.float32)
     return rings, which.reshape(-1), times
 

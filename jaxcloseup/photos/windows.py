@@ -49,8 +49,8 @@ class Windows:
 def photograph_windows(cameras: Camera, pyramid: Pyramid, *, whole_share: float) -> Windows:
     """Make windows of which a share is whole photographs of the coarsest level.
 
-    Photographs of several sizes have windows of the size that all have in common there. Of the
-    other levels, each is three times as likely as the next coarser one: it shows more.
+    If photographs differ in size, windows have the size that all have in common there. Each of the
+    other levels is three times as likely as the next coarser one, because it shows more.
 
     Args:
       cameras: stacked cameras of the coarsest level.

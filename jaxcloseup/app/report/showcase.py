@@ -71,13 +71,11 @@ def exhibits(
         depth = render_depth(target.camera)
         view = int(nearest(target.camera, sources.views, sources.depths, depth=depth))
         photograph = photographs.camera(camera_at(sources.views.cameras, view), view, 0)
-        height, width = target.weight.shape
-        camera = target.camera.replace(height=height, width=width)  # without padding
-        place = find_place(camera, depth[:height, :width], photograph)
+        place = find_place(target.camera, depth, photograph)
         cutout, pixel = None, float("nan")
         if place is not None:
             pixel = 1 / _scale(place)
-            cutout = cut_out(photographs, view, place, camera)
+            cutout = cut_out(photographs, view, place, target.camera)
         render, truth = to_uint8(renders[name]), to_uint8(np.asarray(target.rgb))
         shown.append(Exhibit(name, psnr[name], render, truth, names[view], cutout, pixel))
     return shown

@@ -46,9 +46,11 @@ def fit_minutes(preset: Preset, scene: Scene, minutes: float) -> tuple[Preset, l
 def _schedules(preset: Preset, steps: int) -> list[str]:
     """Return the settings that stretch schedules of learning rates to a number of steps."""
     share = steps / preset.baseline_steps
-    names = [name for name in settings_of(preset) if name in ("means_lr_steps", "lr_decay_steps")]
-    values = {name: settings_of(preset)[name].value for name in names}
-    return [f"{name}={max(1, round(share * value))}" for name, value in values.items()]
+    return [
+        f"{name}={max(1, round(share * schedule.value))}"
+        for name, schedule in settings_of(preset).items()
+        if name in ("means_lr_steps", "lr_decay_steps")
+    ]
 
 
 def _time_steps(preset: Preset, scene: Scene) -> tuple[float, float]:

@@ -48,8 +48,7 @@ def approach(
     view = int(jax.jit(best_source)(camera, sources.views, sources.depths, depth=depth))
     # The lens of the close-up gives all frames one shape, so nothing is compiled for them.
     start = camera.replace(camtoworld=sources.views.cameras.camtoworld[view])
-    height, width = target.weight.shape  # without padding
-    row, column = height // 2, width // 2
+    row, column = camera.height // 2, camera.width // 2
     middle = pixels_to_points(camera, jnp.array([column + 0.5, row + 0.5]), depth[row, column])
     pixel, distance = points_to_pixels(start, middle)
     if not (depth[row, column] > 0 and distance > 0):
@@ -64,7 +63,7 @@ def approach(
     )
 
     def frame(camera: Camera) -> np.ndarray:
-        return to_uint8(np.asarray(render(camera).rgb)[:height, :width])
+        return to_uint8(render(camera).rgb)
 
     cameras = [camera for _, camera in named_cameras(shots)]
     return list(progress.each(frame, cameras, "frames"))

@@ -114,18 +114,18 @@ def draw_pictures(
     depth = label_depth(seen, near=0, far=scene.far)
     near, far = limits or depth_range([depth], scene)
     solid = np.asarray(seen.alpha) >= SOLID
-    depth_colors = colorize_depth(np.asarray(seen.depth), near=near, far=far, valid=solid)
+    depth_colors = colorize_depth(seen.depth, near=near, far=far, valid=solid)
     images: dict[str, Image] = {"rgb": np.asarray(seen.rgb), "depth": depth_colors}
     if seen.normal is not None:
-        images["normals"] = colorize_normals(np.where(solid[..., None], np.asarray(seen.normal), 0))
+        images["normals"] = colorize_normals(np.where(solid[..., None], seen.normal, 0))
     if sources is not None:
         pixels = pixel_grid(camera.height, camera.width)
         support = _support(camera, pixels, depth, sources.views, sources.depths)
-        images["support"] = colorize_support(*map(np.asarray, support))
+        images["support"] = colorize_support(*support)
     if detail is not None:
         sharper = detailed(programs, detail, camera, seen)
         images |= {"rgb": np.asarray(sharper.rgb), "trust": np.asarray(sharper.weight)}
-        images["error"] = colorize_expected_error(np.asarray(sharper.error))
+        images["error"] = colorize_expected_error(sharper.error)
     return images
 
 
