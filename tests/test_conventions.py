@@ -110,6 +110,7 @@ EXCEPTIONS = {
     "pull_back": "arithmetic of a compositor's inner loop takes one value after another",
     "mean_divergence": "a supervision is what it is a method of",
     "rendered_loss": "arguments in the order of RadianceField.render, whose key comes last",
+    "rendered_gradient": "as rendered_loss",
 }
 
 

@@ -66,9 +66,32 @@ def rendered_loss(
     Returns:
       The loss and its metrics, from `judge`.
     """
-    if chunk is None or batch.pixels is None or len(batch.pixels) <= chunk:
+    if chunk is None or _is_one_chunk(chunk, batch):
         return _at_once(field, params, buffers, batch, key)
     return _chunked(field, chunk, sequential, params, buffers, batch, key)
+
+
+def rendered_gradient(
+    params: Any,
+    buffers: Any,
+    batch: Batch,
+    key: jax.Array | None,
+    *,
+    field: RadianceField,
+    chunk: int | None = None,
+    sequential: bool = False,
+) -> tuple[Loss, Any]:
+    """Return `rendered_loss` and its gradient by `params`, without another pass of JAX over it.
+
+    Outside `jax.jit`, `jax.value_and_grad` would trace the loss in every step.
+    """
+    if chunk is None or _is_one_chunk(chunk, batch):
+        return _at_once_forward(field, params, buffers, batch, key)
+    return _chunked_forward(field, chunk, sequential, params, buffers, batch, key)
+
+
+def _is_one_chunk(chunk: int, batch: Batch) -> bool:
+    return batch.pixels is None or len(batch.pixels) <= chunk
 
 
 def _plain(

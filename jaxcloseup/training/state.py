@@ -23,12 +23,12 @@ class DrawLoss(NamedTuple):
 
     Attributes:
       draw: `(keys, data) -> drawn`, draws at random what the step looks at.
-      loss: `(params, buffers, drawn) -> loss, metrics`.
+      gradient: `(params, buffers, drawn) -> (loss, metrics), gradients` by the parameters.
       cameras: `(drawn) -> cameras`, all that the loss renders.
     """
 
     draw: Callable[[DrawKeys, Any], Any]
-    loss: Callable[[Any, Any, Any], tuple[jax.Array, Metrics]]
+    gradient: Callable[[Any, Any, Any], tuple[tuple[jax.Array, Metrics], Any]]
     cameras: Callable[[Any], tuple[Camera, ...]]
 
 
@@ -107,29 +107,20 @@ def update_state(
     if local and field.local is not None:
         drawn = of_draw.draw(keys, data)
         part, place = field.local.take(state, of_draw.cameras(drawn))
-        (value, metrics), gradients = _differentiate(of_draw, part.params, part.buffers, drawn)
+        (value, metrics), gradients = of_draw.gradient(part.params, part.buffers, drawn)
         part, skipped = advance(part, key_adapt, value, gradients, scale, adapt=field.local.adapt)
         after = field.local.put(key_adapt, state, part, place)
         return after, {"loss": value, "skipped": skipped} | metrics
 
     def gradient(keys: DrawKeys, shared: tuple[Any, Any, Any]) -> Any:
         params, buffers, data = shared
-        return _differentiate(of_draw, params, buffers, of_draw.draw(keys, data))
+        return of_draw.gradient(params, buffers, of_draw.draw(keys, data))
 
     shared = state.params, state.buffers, data
     found = spread(gradient, keys, shared) if draws > 1 else gradient(keys, shared)
     (value, metrics), gradients = found
     after, skipped = advance(state, key_adapt, value, gradients, scale, adapt=field.adapt)
     return after, {"loss": value, "skipped": skipped} | metrics
-
-
-def _differentiate(of_draw: DrawLoss, params: Any, buffers: Any, drawn: Any) -> Any:
-    """Return the loss with its metrics, and its gradient by the parameters."""
-
-    def of_params(params: Any) -> tuple[jax.Array, Metrics]:
-        return of_draw.loss(params, buffers, drawn)
-
-    return jax.value_and_grad(of_params, has_aux=True)(params)
 
 
 # Compiled by itself for fields that render whole images: all kinds of steps share it.

@@ -20,7 +20,7 @@ from jaxcloseup.labels.rules import LABEL_RULES, add_label_loss
 from jaxcloseup.photos.views import Batch, Views
 from jaxcloseup.photos.windows import Windows
 from jaxcloseup.training.config import TrainConfig
-from jaxcloseup.training.loss import Loss, rendered_loss
+from jaxcloseup.training.loss import Loss, rendered_gradient, rendered_loss
 from jaxcloseup.training.parallel import Spread, in_a_loop
 from jaxcloseup.training.sampling import DrawKeys, sample_batch, sample_closeup, sample_labels
 from jaxcloseup.training.state import DrawLoss, Metrics, TrainState, update_state
@@ -70,15 +70,17 @@ def train_step(
 
 def _photograph_loss(field: RadianceField, config: TrainConfig, sequential: bool) -> DrawLoss:
     """Return the loss of one draw of `train_step`."""
-    loss_of = _bind_loss(field, sequential=sequential)
+    gradient_of = functools.partial(
+        rendered_gradient, field=field, chunk=field.gradient_chunk, sequential=sequential
+    )
 
     def draw(keys: DrawKeys, views: Views | Windows) -> Any:
         return sample_batch(keys.batch, views, config.num_rays), keys.render
 
-    def loss(params: Any, buffers: Any, drawn: Any) -> Loss:
-        return loss_of(params, buffers, *drawn)
+    def gradient(params: Any, buffers: Any, drawn: Any) -> tuple[Loss, Any]:
+        return gradient_of(params, buffers, *drawn)
 
-    return DrawLoss(draw, loss, lambda drawn: (drawn[0].cameras,))
+    return DrawLoss(draw, gradient, lambda drawn: (drawn[0].cameras,))
 
 
 def pseudo_step(
@@ -179,7 +181,8 @@ def _closeup_loss(field: RadianceField, config: TrainConfig, sequential: bool) -
         )
         return value, metrics | {"label_coverage": jnp.mean(label.weight)}
 
-    return DrawLoss(draw, loss, lambda drawn: (drawn[0].cameras, drawn[2].camera))
+    gradient = jax.value_and_grad(loss, has_aux=True)
+    return DrawLoss(draw, gradient, lambda drawn: (drawn[0].cameras, drawn[2].camera))
 
 
 def labeled_step(
@@ -244,7 +247,8 @@ def _labeled_loss(field: RadianceField, config: TrainConfig, sequential: bool) -
             settings.label_loss_weight,
         )
 
-    return DrawLoss(draw, loss, lambda drawn: (drawn[0][0].cameras, drawn[1][0].cameras))
+    gradient = jax.value_and_grad(loss, has_aux=True)
+    return DrawLoss(draw, gradient, lambda drawn: (drawn[0][0].cameras, drawn[1][0].cameras))
 
 
 def run_steps(

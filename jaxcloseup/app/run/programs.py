@@ -9,7 +9,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
@@ -270,14 +269,13 @@ def _run_in_parts(
 
     Compiling the rendering of an image, with its derivative, takes as long as hundreds of steps.
     """
-    total: Any = None
+    metrics = []
     for i in range(count):
         # Two threads would compile the same parts, so the first step takes one.
-        state, metrics = step(state, spread=in_threads(progress.workers() if i else 1))
+        state, measured = step(state, spread=in_threads(progress.workers() if i else 1))
         # No step begins before the last one ends: what waits would hold memory.
-        total = metrics if total is None else jax.tree.map(jnp.add, total, metrics)
-        jax.block_until_ready(total)
-    return state, jax.tree.map(lambda leaf: leaf / count, total)
+        metrics.append(jax.block_until_ready(measured))
+    return state, jax.tree.map(lambda *values: np.mean(values, axis=0), *metrics)
 
 
 def _checked(metrics: dict[str, Any], count: int) -> dict[str, Any]:

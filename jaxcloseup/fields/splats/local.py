@@ -63,14 +63,20 @@ def local_steps(
         return None
     chunks = capacity // rows
 
-    def take(state: Any, cameras: tuple[Camera, ...]) -> tuple[Any, jax.Array]:
+    def take(state: Any, cameras: tuple[Camera, ...]) -> tuple[Any, jax.Array | None]:
         place, count = _find(state.buffers.bounds, cameras, near=near)
-        return _take(state, place[: _part_size(int(count), chunks)], rows=rows)
+        size = _part_size(int(count), chunks)
+        if size == chunks:  # all, in their places
+            return _without_bounds(state), None
+        return _take(state, place[:size], rows=rows)
 
-    def put(key: jax.Array, state: Any, part: Any, place: jax.Array) -> Any:
-        state = _put(state, part, place, rows=rows)
+    def put(key: jax.Array, state: Any, part: Any, place: jax.Array | None) -> Any:
+        # Of the state before: that of the part is not known until it is computed.
+        due = is_due(int(state.step) + 1)
+        whole = place is None
+        state = _bounded(part, rows=rows) if whole else _put(state, part, place, rows=rows)
         # Surfels that moved far are sorted anew, or their chunks would be in sight everywhere.
-        return _prepare(adapt_all(key, state), rows=rows) if is_due(int(state.step)) else state
+        return _prepare(adapt_all(key, state), rows=rows) if due else state
 
     return Local(
         prepare=functools.partial(_prepare, rows=rows),
@@ -82,11 +88,14 @@ def local_steps(
 
 
 def _part_size(needed: int, chunks: int) -> int:
-    """Return the number of chunks of a part: few sizes are compiled."""
+    """Return the number of chunks of a part: few sizes are compiled.
+
+    Moving more than half of all takes longer than testing the others.
+    """
     size = _FEWEST
     while size < needed:
         size *= _STEP
-    return min(size, chunks)
+    return size if 2 * size <= chunks else chunks
 
 
 @functools.partial(jax.jit, static_argnames="rows")
@@ -96,7 +105,16 @@ def _prepare(state: Any, *, rows: int) -> Any:
     state = _map_rows(lambda leaf: leaf[order], state)
     number = jnp.sum(state.buffers.alive, dtype=jnp.float32)
     state = state.replace(buffers=state.buffers.replace(number=number))
+    return _bounded(state, rows=rows)
+
+
+@functools.partial(jax.jit, static_argnames="rows")
+def _bounded(state: Any, *, rows: int) -> Any:
     return state.replace(buffers=state.buffers.replace(bounds=_bounds_of(state, rows)))
+
+
+def _without_bounds(state: Any) -> Any:
+    return state.replace(buffers=state.buffers.replace(bounds=None))
 
 
 @functools.partial(jax.jit, static_argnames="near")
@@ -138,8 +156,7 @@ def _take(state: Any, place: jax.Array, *, rows: int) -> tuple[Any, jax.Array]:
         chunks = leaf.reshape(-1, rows, *leaf.shape[1:])
         return chunks.at[place].get(mode="fill", fill_value=0).reshape(-1, *leaf.shape[1:])
 
-    part = _map_rows(pick, state)
-    return part.replace(buffers=part.buffers.replace(bounds=None)), place
+    return _without_bounds(_map_rows(pick, state)), place
 
 
 @functools.partial(jax.jit, static_argnames="rows", donate_argnums=0)
@@ -158,8 +175,7 @@ def _put(state: Any, part: Any, place: jax.Array, *, rows: int) -> Any:
         shape = (-1, rows, *old.shape[1:])
         return old.reshape(shape).at[place].set(new.reshape(shape), mode="drop").reshape(old.shape)
 
-    old = state.replace(buffers=state.buffers.replace(bounds=None))
-    after = jax.tree.map(into, old, part)
+    after = jax.tree.map(into, _without_bounds(state), part)
     return after.replace(buffers=after.buffers.replace(bounds=bounds))
 
 
