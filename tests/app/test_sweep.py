@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 
+import constant_color
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +23,7 @@ from tiny_runs import TINY, TINY_MIP, TINY_SURFELS
 from tiny_training import assert_same_step
 
 from jaxcloseup.app.cli import sweep
+from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.report.pictures import comparisons
 from jaxcloseup.app.report.sweep_tables import paired_bootstrap, rows, write_sweep
 from jaxcloseup.app.run.keys import run_keys
@@ -265,9 +267,22 @@ jax.distributed.initialize("127.0.0.1:" + sys.argv[2], 2, int(sys.argv[3]))
 assert len(jax.devices()) == 2 * len(jax.local_devices())
 folder = pathlib.Path(sys.argv[1])
 scene = test_sweep.load_scene(str(folder / "capture"))
-found = test_sweep.sweep_tiny(scene, folder / "sweep", ("control", "diverse"), 1).scores
+found = test_sweep.sweep_colors(scene, folder / "sweep")
 (folder / ("host" + sys.argv[3] + ".json")).write_text(json.dumps(found))
 """
+
+
+def sweep_colors(scene, folder):
+    """Scores of two arms of a method that compiles in seconds."""
+    METHODS["constant_color"] = constant_color.METHOD
+    names = {"method": "constant_color", "preset": "quick"}
+    arms = "control", "diverse"
+    try:
+        with jax.numpy_dtype_promotion("standard"):
+            preset = constant_color.METHOD.presets["quick"]
+            return run_sweep(scene, preset, arms, 1, folder, names=names, max_parallel=3).scores
+    finally:
+        del METHODS["constant_color"]
 
 
 def start(script, *arguments):
@@ -300,7 +315,7 @@ def test_arms_are_spread_over_hosts(capture_folder, tmp_path):
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     scene = load_scene(str(capture_folder))
-    whole = sweep_tiny(scene, tmp_path / "alone", ("control", "diverse"), 1).scores
+    whole = sweep_colors(scene, tmp_path / "alone")
     for process in [start(HOSTS, tmp_path, port, i) for i in range(2)]:
         finish(process)
     hosts = [json.loads((tmp_path / f"host{i}.json").read_text()) for i in range(2)]

@@ -51,18 +51,11 @@ def point_depth_error(depth: np.ndarray, landmarks: Landmarks) -> dict[str, floa
       depth: `[H, W]` rendered z-depth.
       landmarks: visible points; without any, both metrics are NaN.
     """
-    if not len(landmarks.depth):
-        return {"point_depth_error_median": np.nan, "point_depth_error_p90": np.nan}
     rendered = np.asarray(depth)[landmarks.row, landmarks.column]
-    error = np.abs(rendered - landmarks.depth) / landmarks.depth
-    return {
-        "point_depth_error_median": float(np.median(error)),
-        "point_depth_error_p90": float(np.percentile(error, 90)),
-    }
+    return _summarize("point_depth_error", np.abs(rendered - landmarks.depth) / landmarks.depth)
 
 
-@jax.jit
-def surface_error(camera: Camera, rendering: Rendering, surface: Surface) -> dict[str, jax.Array]:
+def surface_error(camera: Camera, rendering: Rendering, surface: Surface) -> dict[str, float]:
     """Return median and 90th percentile of relative depth errors and of normal errors in degrees.
 
     Fields that render no normals are scored on the normals of their rendered depth. Pixels without
@@ -73,6 +66,20 @@ def surface_error(camera: Camera, rendering: Rendering, surface: Surface) -> dic
       rendering: what the field renders, `[H, W]`.
       surface: the exact surface, `[H, W]`.
     """
+    depth_error, normal_error = map(np.asarray, _errors(camera, rendering, surface))
+    # XLA sorts ten times slower on a CPU.
+    depth, normal = (error[~np.isnan(error)] for error in (depth_error, normal_error))
+    return _summarize("depth_error", depth) | _summarize("normal_error", normal)
+
+
+def _summarize(name: str, error: np.ndarray) -> dict[str, float]:
+    middle, most = np.percentile(error, [50, 90]) if error.size else (np.nan, np.nan)
+    return {f"{name}_median": float(middle), f"{name}_p90": float(most)}
+
+
+@jax.jit
+def _errors(camera: Camera, rendering: Rendering, surface: Surface) -> tuple[jax.Array, jax.Array]:
+    """Return relative errors of depth and errors of normals in degrees; NaN is undefined."""
     normal = rendering.normal
     if normal is None:
         normal = depth_to_normal(camera, rendering.depth)
@@ -81,10 +88,4 @@ def surface_error(camera: Camera, rendering: Rendering, surface: Surface) -> dic
     hit = surface.depth > 0
     angle = jnp.where(hit & (length > 0), jnp.rad2deg(jnp.arccos(jnp.clip(cosine, -1, 1))), jnp.nan)
     error = jnp.abs(rendering.depth - surface.depth) / jnp.where(hit, surface.depth, 1)
-    error = jnp.where(hit, error, jnp.nan)
-    return {
-        "depth_error_median": jnp.nanmedian(error),
-        "depth_error_p90": jnp.nanpercentile(error, 90.0),
-        "normal_error_median": jnp.nanmedian(angle),
-        "normal_error_p90": jnp.nanpercentile(angle, 90.0),
-    }
+    return jnp.where(hit, error, jnp.nan), angle
