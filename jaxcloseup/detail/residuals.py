@@ -16,11 +16,14 @@ from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.geometry.numerics import matmul
 from jaxcloseup.labels.rules import label_depth
 from jaxcloseup.metrics.image_metrics import change_colors, fit_colors
-from jaxcloseup.photos.depth_maps import gather_sources
+from jaxcloseup.photos.depth_maps import GatherSources, gather_sources
 from jaxcloseup.photos.pyramids import Pyramid
 from jaxcloseup.photos.views import Views, camera_at, to_float
 
 
+# How many times finer than the photographs that the model learned from their depth maps are, if
+# their renders are as fine.
+FINER_DEPTHS = 4
 MISFIT = 4  # times the median error, where a photograph has a quarter of its trust
 COLOR_RIDGE = 0.01  # regularizes the affine map of a photograph's colors, see `fit_colors`
 _BLUR = 1.5  # standard deviation in pixels of errors that lower trust
@@ -31,10 +34,12 @@ class Residuals(NamedTuple):
 
     Attributes:
       shown: int8 `[V, P, 6]`, see `Detail`.
-      depths: `[V, H, W]` rendered z-depths at the coarsest level, 0 where undefined.
+      cameras: stacked cameras of the depths.
+      depths: `[V, H, W]` rendered z-depths, 0 where undefined.
     """
 
     shown: Pyramid
+    cameras: Camera
     depths: jax.Array
 
 
@@ -57,10 +62,16 @@ def make_detail(
       near: smallest z-depth of a surface, world units.
       far: largest one.
     """
-    shown, depths = render_residuals(render, views.cameras, pyramid, near=near, far=far)
-    sources = gather_sources(views.cameras, depths, views.weight * reproduced(shown))
+    found = render_residuals(render, views.cameras, pyramid, near=near, far=far)
+    sources = trusted_depths(found, views.weight * reproduced(found.shown))
     finer = jnp.float32(np.log2(pyramid.sizes[0][1] / views.cameras.width))
-    return Detail(shown, sources, weights, finer)
+    return Detail(found.shown, sources, weights, finer)
+
+
+def trusted_depths(found: Residuals, trust: jax.Array) -> GatherSources:
+    """Return the depth maps of photographs with a trust `[V, H, W]` of any size in [0, 1]."""
+    enlarged = jax.image.resize(trust, found.depths.shape, "linear")
+    return gather_sources(found.cameras, found.depths, enlarged)
 
 
 def render_residuals(
@@ -93,9 +104,10 @@ def render_residuals(
     last = len(pyramid.sizes) - 1
     chosen = range(pyramid.values.shape[0]) if chosen is None else chosen
     values = np.empty((len(chosen), pyramid.values.shape[1], 6), np.int8)
+    depth_level = max(rendered, pyramid.level_near(FINER_DEPTHS * cameras.width))
 
     def compare(view: int) -> tuple[list[tuple[int, np.ndarray]], jax.Array]:
-        """Return the residual of each level, the coarsest first, and the coarsest one's depth."""
+        """Return the residual of each level, the coarsest first, and the depth at one."""
         levels = []
         for level in range(last, -1, -1):
             camera = pyramid.camera(camera_at(cameras, view), view, level)
@@ -109,6 +121,7 @@ def render_residuals(
             if level == last:
                 # The model reproduces the exposure best at the size that it learned from.
                 colors = _match(photograph, rendering.rgb, rendering.alpha)
+            if level == depth_level:
                 depth = label_depth(rendering, near=near, far=far)
             levels.append((level, np.asarray(_subtract(photograph, rgb, colors))))
         return levels, depth
@@ -118,8 +131,10 @@ def render_residuals(
         depths.append(depth)
         for level, both in levels:
             row[pyramid.pixels_of(level)] = both.reshape(-1, 6)
-    intrinsics = pyramid.intrinsics[np.asarray(chosen)]
-    return Residuals(Pyramid(jnp.asarray(values), intrinsics, pyramid.sizes), jnp.stack(depths))
+    rows = np.asarray(chosen)
+    shown = Pyramid(jnp.asarray(values), pyramid.intrinsics[rows], pyramid.sizes)
+    cameras = shown.camera(jax.tree.map(lambda leaf: leaf[rows], cameras), slice(None), depth_level)
+    return Residuals(shown, cameras, jnp.stack(depths))
 
 
 def reproduced(shown: Pyramid, *, blur: Callable[[Any, float], Any] = blur_images) -> jax.Array:

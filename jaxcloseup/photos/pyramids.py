@@ -74,8 +74,11 @@ class Pyramid:
         height, width = map(int, extent)
         return width, height
 
-    def camera(self, camera: Camera, view: int, index: int) -> Camera:
-        """Return the camera of one view's image at one level, given any camera with its pose."""
+    def camera(self, camera: Camera, view: int | slice, index: int) -> Camera:
+        """Return the camera of one view's image at one level, given any camera with its pose.
+
+        Also stacked cameras of several views.
+        """
         height, width = self.sizes[index]
         intrinsics = self.intrinsics[view, index]
         return camera.replace(intrinsics=intrinsics, height=height, width=width)

@@ -50,7 +50,7 @@ def photograph_windows(cameras: Camera, pyramid: Pyramid, *, whole_share: float)
     """Make windows of which a share is whole photographs of the coarsest level.
 
     If photographs differ in size, windows have the size that all have in common there. Each of the
-    other levels is three times as likely as the next coarser one, because it shows more.
+    other levels is four times as likely as the next coarser one, because it shows more.
 
     Args:
       cameras: stacked cameras of the coarsest level.
@@ -58,7 +58,7 @@ def photograph_windows(cameras: Camera, pyramid: Pyramid, *, whole_share: float)
       whole_share: in [0, 1].
     """
     finer = len(pyramid.sizes) - 1
-    often = [3.0**-level for level in range(finer)]
+    often = [4.0**-level for level in range(finer)]
     shares = [(1 - whole_share) * times / sum(often) for times in often]
     shares = [*shares, whole_share] if finer else [1.0]
     if pyramid.extents is not None:

@@ -112,11 +112,11 @@ def test_nothing_is_computed_on_padding(scene, key):
     counted.clear()
     pyramid, divisor = scene_pyramid(scene)
     assert divisor == 1 and pyramid.sizes == ((64, 64), (32, 32))
-    shown, depths = render_residuals(count, scene.train.cameras, pyramid, near=0.0, far=9.0)
+    found = render_residuals(count, scene.train.cameras, pyramid, near=0.0, far=9.0)
     assert sum(counted) == 5 * own
     for level, views in enumerate((finer[0], scene.train)):
         padded = np.asarray(views.weight) == 0
-        assert padded.any() and not np.asarray(shown.level(level))[padded].any()
+        assert padded.any() and not np.asarray(found.shown.level(level))[padded].any()
 
     windows = photograph_windows(scene.train.cameras, pyramid, whole_share=0.5)
     assert windows.size == (24, 24)  # what both have in common

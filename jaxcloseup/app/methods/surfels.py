@@ -97,7 +97,7 @@ QUICK = dataclasses.replace(
         sh_every=1,
         regularize_from=1,
         means_lr=(4e-4, 1.6e-5),
-        means_lr_steps=6800,
+        means_lr_steps=6300,
         sh_lr=7.5e-3,
         scale_lr=1.5e-2,
         color_ridge=0.1,
@@ -110,9 +110,9 @@ QUICK = dataclasses.replace(
         raster=RasterizeConfig(capacity=2**17, antialias=True),
     ),
     coarse=CoarseConfig(field=_COARSE, steps=1500),
-    windows=WindowConfig(whole_share=0.05),
+    windows=WindowConfig(whole_share=0.03),
     targets=TargetConfig("residual", label_loss_weight=0.7, lr_scale=10.0, control_lr_scale=2.0),
-    baseline_steps=7000,
+    baseline_steps=6500,
     downscale=None,
 )
 

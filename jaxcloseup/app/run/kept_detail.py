@@ -22,18 +22,19 @@ from jaxcloseup.app.run.photograph_sizes import describe_photographs
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.residuals import render_residuals, reproduced
 from jaxcloseup.detail.add import Detail, Detailed, add_to_rendering, label_with_detail
+from jaxcloseup.detail.residuals import Residuals, trusted_depths
 from jaxcloseup.detail.weights import DetailWeights, known_weights
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.io.cache import Stored, cached
-from jaxcloseup.photos.depth_maps import GatherSources, gather_sources
+from jaxcloseup.photos.depth_maps import GatherSources
 from jaxcloseup.photos.pyramids import Pyramid
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.views import Views
 from jaxcloseup.training.state import TrainState
 
 
-_RECIPE = 10  # a change of how detail is made raises it, so that kept detail is made again
+_RECIPE = 11  # a change of how detail is made raises it, so that kept detail is made again
 
 
 def detailed(programs: Programs, detail: Detail, camera: Camera, rendering: Rendering) -> Detailed:
@@ -96,9 +97,9 @@ def make_detail(programs: Programs, state: TrainState) -> tuple[Detail, dict[str
     scene = programs.scene
     pyramid, divisor = programs.pyramid()
     print(f"   detail of {describe_photographs(pyramid, divisor)}", flush=True)
-    shown, depths = render_residuals(programs, state, pyramid)
+    found = render_residuals(programs, state, pyramid)
     finer = jnp.float32(np.log2(pyramid.sizes[0][1] / scene.train.cameras.width))
-    detail = Detail(shown, _sources(scene.train, shown, depths), _weights(scene), finer)
+    detail = Detail(found.shown, _sources(scene.train, found), _weights(scene), finer)
     return detail, {"divisor": divisor, "sizes": list(map(list, pyramid.sizes))}
 
 
@@ -107,9 +108,8 @@ def _weights(scene: Scene) -> DetailWeights:
     return known_weights(scene.name if scene.surface else None)
 
 
-def _sources(views: Views, shown: Pyramid, depths: jax.Array) -> GatherSources:
-    trust = views.weight * reproduced(shown)
-    return jax.jit(gather_sources)(views.cameras, depths, trust)
+def _sources(views: Views, found: Residuals) -> GatherSources:
+    return jax.jit(trusted_depths)(found, views.weight * reproduced(found.shown))
 
 
 def refresh_detail(
@@ -120,9 +120,9 @@ def refresh_detail(
     The weights of `detail`, which is of the other state, stay.
     """
     pyramid, _ = programs.pyramid()
-    shown, depths = render_residuals(programs, state, pyramid, views)
+    found = render_residuals(programs, state, pyramid, views)
     chosen = jax.tree.map(lambda leaf: leaf[np.asarray(views)], programs.scene.train)
-    return dataclasses.replace(detail, shown=shown, sources=_sources(chosen, shown, depths))
+    return dataclasses.replace(detail, shown=found.shown, sources=_sources(chosen, found))
 
 
 def _hash(programs: Programs, state: TrainState) -> str:
@@ -151,8 +151,10 @@ def _unpack(scene: Scene, stored: Stored) -> tuple[Detail, dict[str, Any]]:
     about, cameras = stored.record, scene.train.cameras
     sizes = tuple((int(height), int(width)) for height, width in about["sizes"])
     _check(stored, sizes, cameras)
+    level = sizes.index(stored.arrays["trust"].shape[1:])
     arrays = {name: jnp.asarray(array) for name, array in stored.arrays.items()}
     shown = Pyramid(arrays["values"], arrays["intrinsics"], sizes)
+    cameras = shown.camera(cameras, slice(None), level)
     sources = GatherSources(cameras, arrays["inverse_depth"], arrays["trust"])
     return Detail(shown, sources, _weights(scene), arrays["finer"]), about
 
@@ -160,7 +162,7 @@ def _unpack(scene: Scene, stored: Stored) -> tuple[Detail, dict[str, Any]]:
 def _check(stored: Stored, sizes: tuple[tuple[int, int], ...], cameras: Camera) -> None:
     """Raise unless a file holds what `_pack` returns for these cameras."""
     count, pixels = cameras.intrinsics.shape[0], sum(height * width for height, width in sizes)
-    depths = (count, cameras.height, cameras.width)
+    depths = (count, *stored.arrays["trust"].shape[1:])
     expected = {
         "values": ((count, pixels, 6), np.dtype(np.int8)),
         "intrinsics": ((count, len(sizes), 4), np.dtype(np.float32)),
@@ -170,5 +172,7 @@ def _check(stored: Stored, sizes: tuple[tuple[int, int], ...], cameras: Camera) 
     }
     if {name: (array.shape, array.dtype) for name, array in stored.arrays.items()} != expected:
         raise ValueError("other arrays")
+    if depths[1:] not in sizes:
+        raise ValueError("depth maps of another size")
     if set(stored.record) != {"divisor", "sizes"}:
         raise ValueError("another record")
