@@ -99,7 +99,7 @@ def test_windows_cover_all_pixels_of_all_levels_with_the_stated_shares(windows, 
     corner = np.rint(own[:, 2:] - intrinsics[:, 2:]).astype(int)
     np.testing.assert_allclose(np.bincount(view) / count, 1 / 3, atol=0.015)
     np.testing.assert_allclose(
-        np.bincount(level) / count, [0.5625, 0.1875, WHOLE_SHARE], atol=0.015
+        np.bincount(level) / count, [0.6, 0.15, WHOLE_SHARE], atol=0.015
     )
     for index, (height, width) in enumerate(windows.pyramid.sizes):
         x, y = corner[level == index].T
@@ -116,7 +116,7 @@ def test_pixels_come_from_all_levels_with_the_stated_shares(windows, key):
     view = np.searchsorted([-0.5, 0.5], batch.cameras.position[:, 0])
     level = 2 - np.rint(np.log2(batch.cameras.intrinsics[:, 0] / 20)).astype(int)
     np.testing.assert_allclose(np.bincount(view) / count, 1 / 3, atol=0.01)
-    np.testing.assert_allclose(np.bincount(level) / count, [0.5625, 0.1875, WHOLE_SHARE], atol=0.01)
+    np.testing.assert_allclose(np.bincount(level) / count, [0.6, 0.15, WHOLE_SHARE], atol=0.01)
     own = np.asarray(windows.pyramid.intrinsics)[view, level]
     np.testing.assert_array_equal(batch.cameras.intrinsics, own)
     x, y = np.floor(batch.pixels).astype(int).T
