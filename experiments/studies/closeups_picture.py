@@ -1,10 +1,11 @@
-"""Picture docs/closeups_table.jpg: truth, a field of reduced photographs, default, with detail.
+"""Picture held-out close-ups of default runs: truth, the field alone, and with detail.
 
-    python -m experiments.studies.closeups_picture \\
-        --reduced=outputs/studies/reduced/table --default=outputs/studies/default/table
+    python -m experiments.studies.closeups_picture --runs=outputs/table
+    python -m experiments.studies.closeups_picture --output=docs/closeups_worst.jpg \\
+        --runs=outputs/bench,outputs/counter,...
 
-From above: the close-up in which the default gains most over the other run, the middle one, and
-the one in which it gains least.
+Of one run, from above: the close-up in which detail gains most, the middle one, and the one in
+which it gains least. Of several, the close-up of each that has the lowest PSNR with detail.
 """
 
 import pathlib
@@ -25,34 +26,37 @@ from jaxcloseup.io.files import read_object
 
 
 FLAGS = flags.FLAGS
+_STAGE = "control"
 
 
 def define_flags() -> None:
     """Define the flags of the script, whose names other scripts use too."""
-    flags.DEFINE_string("reduced", None, "folder of a run with --preset=reduced")
-    flags.DEFINE_string("default", None, "folder of a default run of the same scene")
-    flags.DEFINE_string("stage", "control", "stage of both runs to render")
+    flags.DEFINE_list("runs", None, "folders of default runs of drawn scenes")
     flags.DEFINE_string("output", "docs/closeups_table.jpg", "picture to write")
-    flags.DEFINE_integer("width", 398, "width of each panel in pixels", lower_bound=1)
-    flags.mark_flags_as_required(["reduced", "default"])
+    flags.DEFINE_integer("width", 480, "width of each panel in pixels", lower_bound=1)
+    flags.mark_flags_as_required(["runs"])
 
 
 def main(_: list[str]) -> None:
-    """Render three close-ups of both runs, and write the picture."""
-    folders = [pathlib.Path(folder) for folder in (FLAGS.reduced, FLAGS.default)]
-    before, after = (
-        read_object(folder / "results.json")["stages"][FLAGS.stage]["test"]["views"]
-        for folder in folders
-    )
-    gained = {name: after[name]["psnr"] - before[name]["psnr"] for name in after}
-    reduced, default = (open_run(folder, FLAGS.stage) for folder in folders)
+    """Render the close-ups, and write the picture."""
     rows = []
-    for name in best_middle_worst(gained):
-        camera = closeup_camera(default, name, FLAGS.width)
-        sharp = np.asarray(render_detailed(default, camera).rgb)
-        plain = [render_plain(run, camera) for run in (reduced, default)]
-        rows.append([render_truth(default, camera), *plain, sharp])
-    write_rows(FLAGS.output, rows, labels=None)
+    for folder in map(pathlib.Path, FLAGS.runs):
+        run = open_run(folder, _STAGE)
+        for name in _chosen(folder, one=len(FLAGS.runs) == 1):
+            camera = closeup_camera(run, name, FLAGS.width)
+            sharp = np.asarray(render_detailed(run, camera).rgb)
+            rows.append([render_truth(run, camera), render_plain(run, camera), sharp])
+    write_rows(FLAGS.output, rows, labels=["truth", "field", "with detail"])
+
+
+def _chosen(folder: pathlib.Path, *, one: bool) -> list[str]:
+    """Return the names of a run's close-ups to show, whether it is the only run or not."""
+    stages = read_object(folder / "results.json")["stages"]
+    field, detail = (stages[name]["test"]["views"] for name in (_STAGE, "detail"))
+    if not one:
+        return [min(detail, key=lambda name: detail[name]["psnr"])]
+    gained = {name: detail[name]["psnr"] - field[name]["psnr"] for name in detail}
+    return best_middle_worst(gained)
 
 
 if __name__ == "__main__":

@@ -87,10 +87,14 @@ def print_default(runs: Mapping[str, Results]) -> None:
             row = [f"{name}, {TITLES[split]}", pair(results, ["control"], split)]
             row += [f"**{pair(results, ['detail'], split)}**", format_gain(gained)]
             row += [f"{min(gained):+.2f}", pair(results, _BOTH, split, "cc_psnr")]
-            row += [pair(results, _BOTH, split, "ssim", 3), pair(results, _BOTH, split + REDUCED)]
+            row += [
+                pair(results, _BOTH, split, "resolves", 1),
+                pair(results, _BOTH, split, "ssim", 3),
+            ]
+            row.append(pair(results, _BOTH, split + REDUCED))
             rows.append(row)
     header = ["scene, views", "control", "with detail", "gain (95 %)", "worst view"]
-    header += ["color-corrected", "SSIM", "at the size of training"]
+    header += ["color-corrected", "resolves (px)", "SSIM", "at the size of training"]
     print_table("A default run", header, rows)
     for split, title in TITLES.items():
         drawn = [gains(runs[name], split, "detail", "control") for name in runs if name in SCENES]

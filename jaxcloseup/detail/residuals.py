@@ -23,7 +23,7 @@ from jaxcloseup.photos.views import Views, camera_at, to_float
 
 # How many times finer than the photographs that the model learned from their depth maps are, if
 # their renders are as fine.
-FINER_DEPTHS = 4
+FINER_DEPTHS = 2
 MISFIT = 4  # times the median error, where a photograph has a quarter of its trust
 COLOR_RIDGE = 0.01  # regularizes the affine map of a photograph's colors, see `fit_colors`
 _BLUR = 1.5  # standard deviation in pixels of errors that lower trust
@@ -102,11 +102,11 @@ def render_residuals(
       each: like `map`; may show progress.
     """
     last = len(pyramid.sizes) - 1
-    chosen = range(pyramid.values.shape[0]) if chosen is None else chosen
-    values = np.empty((len(chosen), pyramid.values.shape[1], 6), np.int8)
+    rows = np.arange(pyramid.values.shape[0]) if chosen is None else np.asarray(chosen)
+    values = np.empty((len(rows), pyramid.values.shape[1], 6), np.int8)
     depth_level = max(rendered, pyramid.level_near(FINER_DEPTHS * cameras.width))
 
-    def compare(view: int) -> tuple[list[tuple[int, np.ndarray]], jax.Array]:
+    def compare(view: int) -> tuple[list[np.ndarray], jax.Array]:
         """Return the residual of each level, the coarsest first, and the depth at one."""
         levels = []
         for level in range(last, -1, -1):
@@ -123,15 +123,13 @@ def render_residuals(
                 colors = _match(photograph, rendering.rgb, rendering.alpha)
             if level == depth_level:
                 depth = label_depth(rendering, near=near, far=far)
-            levels.append((level, np.asarray(_subtract(photograph, rgb, colors))))
+            levels.append(np.asarray(_subtract(photograph, rgb, colors)).reshape(-1, 6))
         return levels, depth
 
     depths = []
-    for row, (levels, depth) in zip(values, each(compare, chosen), strict=True):
+    for row, (levels, depth) in zip(values, each(compare, rows.tolist()), strict=True):
+        row[:] = np.concatenate(levels[::-1])
         depths.append(depth)
-        for level, both in levels:
-            row[pyramid.pixels_of(level)] = both.reshape(-1, 6)
-    rows = np.asarray(chosen)
     shown = Pyramid(jnp.asarray(values), pyramid.intrinsics[rows], pyramid.sizes)
     cameras = shown.camera(jax.tree.map(lambda leaf: leaf[rows], cameras), slice(None), depth_level)
     return Residuals(shown, cameras, jnp.stack(depths))

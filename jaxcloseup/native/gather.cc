@@ -65,17 +65,6 @@ LevelPair pair_levels(const float* of_levels, const int64_t* sizes, const std::v
   return pair;
 }
 
-// Interleaves a photograph's maps `[height, width]` and repeats their borders.
-void interleave(const float* inverse, const float* trust, const Job& job, float* to) {
-  for (int y = -1; y <= job.height; y++)
-    for (int x = -1; x <= job.width; x++) {
-      const size_t from =
-          size_t(std::clamp(y, 0, job.height - 1)) * job.width + std::clamp(x, 0, job.width - 1);
-      *to++ = inverse[from];
-      *to++ = trust[from];
-    }
-}
-
 // The view's camera, and its pixels in rows.
 struct View {
   const float *pose, *intrinsics, *pixels, *depth;
@@ -175,16 +164,16 @@ void write_block(const Job& job, const Scratch& scratch, bool gathered, const Fi
 }
 
 // Checks the shapes that memory accesses rely on, and describes the photographs.
-ffi::Error prepare(ffi::ThreadPool& pool, Floats& poses, Floats& intrinsics, Floats& inverse, Floats& trust,
+ffi::Error prepare(ffi::ThreadPool& pool, Floats& poses, Floats& intrinsics, Floats& maps,
                    ffi::AnyBuffer& values, Floats& of_levels, ffi::Span<const int64_t>& sizes,
                    ffi::Span<const float>& settings, int finest, Job& job, std::vector<Photograph>& photographs,
-                   std::vector<LevelPair>& pairs, std::vector<float>& maps) {
-  const auto map = inverse.dimensions(), shape = values.dimensions();
-  if (map.size() != 3 || shape.size() != 3) return ffi::Error::InvalidArgument("maps and values have three axes");
+                   std::vector<LevelPair>& pairs) {
+  const auto map = maps.dimensions(), shape = values.dimensions();
+  if (map.size() != 4 || map[3] != 2 || shape.size() != 3)
+    return ffi::Error::InvalidArgument("maps must be [V, H + 2, W + 2, 2] and values [V, P, C]");
   const int64_t count = map[0], levels = sizes.size() / 2, parts = settings.size() / 4;
-  const bool fit = count <= INT32_MAX && map[1] > 0 && map[2] > 0 && map[1] < 32768 && map[2] < 32768;
-  if (!fit || trust.element_count() != inverse.element_count() || shape[0] != count ||
-      poses.element_count() != size_t(12 * count) || intrinsics.element_count() != size_t(4 * count) ||
+  const bool fit = count <= INT32_MAX && map[1] > 2 && map[2] > 2 && map[1] < 32768 && map[2] < 32768;
+  if (!fit || shape[0] != count || poses.element_count() != size_t(12 * count) || intrinsics.element_count() != size_t(4 * count) ||
       of_levels.element_count() != size_t(4 * count * levels))
     return ffi::Error::InvalidArgument("photographs have different numbers, or maps a wrong size");
   if (levels < 1 || levels > MOST_LEVELS || parts < 1 || parts > MOST_PARTS || shape[2] > MOST_CHANNELS ||
@@ -206,8 +195,8 @@ ffi::Error prepare(ffi::ThreadPool& pool, Floats& poses, Floats& intrinsics, Flo
     default: return ffi::Error::InvalidArgument("values must be int8, uint8 or float32");
   }
   job.photographs = static_cast<int>(count);
-  job.height = static_cast<int>(map[1]);
-  job.width = static_cast<int>(map[2]);
+  job.height = static_cast<int>(map[1]) - 2;
+  job.width = static_cast<int>(map[2]) - 2;
   job.levels = static_cast<int>(levels);
   job.finest = std::clamp(finest, 0, job.levels - 1);
   job.values = values.untyped_data();
@@ -217,34 +206,30 @@ ffi::Error prepare(ffi::ThreadPool& pool, Floats& poses, Floats& intrinsics, Flo
   std::memcpy(job.settings, settings.begin(), settings.size() * sizeof(float));
   photographs.resize(count);
   pairs.resize(count * levels);
-  maps.resize(count * job.map_size());
   parallel_for(pool, job.photographs, [&](int i) {
     const float* own = of_levels.typed_data() + 4 * levels * i;
     photographs[i] = describe(poses.typed_data() + 12 * i, intrinsics.typed_data() + 4 * i, own, job);
     for (int level = 0; level < job.levels; level++)
       pairs[i * levels + level] = pair_levels(own, sizes.begin(), starts, level);
-    const size_t first = size_t(i) * job.height * job.width;
-    interleave(inverse.typed_data() + first, trust.typed_data() + first, job, maps.data() + i * job.map_size());
   });
   job.photograph = photographs.data();
   job.pairs = pairs.data();
-  job.maps = maps.data();
+  job.maps = maps.typed_data();
   return ffi::Error::Success();
 }
 
 ffi::Error gather(ffi::ThreadPool pool, Floats pose, Floats intrinsics, Floats pixels, Floats depth, Floats poses,
-                  Floats of_maps, Floats inverse, Floats trust, ffi::AnyBuffer values, Floats of_levels,
+                  Floats of_maps, Floats maps, ffi::AnyBuffer values, Floats of_levels,
                   Integers finest, Integers exclude, ffi::RemainingRets results, ffi::Span<const int64_t> sizes,
                   ffi::Span<const float> settings) {
   Job job;
   std::vector<Photograph> photographs;
   std::vector<LevelPair> pairs;
-  std::vector<float> maps;
   if (pose.element_count() != 12 || intrinsics.element_count() != 4 || finest.element_count() != 1 ||
       exclude.element_count() != 1 || pixels.element_count() != 2 * depth.element_count())
     return ffi::Error::InvalidArgument("one camera, [..., 2] pixels and [...] depths are needed");
-  auto error = prepare(pool, poses, of_maps, inverse, trust, values, of_levels, sizes, settings,
-                       finest.typed_data()[0], job, photographs, pairs, maps);
+  auto error = prepare(pool, poses, of_maps, maps, values, of_levels, sizes, settings, finest.typed_data()[0], job,
+                       photographs, pairs);
   if (error.failure()) return error;
   job.exclude = exclude.typed_data()[0];
   const int64_t count = depth.element_count(), axes = depth.dimensions().size();
@@ -282,7 +267,6 @@ ffi::Error gather(ffi::ThreadPool pool, Floats pose, Floats intrinsics, Floats p
 XLA_FFI_DEFINE_HANDLER_SYMBOL(gather, jaxcloseup::gather,
                               xla::ffi::Ffi::Bind()
                                   .Ctx<xla::ffi::ThreadPool>()
-                                  .Arg<jaxcloseup::Floats>()
                                   .Arg<jaxcloseup::Floats>()
                                   .Arg<jaxcloseup::Floats>()
                                   .Arg<jaxcloseup::Floats>()

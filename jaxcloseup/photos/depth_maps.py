@@ -34,13 +34,28 @@ class GatherSources:
 
     Attributes:
       cameras: stacked cameras of the depth maps.
-      inverse_depth: `[V, H, W]` 1 / z-depth, 0 where undefined.
-      trust: `[V, H, W]` in [0, 1], 0 where the photograph does not count or its depth has an edge.
+      maps: `[V, H + 2, W + 2, 2]` inverse depth and trust of each pixel. Borders are repeated, so
+        what lies between pixels is read without a test.
     """
 
     cameras: Camera
-    inverse_depth: jax.Array
-    trust: jax.Array
+    maps: jax.Array
+
+    @property
+    def inverse_depth(self) -> jax.Array:
+        """Return `[V, H, W]` 1 / z-depth, 0 where undefined."""
+        return self.maps[:, 1:-1, 1:-1, 0]
+
+    @property
+    def trust(self) -> jax.Array:
+        """Return `[V, H, W]` in [0, 1], 0 where a photograph or its depth does not count."""
+        return self.maps[:, 1:-1, 1:-1, 1]
+
+
+def join_maps(cameras: Camera, inverse_depth: jax.Array, trust: jax.Array) -> GatherSources:
+    """Return depth maps `[V, H, W]` of stacked cameras, with their trust, for `gather`."""
+    maps = jnp.stack([inverse_depth, trust], axis=-1)
+    return GatherSources(cameras, jnp.pad(maps, ((0, 0), (1, 1), (1, 1), (0, 0)), mode="edge"))
 
 
 @struct.dataclass
@@ -100,7 +115,7 @@ def gather_sources(
     trust = weight / (1 + (safe_divide(bend, inverse) / edge) ** 2) ** 2
     trust = jnp.where(depths > 0, trust, 0)
     trust = jax.lax.reduce_window(trust, jnp.inf, jax.lax.min, (1, 3, 3), (1, 1, 1), "SAME")
-    return GatherSources(cameras, inverse, trust)
+    return join_maps(cameras, inverse, trust)
 
 
 def prepare_depth_maps(cameras: Camera, depths: jax.Array, weight: jax.Array) -> DepthMaps:

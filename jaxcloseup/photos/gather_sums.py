@@ -108,7 +108,7 @@ def gather_points(
       reader: see there.
       exclude: index of a photograph to leave out; -1 leaves out none.
     """
-    views = jnp.arange(reader.sources.trust.shape[0])
+    views = jnp.arange(reader.sources.maps.shape[0])
     may_see = jax.vmap(lambda camera: _may_see(camera, points, side))(reader.sources.cameras)
     may_see &= views != exclude
     channels = reader.pyramid.values.shape[-1] // len(reader.settings)
@@ -157,8 +157,8 @@ def _finish(sums: _Sums) -> Gathered:
 def _read_maps(
     sources: GatherSources, view: jax.Array, landed: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    maps = jnp.stack([sources.inverse_depth[view], sources.trust[view]], axis=-1)
-    inverse, trust = jnp.moveaxis(backward_warp(maps, landed), -1, 0)
+    maps = backward_warp(sources.maps[view, 1:-1, 1:-1], landed)
+    inverse, trust = jnp.moveaxis(maps, -1, 0)
     return inverse, trust
 
 

@@ -26,6 +26,7 @@ from jaxcloseup.detail.learn import Evidence, learn_weights
 from jaxcloseup.detail.weights import CONTRAST, blend, expected_errors, known_weights, write_known
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.io.cache import Stored, load, save
+from jaxcloseup.photos.depth_maps import join_maps
 from jaxcloseup.photos.pyramids import scene_pyramid
 from jaxcloseup.photos.views import camera_at, to_float
 from jaxcloseup.photos.windows import view_windows
@@ -252,7 +253,8 @@ def test_a_tuned_state_has_the_detail_of_photographs_that_see_the_view(rendered,
 
     # One photograph shows nothing any more, and the other four are a multiple of two.
     trust = detail.sources.trust.at[1].set(0)
-    blind = detail.replace(sources=detail.sources.replace(trust=trust))
+    sources = join_maps(detail.sources.cameras, detail.sources.inverse_depth, trust)
+    blind = detail.replace(sources=sources)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fine_tuning, "_TOGETHER", 2)
         others = tuned_detail(programs, state, cameras, blind)

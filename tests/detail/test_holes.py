@@ -7,7 +7,7 @@ import pytest
 
 from jaxcloseup.detail.holes import fill_holes, find_empty
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
-from jaxcloseup.photos.depth_maps import GatherSources
+from jaxcloseup.photos.depth_maps import join_maps
 
 
 HEIGHT, WIDTH = 24, 40
@@ -25,7 +25,7 @@ def photographs(count, depth):
     cameras = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[camera()] * count)
     inverse = np.where(depth > 0, 1 / np.maximum(depth, 1e-9), 0).astype(np.float32)
     inverse = jnp.tile(jnp.asarray(inverse)[None], (count, 1, 1))
-    return GatherSources(cameras, inverse, jnp.ones_like(inverse))
+    return join_maps(cameras, inverse, jnp.ones_like(inverse))
 
 
 def wall_with_a_gap():

@@ -36,7 +36,7 @@ void fuzz_values() {
   }
   const Dims image = any_of<Dims>({{}, {0}, {1}, {70}, {1, 1}, {3, 50}, {17, 9}, {0, 4}, {4, 0}, {2, 5, 40}});
   Floats pose({3, 4}), intrinsics({4}), view(with(image, {2})), depth(image), poses({photographs, 3, 4});
-  Floats of_maps({photographs, 4}), inverse({photographs, height, width}), trust(inverse.dims);
+  Floats of_maps({photographs, 4}), maps({photographs, height + 2, width + 2, 2});
   Floats of_levels({photographs, levels, 4});
   Array<T> values({photographs, pixels, channels});
   Integers finest({}), exclude({});
@@ -52,8 +52,7 @@ void fuzz_values() {
   fill(of_levels, odd_cameras, [&](size_t i) { return 2 * draw_intrinsics(i % (4 * levels)); });
   fill(view, rarity, [](size_t) { return uniform(0, 30); });
   fill(depth, rarity, [](size_t) { return uniform(1.8f, 2.2f); });
-  fill(inverse, rarity, [](size_t) { return .5f; });
-  fill(trust, rarity, [](size_t) { return uniform(0, 1); });
+  fill(maps, rarity, [](size_t i) { return i % 2 ? uniform(0, 1) : .5f; });
   for (size_t i = 0; i < values.size; i++)
     values.data[i] = sizeof(T) > 1 && rarity && generator() % rarity == 0 ? T(1e38) : T(generator() % 100);
   finest.data[0] = any_of({0, 0, 0, 1, levels, -3, 2147483647});
@@ -61,7 +60,7 @@ void fuzz_values() {
   std::vector<std::unique_ptr<Floats>> results[2];
   for (int some = 0; some < 2; some++) {
     Call call;
-    call.arg(pose).arg(intrinsics).arg(view).arg(depth).arg(poses).arg(of_maps).arg(inverse).arg(trust).arg(values);
+    call.arg(pose).arg(intrinsics).arg(view).arg(depth).arg(poses).arg(of_maps).arg(maps).arg(values);
     call.arg(of_levels).arg(finest).arg(exclude).attr("sizes", sizes).attr("settings", settings);
     for (int i = 0; i < 7 * parts; i++) {
       results[some].emplace_back(new Floats(i % 7 ? image : with(image, {channels / parts})));

@@ -141,8 +141,8 @@ def test_nonsense_gathers_nothing_and_reads_nothing_elsewhere(nonsense):
 
 def nonsense_in_photographs(value):
     sources, pyramid = make_capture(np.float32)
-    for name in ("inverse_depth", "trust"):
-        yield sources.replace(**{name: getattr(sources, name).at[:, ::2, ::3].set(value)}), pyramid
+    for which in range(2):  # inverse depth and trust
+        yield sources.replace(maps=sources.maps.at[:, ::2, ::3, which].set(value)), pyramid
     for name in ("camtoworld", "intrinsics"):
         odd = sources.cameras.replace(**{name: getattr(sources.cameras, name).at[::2].set(value)})
         yield sources.replace(cameras=odd), pyramid

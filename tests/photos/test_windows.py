@@ -98,9 +98,7 @@ def test_windows_cover_all_pixels_of_all_levels_with_the_stated_shares(windows, 
     own = np.asarray(windows.pyramid.intrinsics)[view, level]
     corner = np.rint(own[:, 2:] - intrinsics[:, 2:]).astype(int)
     np.testing.assert_allclose(np.bincount(view) / count, 1 / 3, atol=0.015)
-    np.testing.assert_allclose(
-        np.bincount(level) / count, [0.6, 0.15, WHOLE_SHARE], atol=0.015
-    )
+    np.testing.assert_allclose(np.bincount(level) / count, [0.6, 0.15, WHOLE_SHARE], atol=0.015)
     for index, (height, width) in enumerate(windows.pyramid.sizes):
         x, y = corner[level == index].T
         assert x.min() == 0 and x.max() == width - 16

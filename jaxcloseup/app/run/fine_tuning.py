@@ -98,7 +98,7 @@ def tuned_detail(programs: Programs, state: TrainState, cameras: Camera, detail:
     counts = np.sum(reached < _ENOUGH, axis=1) + 1
     needed = [views[:count] for views, count in zip(order, counts, strict=True)]
     count = len(np.unique(np.concatenate(needed)))
-    count = min(-(-count // _TOGETHER) * _TOGETHER, len(detail.sources.trust))
+    count = min(-(-count // _TOGETHER) * _TOGETHER, len(detail.sources.maps))
     views = np.argsort(-shares.max(axis=0), kind="stable")[:count]
     return refresh_detail(programs, state, detail, np.sort(views).tolist())
 
@@ -111,7 +111,7 @@ def _shares(programs: Programs, state: TrainState, camera: Camera, detail: Detai
 @jax.jit
 def _shares_at(detail: Detail, camera: Camera, depth: jax.Array) -> jax.Array:
     """Return each photograph's share in what a view gathers, `[V]`; the sum is at most 1."""
-    count = detail.sources.trust.shape[0]
+    count = len(detail.sources.maps)
     # Each photograph shows nothing but its own number, in as fine pixels as it has.
     numbers = Pyramid(jnp.eye(count)[:, None], detail.shown.intrinsics[:, :1], ((1, 1),))
     every = max(1, round((depth.size / _PIXELS) ** 0.5))

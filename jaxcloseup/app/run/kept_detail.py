@@ -27,7 +27,7 @@ from jaxcloseup.detail.weights import DetailWeights, known_weights
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.io.cache import Stored, cached
-from jaxcloseup.photos.depth_maps import GatherSources
+from jaxcloseup.photos.depth_maps import GatherSources, join_maps
 from jaxcloseup.photos.pyramids import Pyramid
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.views import Views
@@ -155,7 +155,7 @@ def _unpack(scene: Scene, stored: Stored) -> tuple[Detail, dict[str, Any]]:
     arrays = {name: jnp.asarray(array) for name, array in stored.arrays.items()}
     shown = Pyramid(arrays["values"], arrays["intrinsics"], sizes)
     cameras = shown.camera(cameras, slice(None), level)
-    sources = GatherSources(cameras, arrays["inverse_depth"], arrays["trust"])
+    sources = join_maps(cameras, arrays["inverse_depth"], arrays["trust"])
     return Detail(shown, sources, _weights(scene), arrays["finer"]), about
 
 
