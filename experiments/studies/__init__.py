@@ -1,6 +1,6 @@
 """Scripts that make the tables and pictures of the documents, one script each.
 
-    default_runs        tables of default runs: README.md, docs/results.md
+    default_runs        tables of default runs: docs/results.md
     few_photographs     table of runs with 20 photographs: docs/log/results.md
     photograph_widths   table of runs on photographs of several sizes: docs/results.md
     methods_table       table of all methods from a sweep: docs/log/results.md

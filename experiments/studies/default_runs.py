@@ -1,10 +1,9 @@
-"""Tables of default runs: README.md, and "A default run" of docs/results.md.
+"""Tables of default runs: "A default run" of docs/results.md.
 
     python -m experiments.studies.default_runs --capture=path/to/plush
 
-makes the runs in `outputs/studies`, with the default preset and with `--preset=reduced`, unless
-they are there, and prints the tables. `--runs` and `--reduced_runs` name folders of finished runs
-instead.
+makes the runs in `outputs/studies`, unless they are there, and prints the tables. `--runs` names
+folders of finished runs instead.
 """
 
 import pathlib
@@ -30,14 +29,12 @@ from jaxcloseup.app.score.metrics_text import REDUCED
 
 
 FLAGS = flags.FLAGS
-_BOTH = ("control", "detail")
 _RUNGS = (1, 2, 4, 8, 16)
 
 
 def define_flags() -> None:
     """Define the flags of the script, whose names other scripts use too."""
     flags.DEFINE_list("runs", [], "folders of default runs, one for each scene")
-    flags.DEFINE_list("reduced_runs", [], "folders of runs with --preset=reduced")
     flags.DEFINE_list("scenes", SCENES, "drawn scenes, where runs are made")
     flags.DEFINE_string("capture", None, "folder of a real capture, where runs are made")
     flags.DEFINE_string("output_dir", "outputs/studies", "folder of the runs to make")
@@ -48,56 +45,42 @@ def main(_: list[str]) -> None:
     scenes = [*FLAGS.scenes, *filter(None, [FLAGS.capture])]
     root = pathlib.Path(FLAGS.output_dir)
     runs = finished_runs(FLAGS.runs, root / "default", scenes)
-    reduced: dict[str, Results] = {}
-    if FLAGS.reduced_runs or not FLAGS.runs:
-        given = ("--preset=reduced", "--stages=control")
-        reduced = finished_runs(FLAGS.reduced_runs, root / "reduced", scenes, *given)
-    print_all(runs, reduced)
+    print_all(runs)
 
 
-def print_all(runs: Mapping[str, Results], reduced: Mapping[str, Results]) -> None:
-    """Print all tables of runs by scene, `reduced` ones only in the first."""
-    print_readme(runs, reduced)
+def print_all(runs: Mapping[str, Results]) -> None:
+    """Print all tables of runs by scene."""
     print_default(runs)
     print_magnifications(runs)
     print_labels(runs)
 
 
-def print_readme(runs: Mapping[str, Results], reduced: Mapping[str, Results]) -> None:
-    """Print PSNR of both presets and of the default with detail."""
-    rows = []
-    for name, results in runs.items():
-        row = [name]
-        for split in (CLOSEUPS, ORDINARY):
-            before = reduced.get(name, {"stages": {}})
-            row += [pair(found, ["control"], split, digits=1) for found in (before, results)]
-            row.append(f"**{pair(results, ['detail'], split, digits=1)}**")
-        rows.append(row)
-    header = ["scene", "close-ups: reduced", "default", "with detail"]
-    header += ["ordinary views: reduced", "default", "with detail"]
-    print_table("README.md", header, rows)
+def _both(results: Results) -> tuple[str, str]:
+    """Return the stage of the field alone, and that with detail; short runs have no control."""
+    return "control" if "control" in results["stages"] else "baseline", "detail"
 
 
 def print_default(runs: Mapping[str, Results]) -> None:
     """Print the gain of detail in each scene and split, and its mean over the drawn scenes."""
     rows = []
     for name, results in runs.items():
+        both = _both(results)
         for split in filter(results["stages"]["detail"].__contains__, TITLES):
-            gained = gains(results, split, "detail", "control")
-            row = [f"{name}, {TITLES[split]}", pair(results, ["control"], split)]
-            row += [f"**{pair(results, ['detail'], split)}**", format_gain(gained)]
-            row += [f"{min(gained):+.2f}", pair(results, _BOTH, split, "cc_psnr")]
+            gained = gains(results, split, *both[::-1])
+            row = [f"{name}, {TITLES[split]}", pair(results, both[:1], split)]
+            row += [f"**{pair(results, both[1:], split)}**", format_gain(gained)]
+            row += [f"{min(gained):+.2f}", pair(results, both, split, "cc_psnr")]
             row += [
-                pair(results, _BOTH, split, "resolves", 1),
-                pair(results, _BOTH, split, "ssim", 3),
+                pair(results, both, split, "resolves", 1),
+                pair(results, both, split, "ssim", 3),
             ]
-            row.append(pair(results, _BOTH, split + REDUCED))
+            row.append(pair(results, both, split + REDUCED))
             rows.append(row)
-    header = ["scene, views", "control", "with detail", "gain (95 %)", "worst view"]
+    header = ["scene, views", "field", "with detail", "gain (95 %)", "worst view"]
     header += ["color-corrected", "resolves (px)", "SSIM", "at the size of training"]
     print_table("A default run", header, rows)
     for split, title in TITLES.items():
-        drawn = [gains(runs[name], split, "detail", "control") for name in runs if name in SCENES]
+        drawn = [gains(r, split, *_both(r)[::-1]) for name, r in runs.items() if name in SCENES]
         if drawn:
             print(f"mean of drawn scenes, {title}: {format_mean_gain(drawn)} dB")
     print()
@@ -106,9 +89,9 @@ def print_default(runs: Mapping[str, Results]) -> None:
 def print_magnifications(runs: Mapping[str, Results]) -> None:
     """Print PSNR on the zoom ladder, of the scenes that have one."""
     rows = [
-        [name, *(pair(results, _BOTH, f"zoom_{times}", digits=1) for times in _RUNGS)]
+        [name, *(pair(results, _both(results), f"zoom_{times}", digits=1) for times in _RUNGS)]
         for name, results in runs.items()
-        if score(results, "control", "zoom_1") is not None
+        if score(results, "detail", "zoom_1") is not None
     ]
     print_table("By magnification", ["scene", *(f"{times}x" for times in _RUNGS)], rows)
 
