@@ -15,7 +15,7 @@ LEVELS = {"baseline": 20.0, "control": 21.0, "closeup": 21.5, "detail": 23.0}
 LEVELS |= {"test_time_control": 21.25, "test_time": 22.25}
 
 
-def write_run(folder, scene, gate=None, better=0.0):
+def write_run(folder, scene, gate=None):
     """Write results whose second view is 2 dB better, ordinary views 10 dB more."""
 
     def scores(level):
@@ -23,11 +23,7 @@ def write_run(folder, scene, gate=None, better=0.0):
         return {"psnr": level, "cc_psnr": level + 0.5, "ssim": 0.5, "views": views}
 
     stages = {
-        stage: {
-            "test": scores(level),
-            "test_far": scores(level + 10),
-            "zoom_1": scores(level),
-        }
+        stage: {"test": scores(level), "test_far": scores(level + 10), "zoom_1": scores(level)}
         for stage, level in LEVELS.items()
     }
     folder.mkdir()

@@ -10,53 +10,49 @@ which it gains least. Of several, the close-up of each that has the lowest PSNR 
 
 import pathlib
 
+import cv2
+import imageio.v3 as imageio
 import numpy as np
 from absl import app, flags
 
-from experiments.studies.pictures import (
-    closeup_camera,
-    render_detailed,
-    render_plain,
-    render_truth,
-    write_rows,
-)
-from experiments.trained_run import open_run
+from experiments.studies.pictures import write_rows
 from jaxcloseup.app.report.showcase import best_middle_worst
 from jaxcloseup.io.files import read_object
 
 
 FLAGS = flags.FLAGS
-_STAGE = "control"
 
 
 def define_flags() -> None:
     """Define the flags of the script, whose names other scripts use too."""
-    flags.DEFINE_list("runs", None, "folders of default runs of drawn scenes")
+    flags.DEFINE_list("runs", None, "folders of default runs")
     flags.DEFINE_string("output", "docs/closeups_table.jpg", "picture to write")
     flags.DEFINE_integer("width", 480, "width of each panel in pixels", lower_bound=1)
     flags.mark_flags_as_required(["runs"])
 
 
 def main(_: list[str]) -> None:
-    """Render the close-ups, and write the picture."""
+    """Put renders that runs keep beside the truth, and write the picture."""
     rows = []
     for folder in map(pathlib.Path, FLAGS.runs):
-        run = open_run(folder, _STAGE)
-        for name in _chosen(folder, one=len(FLAGS.runs) == 1):
-            camera = closeup_camera(run, name, FLAGS.width)
-            sharp = np.asarray(render_detailed(run, camera).rgb)
-            rows.append([render_truth(run, camera), render_plain(run, camera), sharp])
+        stages = read_object(folder / "results.json")["stages"]
+        field = "control" if "control" in stages else "baseline"
+        views, plain = (stages[name]["test"]["views"] for name in ("detail", field))
+        chosen = [min(views, key=lambda name: views[name]["psnr"])]
+        if len(FLAGS.runs) == 1:
+            gained = {name: views[name]["psnr"] - plain[name]["psnr"] for name in views}
+            chosen = best_middle_worst(gained)
+        rows += [
+            [_panel(folder, stage, name) for stage in ("truth", field, "detail")] for name in chosen
+        ]
     write_rows(FLAGS.output, rows, labels=["truth", "field", "with detail"])
 
 
-def _chosen(folder: pathlib.Path, *, one: bool) -> list[str]:
-    """Return the names of a run's close-ups to show, whether it is the only run or not."""
-    stages = read_object(folder / "results.json")["stages"]
-    field, detail = (stages[name]["test"]["views"] for name in (_STAGE, "detail"))
-    if not one:
-        return [min(detail, key=lambda name: detail[name]["psnr"])]
-    gained = {name: detail[name]["psnr"] - field[name]["psnr"] for name in detail}
-    return best_middle_worst(gained)
+def _panel(folder: pathlib.Path, stage: str, name: str) -> np.ndarray:
+    """Return a close-up that a run keeps, with the width of a panel."""
+    image = imageio.imread(folder / "renders" / stage / "test" / "rgb" / f"{name}.png")
+    height = round(FLAGS.width * image.shape[0] / image.shape[1])
+    return cv2.resize(image, (FLAGS.width, height), interpolation=cv2.INTER_AREA) / np.float32(255)
 
 
 if __name__ == "__main__":

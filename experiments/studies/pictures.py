@@ -29,11 +29,6 @@ def render_truth(run: TrainedRun, camera: Camera) -> np.ndarray:
     return np.asarray(run.scene.surface(camera).rgb)
 
 
-def render_plain(run: TrainedRun, camera: Camera) -> np.ndarray:
-    """Render the state of a run, `[H, W, 3]`."""
-    return np.asarray(run.programs.render(run.state, camera).rgb)
-
-
 def render_detailed(run: TrainedRun, camera: Camera) -> Detailed:
     """Render the state of a run with detail and with the expected error."""
     seen = run.programs.render(run.state, camera)

@@ -10,9 +10,9 @@ from jaxcloseup.photos.scene import Scene
 # Seconds of a step, or of a whole part, of a default run of `table` on two cores.
 _STEP = {
     "coarse_baseline": 0.014,
-    "baseline": 0.04,
-    "control": 0.05,
-    "closeup": 0.16,
+    "baseline": 0.03,
+    "control": 0.045,
+    "closeup": 0.13,
     "test_time_control": 0.05,
     "test_time": 0.09,
 }
@@ -26,10 +26,10 @@ _PART = {
     "audit": 5,
     "dolly": 11,
     "report": 6,
-    "baseline_evaluation": 13,
+    "baseline_evaluation": 8,
     "detail_evaluation": 20,
 }
-_EVALUATION = 10  # seconds of any other
+_EVALUATION = 7  # seconds of any other
 _RAYS = 8  # times as long for images of a field that renders single rays
 _WORDS = {
     "depths": "rendering depths of the photographs, and what is scored",
