@@ -4,8 +4,8 @@
     python -m experiments.studies.closeups_picture --output=docs/closeups_worst.jpg \\
         --runs=outputs/bench,outputs/counter,...
 
-Of one run, from above: the close-up in which detail gains most, the middle one, and the one in
-which it gains least. Of several, the close-up of each that has the lowest PSNR with detail.
+It shows the three close-ups of one run in which detail gains most, in the middle and least, or of
+several runs the close-up of each that has the lowest PSNR with detail.
 """
 
 import pathlib
@@ -16,6 +16,7 @@ import numpy as np
 from absl import app, flags
 
 from experiments.studies.pictures import write_rows
+from experiments.studies.tables import CLOSEUPS, field_and_detail
 from jaxcloseup.app.report.showcase import best_middle_worst
 from jaxcloseup.io.files import read_object
 
@@ -35,16 +36,14 @@ def main(_: list[str]) -> None:
     """Put renders that runs keep beside the truth, and write the picture."""
     rows = []
     for folder in map(pathlib.Path, FLAGS.runs):
-        stages = read_object(folder / "results.json")["stages"]
-        field = "control" if "control" in stages else "baseline"
-        views, plain = (stages[name]["test"]["views"] for name in ("detail", field))
+        results = read_object(folder / "results.json")
+        both = field_and_detail(results)
+        plain, views = (results["stages"][name][CLOSEUPS]["views"] for name in both)
         chosen = [min(views, key=lambda name: views[name]["psnr"])]
         if len(FLAGS.runs) == 1:
             gained = {name: views[name]["psnr"] - plain[name]["psnr"] for name in views}
             chosen = best_middle_worst(gained)
-        rows += [
-            [_panel(folder, stage, name) for stage in ("truth", field, "detail")] for name in chosen
-        ]
+        rows += [[_panel(folder, stage, name) for stage in ("truth", *both)] for name in chosen]
     write_rows(FLAGS.output, rows, labels=["truth", "field", "with detail"])
 
 

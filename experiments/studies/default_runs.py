@@ -17,6 +17,7 @@ from experiments.studies.tables import (
     SCENES,
     TITLES,
     Results,
+    field_and_detail,
     finished_runs,
     format_gain,
     format_mean_gain,
@@ -55,16 +56,11 @@ def print_all(runs: Mapping[str, Results]) -> None:
     print_labels(runs)
 
 
-def _both(results: Results) -> tuple[str, str]:
-    """Return the stage of the field alone, and that with detail; short runs have no control."""
-    return "control" if "control" in results["stages"] else "baseline", "detail"
-
-
 def print_default(runs: Mapping[str, Results]) -> None:
     """Print the gain of detail in each scene and split, and its mean over the drawn scenes."""
     rows = []
     for name, results in runs.items():
-        both = _both(results)
+        both = field_and_detail(results)
         for split in filter(results["stages"]["detail"].__contains__, TITLES):
             gained = gains(results, split, *both[::-1])
             row = [f"{name}, {TITLES[split]}", pair(results, both[:1], split)]
@@ -80,7 +76,11 @@ def print_default(runs: Mapping[str, Results]) -> None:
     header += ["color-corrected", "resolves (px)", "SSIM", "at the size of training"]
     print_table("A default run", header, rows)
     for split, title in TITLES.items():
-        drawn = [gains(r, split, *_both(r)[::-1]) for name, r in runs.items() if name in SCENES]
+        drawn = [
+            gains(r, split, *field_and_detail(r)[::-1])
+            for name, r in runs.items()
+            if name in SCENES
+        ]
         if drawn:
             print(f"mean of drawn scenes, {title}: {format_mean_gain(drawn)} dB")
     print()
@@ -89,7 +89,13 @@ def print_default(runs: Mapping[str, Results]) -> None:
 def print_magnifications(runs: Mapping[str, Results]) -> None:
     """Print PSNR on the zoom ladder, of the scenes that have one."""
     rows = [
-        [name, *(pair(results, _both(results), f"zoom_{times}", digits=1) for times in _RUNGS)]
+        [
+            name,
+            *(
+                pair(results, field_and_detail(results), f"zoom_{times}", digits=1)
+                for times in _RUNGS
+            ),
+        ]
         for name, results in runs.items()
         if score(results, "detail", "zoom_1") is not None
     ]

@@ -133,7 +133,7 @@ def _train(capture: pathlib.Path, run: pathlib.Path) -> dict[str, Any]:
         given = [f"--scene={capture}", f"--output_dir={run}", "--seed=0", "--stages=detail"]
         begun = time.perf_counter()
         subprocess.run([sys.executable, "-m", "experiments.run", *given], check=True)
-        # Of the largest process so far, so the largest photographs come last.
+        # This is of the largest process so far, so the largest photographs come last.
         most = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 2**10
         size = "x".join(map(str, read_object(run / "results.json")["resolution"]))
         found = {"seconds": time.perf_counter() - begun, "bytes": most, "reduced": size}

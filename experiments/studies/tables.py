@@ -41,6 +41,11 @@ def finished_runs(
     return {pathlib.Path(results["scene"]).name: results for results in found}
 
 
+def field_and_detail(results: Results) -> tuple[str, str]:
+    """Return the stage of the field alone, and that with detail; short runs have no control."""
+    return "control" if "control" in results["stages"] else "baseline", "detail"
+
+
 def score(results: Results, stage: str, split: str, metric: str = "psnr") -> float | None:
     """Return the mean score of a stage, or None if the run has none."""
     return results["stages"].get(stage, {}).get(split, {}).get(metric)

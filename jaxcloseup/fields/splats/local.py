@@ -71,7 +71,7 @@ def local_steps(
         return _take(state, place[:size], rows=rows)
 
     def put(key: jax.Array, state: Any, part: Any, place: jax.Array | None) -> Any:
-        # Of the state before: that of the part is not known until it is computed.
+        # The state before knows its number already; that of the part is still being computed.
         due = is_due(int(state.step) + 1)
         whole = place is None
         state = _bounded(part, rows=rows) if whole else _put(state, part, place, rows=rows)
