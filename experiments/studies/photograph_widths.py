@@ -1,21 +1,25 @@
 """Table of runs on the same photographs in several sizes: time, memory, and what close-ups show.
 
     python -m experiments.studies.photograph_widths
+    python -m experiments.studies.photograph_widths --scene=CAPTURE --split=closest
 
 draws 16 photographs of `table`, half of them portrait, and six close-ups, writes them as captures
-with `--widths`, trains each in a process of its own, and scores renders of 1920 pixels' width,
-whatever the photographs' size. Everything lies in `outputs/studies`; what is there is not made
-again.
+with `--widths`, or reduces the photographs of a capture to these; trains each in a process of its
+own, and scores renders of about 1920 pixels' width, whatever the photographs' size. Everything lies
+in `outputs/studies`; what is there is not made again.
 """
 
 import json
 import pathlib
 import resource
+import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from typing import Any
 
+import cv2
 import imageio.v3 as imageio
 import jax
 import jax.numpy as jnp
@@ -26,6 +30,7 @@ from experiments.studies.pictures import render_detailed
 from experiments.studies.tables import print_table
 from experiments.trained_run import open_run
 from jaxcloseup.app import progress
+from jaxcloseup.app.score.targets import score_divisor
 from jaxcloseup.artifacts.images import to_uint8
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.geometry.cameras import Camera, crop_camera
@@ -33,7 +38,7 @@ from jaxcloseup.io.files import read_object
 from jaxcloseup.metrics.image_metrics import psnr, quantize
 from jaxcloseup.metrics.resolution import resolved_period, ring_correlation
 from jaxcloseup.photos.scene import Scene
-from jaxcloseup.photos.views import Views, camera_at
+from jaxcloseup.photos.views import Views, camera_at, to_float
 
 
 FLAGS = flags.FLAGS
@@ -46,20 +51,29 @@ _OPENGL = np.diag([1.0, -1, -1])
 def define_flags() -> None:
     """Define the flags of the script, whose names other scripts use too."""
     flags.DEFINE_list("widths", ["960", "4032"], "longer sides of photographs, in pixels")
-    flags.DEFINE_string("scene", "table", "built-in scene to draw")
+    flags.DEFINE_string("scene", "table", "built-in scene to draw, or folder of a capture")
+    flags.DEFINE_string("split", "given", "how a capture's photographs are held out")
     flags.DEFINE_string("output_dir", "outputs/studies/sizes", "folder of captures and runs")
 
 
 def main(_: list[str]) -> None:
     """Write captures, train on each, and print the table."""
-    scene, rows = load_scene(FLAGS.scene, downscale=8), []
+    source, rows = pathlib.Path(FLAGS.scene), []
+    scene = load_scene(FLAGS.scene, downscale=8, split=FLAGS.split)
     root = pathlib.Path(FLAGS.output_dir)
     for width in map(int, FLAGS.widths):
-        folder = root / f"{FLAGS.scene}_{width}"
-        if not (folder / "points3d.ply").exists():
-            _write_capture(scene, folder, width)
-        record = _train(folder, root / f"run_{FLAGS.scene}_{width}")
-        found = _score(scene, root / f"run_{FLAGS.scene}_{width}")
+        folder = root / f"{source.name}_{width}"
+        run = folder.with_name(f"run_{folder.name}")
+        if not folder.exists():
+            written = folder.with_suffix(".part")
+            shutil.rmtree(written, ignore_errors=True)
+            if source.is_dir():
+                _reduce_capture(source, written, width)
+            else:
+                _write_capture(scene, written, width)
+            written.rename(folder)
+        record = _train(folder, run)
+        found = _score(run, _closeups(scene))
         cost = f"{record['seconds'] / 60:.1f} min", f"{record['bytes'] / 2**30:.1f} GiB"
         rows.append([str(width), record["reduced"], *cost, *found])
     header = ["photographs' width", "reduced to", "time", "memory", "PSNR", "resolves (px)"]
@@ -126,11 +140,24 @@ def _write_capture(scene: Scene, folder: pathlib.Path, width: int) -> None:
     (folder / "points3d.ply").write_text("\n".join([*header, *lines, ""]))
 
 
+def _reduce_capture(source: pathlib.Path, folder: pathlib.Path, width: int) -> None:
+    """Copy a capture, and reduce the longer side of its photographs to `width` pixels."""
+    shutil.copytree(source, folder)
+    for file in progress.track(sorted((folder / "images").rglob("*.*")), f"{width} pixels"):
+        photograph = imageio.imread(file)
+        factor = width / max(photograph.shape[:2])
+        if factor < 1:
+            size = [round(factor * side) for side in photograph.shape[1::-1]]
+            reduced = cv2.resize(photograph, size, interpolation=cv2.INTER_AREA)
+            imageio.imwrite(file, reduced, quality=95)
+
+
 def _train(capture: pathlib.Path, run: pathlib.Path) -> dict[str, Any]:
     """Train a run on a capture, and return its time, its memory and its size of training."""
     record = run.with_suffix(".json")
     if not record.exists():
         given = [f"--scene={capture}", f"--output_dir={run}", "--seed=0", "--stages=detail"]
+        given.append(f"--split={FLAGS.split}")
         begun = time.perf_counter()
         subprocess.run([sys.executable, "-m", "experiments.run", *given], check=True)
         # This is of the largest process so far, so the largest photographs come last.
@@ -141,18 +168,32 @@ def _train(capture: pathlib.Path, run: pathlib.Path) -> dict[str, Any]:
     return read_object(record)
 
 
-def _score(scene: Scene, folder: pathlib.Path) -> list[str]:
+def _closeups(scene: Scene) -> Iterator[tuple[Camera, np.ndarray]]:
+    """Return cameras of about `_SHOWN` pixels' width with their true images `[H, W, 3]`."""
+    if scene.surface is not None:
+        for camera in _views(scene, _SHOWN)["test"]:
+            yield camera, _draw(scene, camera)
+        return
+    assert scene.photographs_at is not None
+    divisor = score_divisor(scene, _SHOWN)
+    views, sizes = scene.photographs_at(divisor or scene.metadata["downscale"], "test")
+    for i, (width, height) in enumerate(sizes):
+        camera = camera_at(views.cameras, i).replace(width=width, height=height)
+        yield camera, np.asarray(to_float(views.rgb[i, :height, :width]))
+
+
+def _score(folder: pathlib.Path, closeups: Iterator[tuple[Camera, np.ndarray]]) -> list[str]:
     """Return PSNR and the finest resolved period of close-ups, field alone and with detail."""
-    run = open_run(folder, "control")
+    run, resolved = open_run(folder, "baseline"), jax.jit(ring_correlation)
     errors: dict[str, list[float]] = {"field": [], "detail": []}
     curves: dict[str, list[np.ndarray]] = {"field": [], "detail": []}
-    for camera in progress.track(_views(scene, _SHOWN)["test"], "close-ups"):
-        truth = quantize(jnp.asarray(_draw(scene, camera)))
+    for camera, photograph in closeups:
+        truth = quantize(jnp.asarray(photograph))
         sharp = render_detailed(run, camera).rgb
         plain = run.programs.render(run.state, camera).rgb
         for name, image in (("field", plain), ("detail", sharp)):
             errors[name].append(float(psnr(quantize(image), truth)))
-            curves[name].append(np.asarray(jax.jit(ring_correlation)(quantize(image), truth)))
+            curves[name].append(np.asarray(resolved(quantize(image), truth)))
     values = [f"{np.mean(errors[name]):.2f}" for name in errors]
     periods = [f"{resolved_period(np.mean(curves[name], axis=0)):.1f}" for name in curves]
     return [" / ".join(values), " / ".join(periods)]
