@@ -15,7 +15,13 @@ import numpy as np
 
 from jaxcloseup.captures.distortion import Remap, undistort, undistortion_map
 from jaxcloseup.captures.photo import Photo, Reading, resized_intrinsics
-from jaxcloseup.captures.photo_files import downscale_image, read_file, read_image, read_mask
+from jaxcloseup.captures.photo_files import (
+    downscale_image,
+    read_file,
+    read_image,
+    read_mask,
+    size_of_image,
+)
 from jaxcloseup.captures.world_frames import Frame, frame_intrinsics
 from jaxcloseup.io.cache import Stored, cache_path, cached, content_hash, hash_files
 from jaxcloseup.io.memory import installed_memory
@@ -58,6 +64,26 @@ def read_photos(splits: Mapping[str, Sequence[Frame]], reading: Reading) -> dict
     found = {split: [next(wholes) for _ in members] for split, members in whole.items()}
     found["test" if closeups else ""] = [photo for photos in made for photo in photos[1:]]
     return {split: found[split] for split in splits}
+
+
+def read_small(frame: Frame, reading: Reading, side: int) -> Photo:
+    """Read a photograph whole, with its longer side divided to about `side` pixels.
+
+    The lens is undistorted after the photograph is reduced, which is fast, and fine for features.
+
+    Raises:
+      SceneError: the photograph or its mask cannot be read, or their sizes differ.
+    """
+    largest = max(size_of_image(frame.file) or frame.size or (side,))
+    reading = reading._replace(downscale=max(1, round(largest / side)), zoom=1)
+    picture, mask = read_file(frame.file), read_file(frame.mask) if frame.mask else None
+    plain = frame._replace(distortion=None, reduced=None)
+    (photo,) = _make_photo(plain, False, picture, mask, reading, undistortion_map)
+    if frame.distortion:
+        lens = tuple(photo.intrinsics(reading.half_pixel).tolist())
+        remap = undistortion_map(frame.distortion, lens, *photo.size)
+        photo = photo._replace(rgb=undistort(photo.rgb, photo.mask, remap)[0])
+    return photo._replace(frame=frame)
 
 
 def _check_memory(photo: Photo, count: int, reading: Reading) -> None:

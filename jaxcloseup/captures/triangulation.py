@@ -10,13 +10,12 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from jaxcloseup.captures.features import find_features, match_features
 
-_LONGEST_SIDE = 1600  # in pixels; larger photographs are searched at this size
-_MAX_FEATURES = 2000  # per photograph; matching cost grows with their square
+
 _NEIGHBORS = 4
 # Cosine of the widest angle between optical axes; SIFT finds few matches beyond 40 degrees.
 _MIN_AXIS_COSINE = np.cos(np.radians(60))
-_RATIO = 0.8  # best over second-best match distance, as in Lowe (2004)
 _MAX_ERROR = 2.0  # in pixels
 _MIN_ANGLE = np.radians(1.5)  # between rays; below it, depth is unreliable
 
@@ -27,17 +26,6 @@ class Triangulated(NamedTuple):
     points: np.ndarray  # `[P, 3]` float32 world points
     rgb: np.ndarray  # `[P, 3]` float32 colors in [0, 1]
     views: np.ndarray  # `[P, 2]` indices of the photographs
-
-
-class _Features(NamedTuple):
-    """Features of one photograph: pixels `[F, 2]`, descriptors `[F, 128]` and colors `[F, 3]`.
-
-    Descriptors and colors are uint8 to save memory; SIFT's descriptors are integers anyway.
-    """
-
-    pixels: np.ndarray
-    descriptors: np.ndarray
-    rgb: np.ndarray
 
 
 def triangulate(
@@ -56,10 +44,10 @@ def triangulate(
       camtoworld: `[V, 3, 4]` OpenCV poses.
       intrinsics: `[V, 4]` fx, fy, cx, cy in pixels.
     """
-    found = [_find_features(image, mask) for image, mask in zip(images, masks, strict=True)]
+    found = [find_features(image, mask) for image, mask in zip(images, masks, strict=True)]
     points, colors, views = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros((0, 2), int)]
     for i, j in _neighbors(camtoworld):
-        first, second = _match(found[i].descriptors, found[j].descriptors)
+        first, second = match_features(found[i].descriptors, found[j].descriptors)
         pixels = found[i].pixels[first], found[j].pixels[second]
         world, good = _intersect(pixels, camtoworld[[i, j]], intrinsics[[i, j]])
         points.append(world[good])
@@ -70,24 +58,6 @@ def triangulate(
         np.concatenate(colors).astype(np.float32) / 255,
         np.concatenate(views),
     )
-
-
-def _find_features(image: np.ndarray, mask: np.ndarray) -> _Features:
-    height, width = image.shape[:2]
-    scale = min(1.0, _LONGEST_SIDE / max(height, width))
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if scale < 1 else image
-    usable = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) if scale < 1 else mask
-    # Without precise upscaling OpenCV's keypoints are a quarter of a pixel off.
-    sift = cv2.SIFT.create(nfeatures=_MAX_FEATURES, enable_precise_upscale=True)
-    gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
-    keypoints, descriptors = sift.detectAndCompute(gray, np.uint8(255) * (usable >= 128))
-    if not keypoints:
-        return _Features(np.zeros((0, 2)), np.zeros((0, 128), np.uint8), np.zeros((0, 3)))
-    # OpenCV puts pixel centers at integers, we at half-integers.
-    pixels = (np.array([point.pt for point in keypoints]) + 0.5) / size * [width, height]
-    column, row = np.clip(pixels.astype(int), 0, [width - 1, height - 1]).T
-    return _Features(pixels, descriptors.astype(np.uint8), image[row, column])
 
 
 def _neighbors(camtoworld: np.ndarray) -> Iterator[tuple[int, int]]:
@@ -102,25 +72,6 @@ def _neighbors(camtoworld: np.ndarray) -> Iterator[tuple[int, int]]:
         (min(i, j), max(i, j)) for i, row in enumerate(order.tolist()) for j in row if fit[i, j]
     }
     yield from sorted(pairs)
-
-
-def _match(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Match descriptors that are mutually best and pass the ratio test; indices into both."""
-    if len(a) < 2 or len(b) < 2:
-        return np.zeros(0, int), np.zeros(0, int)
-    similar = _unit(a) @ _unit(b).T
-    first, best = np.arange(len(a)), similar.argmax(1)
-    mutual = similar.argmax(0)[best] == first
-    highest = similar[first, best]
-    similar[first, best] = -1
-    nearest, second = (np.sqrt(np.maximum(2 - 2 * s, 0)) for s in (highest, similar.max(1)))
-    keep = mutual & (nearest < _RATIO * second)
-    return first[keep], best[keep]
-
-
-def _unit(descriptors: np.ndarray) -> np.ndarray:
-    lengths = np.linalg.norm(descriptors.astype(np.float32), axis=1, keepdims=True)
-    return descriptors / np.maximum(lengths, 1)
 
 
 def _intersect(

@@ -1,0 +1,1 @@
+"""Check whether a capture's poses, lenses and points fit its photographs."""

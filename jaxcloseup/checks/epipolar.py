@@ -1,0 +1,93 @@
+"""How far matched features are from what the poses allow."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxcloseup.checks.matches import Matches
+
+
+FITTING = 2.0  # pixels of epipolar error up to which a match fits the poses
+
+
+class Cameras(NamedTuple):
+    """The cameras of photographs, as a capture gives them."""
+
+    camtoworld: np.ndarray  # `[V, 3, 4]` float64 OpenCV poses
+    intrinsics: np.ndarray  # `[V, 4]` fx, fy, cx, cy in pixels
+    sizes: np.ndarray  # `[V, 2]` widths and heights in pixels
+
+
+class Fit(NamedTuple):
+    """How well matches fit cameras."""
+
+    share: float  # share of matches with an error of at most `FITTING`
+    median: float  # median error in pixels
+    by_view: np.ndarray  # `[V]` share of each photograph's matches that fit; NaN without matches
+
+
+def epipolar_errors(matches: Matches, cameras: Cameras) -> np.ndarray:
+    """Compute how far, in pixels, matches are from the projections that poses allow.
+
+    A feature of one photograph lies somewhere on a ray, which another photograph sees as an arc of
+    directions from the ray's end at infinity to the first camera. The error is the angle between
+    the other's feature and this arc, in pixels at the feature along the image's radius, averaged
+    over both photographs. Unlike the distance from an epipolar line it knows that points lie before
+    both cameras, and it stays defined for photographs from one place.
+
+    Args:
+      matches: M matches.
+      cameras: cameras of the photographs.
+
+    Returns:
+      `[M]` errors in pixels.
+    """
+    rays, pixels = _rays(matches, cameras)
+    centers = cameras.camtoworld[matches.views, :, 3]
+    away = centers[:, 0] - centers[:, 1]
+    length = np.linalg.norm(away, axis=-1, keepdims=True)
+    away = np.divide(away, length, out=np.zeros_like(away), where=length > 0)
+    forward = _arc_angles(rays[:, 1], rays[:, 0], away) * pixels[:, 1]
+    backward = _arc_angles(rays[:, 0], rays[:, 1], -away) * pixels[:, 0]
+    return (forward + backward) / 2
+
+
+def fit(matches: Matches, cameras: Cameras) -> Fit:
+    """Measure how well matches fit cameras."""
+    errors = epipolar_errors(matches, cameras)
+    inside, count = errors <= FITTING, len(cameras.intrinsics)
+    ends = matches.views.ravel()
+    total = np.bincount(ends, minlength=count)
+    right = np.bincount(ends, np.repeat(inside, 2), minlength=count)
+    by_view = np.divide(right, total, out=np.full(count, np.nan), where=total > 0)
+    return Fit(float(inside.mean()), float(np.median(errors)), by_view)
+
+
+def _rays(matches: Matches, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
+    """Return unit directions `[M, 2, 3]` in the world of features, and pixels a radian `[M, 2]`."""
+    lenses = cameras.intrinsics[matches.views]
+    flat = (matches.pixels - lenses[..., 2:]) / lenses[..., :2]
+    local = np.concatenate([flat, np.ones((*flat.shape[:-1], 1))], -1)
+    world = np.einsum("mvij,mvj->mvi", cameras.camtoworld[matches.views, :, :3], local)
+    squared = np.sum(local**2, -1)  # 1 / cos^2, by which a pixel far from the axis is a smaller angle
+    focal = np.sqrt(lenses[..., 0] * lenses[..., 1])
+    return world / np.sqrt(np.sum(world**2, -1, keepdims=True)), focal * squared
+
+
+def _arc_angles(directions: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return angles `[M]` between unit directions `[M, 3]` and arcs; an end of 0 is no arc."""
+    normal = np.cross(start, end)
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    normal = np.divide(normal, length, out=np.zeros_like(normal), where=length > 1e-9)
+    between = np.sum(np.cross(normal, start) * directions, -1) > 0
+    between &= np.sum(np.cross(end, normal) * directions, -1) > 0
+    across = np.abs(np.arcsin(np.clip(np.sum(normal * directions, -1), -1, 1)))
+    # The end, the other camera itself, is no point that it sees; but numbers should not jump there.
+    to_end = np.where(length[:, 0] > 1e-9, _angle(directions, end), np.pi)
+    nearest = np.minimum(_angle(directions, start), to_end)
+    return np.where(between, across, nearest)
+
+
+def _angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the angle `[M]` between unit vectors, exact also where it is small."""
+    return 2 * np.arcsin(np.clip(np.linalg.norm(a - b, axis=-1) / 2, 0, 1))

@@ -1,0 +1,83 @@
+"""Read a capture's photographs once, small, with all that a check asks of them."""
+
+import concurrent.futures
+import os
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from jaxcloseup.captures.features import Features, find_features
+from jaxcloseup.captures.photo import Photo, Reading
+from jaxcloseup.captures.photo_reading import read_small
+from jaxcloseup.captures.world_frames import Frame
+from jaxcloseup.checks.epipolar import Cameras
+from jaxcloseup.checks.matches import Matches, find_matches
+
+
+SIDE = 800  # longer side in pixels, about, of photographs that are checked
+_FEATURES = 1500  # of a photograph
+
+
+class Evidence(NamedTuple):
+    """What photographs show, and the cameras that are claimed for them."""
+
+    frames: Sequence[Frame]
+    cameras: Cameras  # in pixels of the reduced photographs
+    gray: Sequence[np.ndarray]  # `[H, W]` uint8 reduced photographs
+    matches: Matches
+    looks: np.ndarray  # `[V, 4]` what `look` measures
+
+
+def gather(
+    frames: Sequence[Frame], reading: Reading, report: Callable[[int], object] = lambda _: None
+) -> Evidence:
+    """Read photographs at about `SIDE` pixels, and match them.
+
+    Args:
+      frames: photographs of the capture.
+      reading: how photographs are read; its divisors do not count.
+      report: receives the number of photographs that are read.
+
+    Raises:
+      SceneError: a photograph cannot be read.
+    """
+
+    def measure(frame: Frame) -> tuple[Photo, np.ndarray, Features, np.ndarray]:
+        photo = read_small(frame, reading, SIDE)
+        gray = cv2.cvtColor(photo.rgb, cv2.COLOR_RGB2GRAY)
+        return photo._replace(rgb=photo.rgb[:0]), gray, find_features(photo.rgb, photo.mask, _FEATURES), look(photo.rgb, photo.mask)
+
+    done = []
+    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+        for found in pool.map(measure, frames):
+            done.append(found)
+            report(len(done))
+    photos, gray, features, looks = zip(*done, strict=True)
+    cameras = Cameras(
+        np.stack([frame.camtoworld for frame in frames]),
+        np.stack([photo.intrinsics(reading.half_pixel) for photo in photos]),
+        np.array([image.shape[::-1] for image in gray]),
+    )
+    return Evidence(frames, cameras, gray, find_matches(features), np.stack(looks))
+
+
+def look(rgb: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Measure a photograph's contrast, sharpness, and shares of black and of white pixels `[4]`.
+
+    Contrast is the standard deviation of gray levels, and sharpness that of the Laplacian as a
+    share of it.
+
+    Args:
+      rgb: `[H, W, 3]` uint8.
+      mask: `[H, W]` uint8; pixels below 128 do not count.
+    """
+    used = mask >= 128
+    if not used.any():
+        return np.zeros(4)
+    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    contrast = float(gray[used].std())
+    edges = float(cv2.Laplacian(gray, cv2.CV_32F)[used].std())
+    black, white = (rgb <= 2).all(-1)[used].mean(), (rgb >= 253).all(-1)[used].mean()
+    return np.array([contrast, edges / max(contrast, 1e-6), black, white])

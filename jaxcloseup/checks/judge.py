@@ -1,0 +1,169 @@
+"""Judge a capture by its evidence: do poses, lenses and points fit the photographs?"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from jaxcloseup.checks.epipolar import Fit, fit
+from jaxcloseup.checks.evidence import SIDE, Evidence
+from jaxcloseup.checks.looks import describe_looks, exposures
+from jaxcloseup.checks.mistakes import find_mistake
+from jaxcloseup.checks.order import find_order
+from jaxcloseup.checks.points import find_points_mistake, fit_points
+
+
+FITS, LOOSE, MISFIT, UNKNOWN = "fits", "loose", "misfit", "unknown"
+_FEWEST = 60  # matches, below which nothing is said of poses
+_MOST_WRONG = 0.5  # share of matches that do not fit, from which the capture is refused
+_BLURRED = 1.0  # pixels of median error from which close-ups are blurred
+_SHOWN = 0.3  # share of points with texture in two photographs, below which a turn may show more
+_BAD = 0.3  # share of a photograph's fitting matches below which its pose is wrong
+
+
+@dataclasses.dataclass(frozen=True)
+class Checked:
+    """What a check found. All of it is plain JSON."""
+
+    verdict: str  # whether poses fit: `FITS`, `LOOSE`, `MISFIT` or `UNKNOWN`
+    sentence: str  # what is said first
+    notes: tuple[str, ...]  # further sentences
+    corrections: tuple[str, ...]  # of the known mistake that was found, if one was
+    # what to read in place of points that do not fit: `points=none` or a turn; none where they fit
+    points: tuple[str, ...]
+    figures: dict[str, Any]  # numbers behind the sentences
+    worst: tuple[tuple[str, float], ...]  # photographs with the smallest shares of fitting matches
+
+
+def judge(
+    evidence: Evidence, points: np.ndarray, *, opengl: bool, ordered: bool = True
+) -> Checked:
+    """Judge a capture.
+
+    Args:
+      evidence: what its photographs show.
+      points: `[P, 3]` its world points.
+      opengl: whether the file's matrices have OpenGL's axes, as transforms.json has.
+      ordered: whether the evidence is of all photographs, so that an order can be corrected.
+    """
+    names = [frame.file.name for frame in evidence.frames]
+    matches, cameras = evidence.matches, evidence.cameras
+    count = len(matches.views)
+    figures: dict[str, Any] = {"photographs": len(names), "matches": count, "points": len(points)}
+    found = fit(matches, cameras) if count >= _FEWEST else None
+    corrections: tuple[str, ...] = ()
+    if found is None:
+        verdict = UNKNOWN
+        sentence = (
+            f"{len(names)} photographs, poses are not checked: only {count} features match between "
+            "them"
+        )
+    else:
+        figures |= {"share": found.share, "median": found.median}
+        verdict, sentence, corrections = _judge_poses(
+            evidence, found, names, opengl=opengl, ordered=ordered
+        )
+    about, instead = _judge_points(evidence, points, figures, trusted=verdict in (FITS, LOOSE))
+    notes = [*describe_looks(evidence.looks, names), *exposures(matches, names)]
+    notes += _coverage(evidence, points, figures) if verdict in (FITS, LOOSE) else []
+    worst = sorted(
+        (float(share), name)
+        for share, name in zip(found.by_view if found else (), names, strict=False)
+        if np.isfinite(share)
+    )
+    return Checked(
+        verdict=verdict,
+        sentence=sentence + about,
+        notes=tuple(notes),
+        corrections=corrections,
+        points=instead,
+        figures=figures,
+        worst=tuple((name, share) for share, name in worst[:12]),
+    )
+
+
+def _judge_poses(
+    evidence: Evidence, found: Fit, names: Sequence[str], *, opengl: bool, ordered: bool
+) -> tuple[str, str, tuple[str, ...]]:
+    """Return verdict, sentence and corrections for poses and lenses."""
+    count = len(evidence.matches.views)
+    bad = [names[i] for i in np.flatnonzero(found.by_view < _BAD)]
+    fits = f"{len(names)} photographs, poses fit: {found.median:.1f} px"
+    if found.share >= 1 - _MOST_WRONG and not bad:
+        if found.median <= _BLURRED:
+            return FITS, fits, ()
+        return LOOSE, (
+            f"{len(names)} photographs, poses are off by {found.median:.1f} px in the median (of "
+            f"{SIDE} px): close-ups will be blurred by as much"
+        ), ()
+    said = (
+        f"{round(found.share * count):,} of {count:,} features that match between photographs fit "
+        f"their poses (median error {found.median:.0f} px of {SIDE})"
+    )
+    mistake = find_mistake(evidence.matches, evidence.cameras, opengl=opengl)
+    if mistake:
+        return MISFIT, f"{said}: {mistake.sentence}", mistake.corrections
+    order = find_order(evidence.matches, evidence.cameras)
+    if order is not None:
+        corrections = ("order=" + ",".join(map(str, order)),) if ordered else ()
+        return MISFIT, f"{said}: {_describe_order(order, names)}", corrections
+    if found.share >= 1 - _MOST_WRONG:
+        first = ", ".join(bad[:3])
+        return LOOSE, f"{fits}, but not those of {len(bad)} photographs, such as {first}", ()
+    return MISFIT, f"{said}, and no known mistake explains it", ()
+
+
+def _describe_order(order: np.ndarray, names: Sequence[str]) -> str:
+    """Say how the order of poses differs from that of photographs."""
+    count = len(order)
+    moved = np.flatnonzero(order != np.arange(count))
+    if (order == np.arange(count)[::-1]).all():
+        return "poses are listed in the reverse order of the photographs"
+    if len(np.unique((order - np.arange(count)) % count)) == 1:
+        return f"poses are listed {order[0]} places off the photographs"
+    if len(moved) == 2:
+        return f"the poses of {names[moved[0]]} and {names[moved[1]]} are exchanged"
+    return f"{len(moved)} of {count} poses belong to another photograph than the one listed"
+
+
+def _judge_points(
+    evidence: Evidence, points: np.ndarray, figures: dict[str, Any], *, trusted: bool
+) -> tuple[str, tuple[str, ...]]:
+    """Return what is said of points, and what to read instead of them."""
+    if not len(points):
+        return "; no points", ()
+    if not trusted:
+        return "", ()
+    found = fit_points(points, evidence.gray, evidence.cameras)
+    figures |= {"points_share": found.share, "points_moved": found.moved}
+    if not found.known:
+        return f"; {len(points):,} points are not checked", ()
+    if found.fits and found.textured >= _SHOWN * found.tried:
+        return f"; {len(points):,} points fit", ()
+    axes = find_points_mistake(points, evidence.gray, evidence.cameras)
+    if axes:
+        return f"; {len(points):,} points lie in another world than the cameras, turned to ({axes})", (
+            f"points={axes}",
+        )
+    if found.fits:
+        return f"; {len(points):,} points fit", ()
+    return (
+        f"; {len(points):,} points do not lie on what the photographs show "
+        f"({100 * found.share:.0f} % look alike in two of them, {100 * found.moved:.0f} % by chance)"
+    ), ("points=none",)
+
+
+def _coverage(evidence: Evidence, points: np.ndarray, figures: dict[str, Any]) -> list[str]:
+    """Say from how many directions surfaces are seen."""
+    cameras, views = evidence.cameras, evidence.matches.views
+    pairs = np.unique(views, axis=0)
+    alone = len(cameras.intrinsics) - len(np.unique(views))
+    axes = cameras.camtoworld[:, :, 2]
+    cosine = np.sum(axes[pairs[:, 0]] * axes[pairs[:, 1]], -1)
+    angle = float(np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1))))
+    figures |= {"neighbor_degrees": angle, "without_matches": int(alone)}
+    notes = []
+    if alone:
+        notes.append(f"{alone} of {len(axes)} photographs share no features with others")
+    return notes
