@@ -96,7 +96,7 @@ def read_listing(
     chosen = spread(scene, len(train), photographs)
     fewer = len(chosen) < len(train)
     frames = division.frames | {"train": [train[i] for i in chosen]}
-    frames, masked = attach_masks(folder, frames)
+    frames = attach_masks(folder, frames)
     if downscale is None:
         sizes = (size_of_image(frame.file) or frame.size for frame in frames["train"])
         downscale = fitting_divisor(filter(None, sizes), zoom**2 * pixels)
@@ -104,7 +104,7 @@ def read_listing(
     keep = np.ones(len(points), bool)
     if fewer or len(frames) > 1:
         keep = _seen_in_training(frames["train"], len(points))
-    notes = [note, *division.notes, *masked, *reduced]
+    notes = [note, *division.notes, *reduced]
     if fewer:
         notes.append(f"{scene}: learns from {len(chosen)} of {len(train)} training photographs")
     if not keep.all():

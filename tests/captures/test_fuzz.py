@@ -49,7 +49,8 @@ from jaxcloseup.app.view.camera_files import read_camera_path, read_camera_trans
 from jaxcloseup.app.view.camera_paths import CameraError
 from jaxcloseup.artifacts.checkpoints import CheckpointError, Checkpoints
 from jaxcloseup.captures.load import SceneError, load_scene
-from jaxcloseup.captures.photo_files import read_image, read_mask
+from jaxcloseup.captures.mask_values import read_mask
+from jaxcloseup.captures.photo_files import read_image
 from jaxcloseup.io.ply import PlyError, read_vertices
 from jaxcloseup.io.torch_file import TorchFileError, read_tensors
 

@@ -110,13 +110,13 @@ def capture(tmp_path, cache):
 @pytest.fixture
 def decoded(monkeypatch):
     """Collects the names of the images that are decoded."""
-    names, read = [], photo_reading.read_image
+    names, read = [], photo_reading.decode_image
 
     def count(path, **options):
         names.append(path.name)
         return read(path, **options)
 
-    monkeypatch.setattr(photo_reading, "read_image", count)
+    monkeypatch.setattr(photo_reading, "decode_image", count)
     return names
 
 
