@@ -33,7 +33,7 @@ class _Tag(NamedTuple):
 
 
 def unread_format(data: np.ndarray) -> tuple[str, str] | None:
-    """Say what a file of a known format is that is not read, and what to do.
+    """Return what a file of a known format is that is not read, and what to do.
 
     Args:
       data: `[N]` uint8 bytes of the file.
@@ -66,7 +66,7 @@ def without_orientation(data: np.ndarray) -> np.ndarray:
     if tag is None or tag.value == 1:
         return data
     data = data.copy()
-    struct.pack_into(tag.code, data, tag.at, 1)
+    struct.pack_into(tag.code, data.data, tag.at, 1)
     return data
 
 
@@ -78,15 +78,15 @@ def _tiff_tags(data: np.ndarray) -> dict[int, _Tag]:
         return {}
     large = start in _LARGE
     size, head, skip = (20, "Q", 12) if large else (12, "H", 8)
-    tags = {}
+    held, tags = data.data, {}
     try:
-        (at,) = struct.unpack_from(f"{order}{'Q' if large else 'I'}", data, 8 if large else 4)
-        (count,) = struct.unpack_from(order + head, data, at)
+        (at,) = struct.unpack_from(f"{order}{'Q' if large else 'I'}", held, 8 if large else 4)
+        (count,) = struct.unpack_from(order + head, held, at)
         at += struct.calcsize(head)
         for entry in range(at, at + size * min(count, 4096), size):
-            tag, kind = struct.unpack_from(f"{order}HH", data, entry)
+            tag, kind = struct.unpack_from(f"{order}HH", held, entry)
             code = order + {1: "B", 3: "H", 4: "I"}.get(kind, "B")
-            (value,) = struct.unpack_from(code, data, entry + skip)
+            (value,) = struct.unpack_from(code, held, entry + skip)
             tags[tag] = _Tag(value, entry + skip, code)
     except (struct.error, OverflowError):
         return {}

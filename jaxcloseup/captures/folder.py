@@ -1,6 +1,7 @@
 """Load a capture: the photographs, cameras, points and depth range of one folder."""
 
 import functools
+import itertools
 import logging
 import pathlib
 import warnings
@@ -14,7 +15,12 @@ from jaxcloseup.captures.formats import Listing, read_listing
 from jaxcloseup.captures.json_fields import affine_transform, number
 from jaxcloseup.captures.names import unique_names
 from jaxcloseup.captures.photo import Photo, Reading
-from jaxcloseup.captures.photo_checks import check_sizes, check_weights, without_transparent
+from jaxcloseup.captures.photo_checks import (
+    check_sizes,
+    check_weights,
+    warn_copies,
+    without_transparent,
+)
 from jaxcloseup.captures.photo_files import pad_images, read_image
 from jaxcloseup.captures.photo_masks import understood_masks
 from jaxcloseup.captures.photo_reading import read_photos
@@ -68,10 +74,13 @@ def load_capture(
             f"{error.filename or path!s:.200} cannot be read ({error.strerror}): make it readable, "
             "or correct its name in the file that lists it."
         ) from error
-    every = [frame for frames in listing.frames.values() for frame in frames]
-    name = listing.folder.resolve().name
-    masks, note = understood_masks(name, every, inverted=reading.invert_masks)
-    listing = listing._replace(notes=(*listing.notes, *map(printable, note)))
+    masks, notes = understood_masks(
+        listing.folder.resolve().name,
+        itertools.chain(*listing.frames.values()),
+        inverted=reading.invert_masks,
+    )
+    listing = listing._replace(notes=(*listing.notes, *map(printable, notes)))
+    warn_copies(listing)
     for note in listing.notes:
         _log.info(note)
     scene = _load(listing, reading._replace(downscale=listing.downscale, masks=masks))
@@ -83,7 +92,7 @@ def _load(listing: Listing, reading: Reading) -> Scene:
     transform, scale = _applied(listing)
     parts = read_photos(listing.frames, reading)
     listing, parts = without_transparent(listing, parts)
-    photos = [photo for members in parts.values() for photo in members]
+    photos = list(itertools.chain(*parts.values()))
     check_weights(listing.folder, listing.frames, photos, reading)
     check_sizes(listing.file.parent, photos)
     intrinsics = np.stack([photo.intrinsics(reading.half_pixel) for photo in photos])

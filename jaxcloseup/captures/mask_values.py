@@ -94,7 +94,9 @@ def understand_masks(
         if {0, largest} <= used:
             break  # no other mask could change the meaning
     if len(used) < 2 and len(opacities) > 1:
-        return MaskValues(by_alpha=True), _kept("shapes in alpha", "transparent", "opaque", inverted)
+        return MaskValues(by_alpha=True), _kept(
+            "shapes in alpha", "transparent", "opaque", inverted
+        )
     if len(used) < 2:
         color = "white" if any(used) else "black"
         nothing = ": they mask nothing" if any(used) != inverted else ""

@@ -1,13 +1,41 @@
 """Check decoded photographs and masks, also against what the capture's files say."""
 
+import collections
 import pathlib
 import warnings
 from collections.abc import Mapping, Sequence
 
 from jaxcloseup.captures.formats import Listing
 from jaxcloseup.captures.photo import CONSTANT, TRANSPARENT, Photo, Reading
+from jaxcloseup.captures.photo_files import read_file
+from jaxcloseup.captures.reduced_photos import is_stand_in
 from jaxcloseup.captures.world_frames import Frame
-from jaxcloseup.photos.scene import BlankPhotographWarning, ImageSizeWarning, SceneError
+from jaxcloseup.io.cache import content_hash
+from jaxcloseup.photos.scene import (
+    BlankPhotographWarning,
+    DuplicateFileWarning,
+    ImageSizeWarning,
+    SceneError,
+)
+
+
+def warn_copies(listing: Listing) -> None:
+    """Warn of photographs under several names: files of the same bytes."""
+    by_size = collections.defaultdict(list)
+    for file in sorted({frame.file for part in listing.frames.values() for frame in part}):
+        by_size[file.stat().st_size].append(file)
+    same: dict[str, list[pathlib.Path]] = collections.defaultdict(list)
+    for files in by_size.values():
+        for file in files if len(files) > 1 else ():
+            same[content_hash(read_file(file))].append(file)
+    if copied := [files for files in same.values() if len(files) > 1]:
+        first, second, *_ = copied[0]
+        warnings.warn(
+            f"{listing.folder}: {sum(map(len, copied)) - len(copied)} photographs are the same "
+            f"file as another, such as {second.name} as {first.name}: remove the copies.",
+            DuplicateFileWarning,
+            stacklevel=2,
+        )
 
 
 def without_transparent(
@@ -108,6 +136,8 @@ def check_sizes(folder: pathlib.Path, photos: Sequence[Photo]) -> None:
                 f"{frame.label}: the image is {width} x {height} pixels, but w and h are {w} x {h}"
                 f"{rotated}: restore the image that the camera was solved for, or correct w and h."
             )
+        if is_stand_in(frame):
+            continue  # a note says so
         resized.append(f"{frame.listed} is {width} x {height} pixels instead of {w} x {h}")
     if resized:
         more = f" (and {len(resized) - 1} more)" if len(resized) > 1 else ""

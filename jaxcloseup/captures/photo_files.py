@@ -106,9 +106,7 @@ def size_of_image(path: pathlib.Path) -> tuple[int, int] | None:
         return None
 
 
-def decode_channels(
-    path: pathlib.Path, data: np.ndarray
-) -> tuple[np.ndarray, np.ndarray | None]:
+def decode_channels(path: pathlib.Path, data: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     """Decode an image as it is stored, uint8 or uint16.
 
     Args:

@@ -41,9 +41,7 @@ def is_dynamic(frame: Frame) -> bool:
     return frame.mask is not None and frame.mask.stem == _DYNAMIC.format(stem=frame.file.stem)
 
 
-def attach_masks(
-    folder: pathlib.Path, splits: dict[str, list[Frame]]
-) -> dict[str, list[Frame]]:
+def attach_masks(folder: pathlib.Path, splits: dict[str, list[Frame]]) -> dict[str, list[Frame]]:
     """Attach the masks found by name to the frames.
 
     Args:

@@ -140,8 +140,8 @@ def _unpack(frame: Frame, count: int, stored: Stored) -> list[Photo]:
         rgb, mask = stored.arrays[f"rgb{i}"], stored.arrays[f"mask{i}"]
         if not (rgb.dtype == mask.dtype == np.uint8 and rgb.shape == (*mask.shape, 3)):
             raise ValueError("other arrays")
-        sizes = map(tuple, (stored_size, scaled, corner))
-        photos.append(Photo(frame, rgb, mask, *sizes, flaw=str(flaw)))
+        sizes = tuple(stored_size), tuple(scaled), tuple(corner)
+        photos.append(Photo(frame, rgb, mask, *sizes, str(flaw)))
     if len(photos) != count:
         raise ValueError(f"{len(photos)} photographs instead of {count}")
     return photos

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxcloseup.captures.distortion import COEFFICIENTS, read_distortion
 from jaxcloseup.captures.json_fields import image_side, read_object, rigid_transform
+from jaxcloseup.captures.reduced_photos import existing_place
 from jaxcloseup.captures.world_frames import Frame, check_photographs, frame_intrinsics
 from jaxcloseup.photos.scene import SceneError, UnknownKeyWarning
 
@@ -97,6 +98,6 @@ def _read_frame(path: pathlib.Path, fields: dict[str, Any], entry: dict[str, Any
 
 def _find(folder: pathlib.Path, listed: str) -> pathlib.Path:
     """Find the listed file; Blender's datasets leave out the suffix."""
-    path = folder / listed.replace("\\", "/")
+    path = existing_place(folder / listed.replace("\\", "/"))
     candidates = [pathlib.Path(f"{path}{suffix}") for suffix in _SUFFIXES]
     return next((candidate for candidate in candidates if candidate.is_file()), path)

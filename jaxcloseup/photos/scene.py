@@ -46,7 +46,7 @@ class NearFarWarning(SceneWarning):
 
 
 class DuplicateFileWarning(SceneWarning):
-    """A photograph is listed more than once."""
+    """A photograph is listed more than once, or under two names."""
 
 
 class PointsWarning(SceneWarning):

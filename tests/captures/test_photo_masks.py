@@ -54,9 +54,8 @@ def test_some_masks_are_noted(tmp_path, caplog):
     with caplog.at_level("INFO", "jaxcloseup"):
         scene = load_scene(tmp_path)
     assert weights(scene) == pytest.approx({"000": 1, "001": 3 / 8, "002": 1})
-    assert f"{tmp_path.name}: 1 of 3 photographs have a mask; the others are used whole" in (
-        caplog.messages
-    )
+    words = "1 of 3 photographs have a mask (white is kept); the others are used whole"
+    assert f"{tmp_path.name}: {words}" in caplog.messages
 
 
 def test_no_mask_fits(tmp_path):
@@ -100,7 +99,7 @@ def test_a_mask_is_undistorted_with_its_photograph(tmp_path):
     lens = {"fl_x": 30.0, "cx": 24.0, "cy": 20.0, "w": 48, "h": 40, "k1": -0.2, "p1": 0.01}
     mask = np.zeros((40, 48), np.uint8)
     mask[5:30, 10:40] = 255
-    write_image(tmp_path / "images/a.png", np.full((40, 48, 3), 90, np.uint8))
+    write_image(tmp_path / "images/a.png", np.random.default_rng(0).integers(0, 255, (40, 48, 3)))
     pose = {"file_path": "images/a.png", "transform_matrix": POSE.tolist()}
     write_image(tmp_path / "other/x.png", mask)
     write_json(tmp_path / "transforms.json", [{**pose, "mask_path": "other/x.png"}], **lens)

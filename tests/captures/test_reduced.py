@@ -47,7 +47,7 @@ def test_shrunk_photographs_are_used(tmp_path, size):
     )
     np.testing.assert_allclose(weight.mean((1, 2)), [1, 5 / 9, 1], atol=2e-3)
     assert scene.names["train"] == ["a", "b", "c"]
-    assert scene.metadata["notes"][-1].endswith("using the shrunk photographs in images_2")
+    assert scene.metadata["notes"][-2].endswith("using the shrunk photographs in images_2")
     assert (load(tmp_path)[0][1] == picture(1)).all()  # not used at full size
 
 
