@@ -21,7 +21,8 @@ _STARTS = {  # by the offset of bytes: what the file is, and what to do
 }
 _TIFF = {b"II*\0": "<", b"MM\0*": ">", b"II+\0": "<", b"MM\0+": ">"}  # byte order by start
 _LARGE = (b"II+\0", b"MM\0+")  # BigTIFF, of 64-bit offsets
-_SUBFILE, _PHOTOMETRIC, _ORIENTATION, _PARTS, _DNG = 254, 262, 274, 330, 50706
+_SUBFILE, _PHOTOMETRIC, _ORIENTATION, _PARTS = 254, 262, 274, 330
+_EXTRA, _DNG = 338, 50706
 
 
 class _Tag(NamedTuple):
@@ -57,16 +58,18 @@ def unread_format(data: np.ndarray) -> tuple[str, str] | None:
     return None
 
 
-def without_orientation(data: np.ndarray) -> np.ndarray:
-    """Return the bytes `[N]` of a file, for a TIFF without its tag that turns the image.
+def as_stored(data: np.ndarray) -> np.ndarray:
+    """Return the bytes `[N]` of a file; of a TIFF with tags by which OpenCV changes no pixel.
 
-    OpenCV follows the tag of TIFFs even where it is told to return the pixels as they are stored.
+    Even where it is told to return pixels as they are stored, OpenCV turns a TIFF by its
+    orientation, and multiplies colors of 8 bits by alpha that is not associated with them.
     """
-    tag = _tiff_tags(data).get(_ORIENTATION)
-    if tag is None or tag.value == 1:
-        return data
-    data = data.copy()
-    struct.pack_into(tag.code, data.data, tag.at, 1)
+    tags = _tiff_tags(data)
+    changed = [tag for key in (_ORIENTATION, _EXTRA) if (tag := tags.get(key)) and tag.value > 1]
+    if changed:
+        data = data.copy()
+    for tag in changed:
+        struct.pack_into(tag.code, data.data, tag.at, 1)
     return data
 
 

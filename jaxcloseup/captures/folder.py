@@ -90,8 +90,7 @@ def load_capture(
 
 def _load(listing: Listing, reading: Reading) -> Scene:
     transform, scale = _applied(listing)
-    parts = read_photos(listing.frames, reading)
-    listing, parts = without_transparent(listing, parts)
+    listing, parts = without_transparent(listing, read_photos(listing.frames, reading))
     photos = list(itertools.chain(*parts.values()))
     check_weights(listing.folder, listing.frames, photos, reading)
     check_sizes(listing.file.parent, photos)

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import PIL.Image
 
-from jaxcloseup.captures.file_kinds import unread_format, without_orientation
+from jaxcloseup.captures.file_kinds import as_stored, unread_format
 from jaxcloseup.io.files import read_bytes
 from jaxcloseup.photos.scene import SceneError
 
@@ -73,7 +73,7 @@ def decode_image(path: pathlib.Path, *, data: np.ndarray | None = None) -> np.nd
 
 
 def composite(image: np.ndarray, background: float) -> np.ndarray:
-    """Lay RGBA `[H, W, 4]` over a gray level in [0, 1]; RGB `[H, W, 3]` stays as it is."""
+    """Return RGBA `[H, W, 4]` over a gray level in [0, 1]; RGB `[H, W, 3]` stays as it is."""
     if image.shape[-1] == 3:
         return image
     share = image[..., 3:].astype(np.float32) / 255
@@ -124,8 +124,8 @@ def decode_channels(path: pathlib.Path, data: np.ndarray) -> tuple[np.ndarray, n
     image, large = None, _pixels(data) > MOST_PIXELS
     if not large and data.size and not _is_truncated_jpeg(data.tobytes()):
         try:
-            # Ignores the EXIF orientation, except of TIFFs; keeps alpha and depth.
-            image = cv2.imdecode(without_orientation(data), cv2.IMREAD_UNCHANGED)
+            # Ignores the EXIF orientation, keeps alpha and depth.
+            image = cv2.imdecode(as_stored(data), cv2.IMREAD_UNCHANGED)
         except cv2.error as error:
             large = "MAX_IMAGE" in str(error) or error.code == cv2.Error.StsNoMem
     if large:
