@@ -35,7 +35,7 @@ def is_stand_in(frame: Frame) -> bool:
 
 
 def note_stand_ins(name: str, frames: Sequence[Frame]) -> tuple[str, ...]:
-    """Note that shrunk photographs are read in place of their originals.
+    """Return a note if shrunk photographs are read in place of their originals.
 
     Args:
       name: name of the capture, for the note.
