@@ -13,6 +13,10 @@ import struct
 import zipfile
 import zlib
 
+import cv2
+import numpy as np
+import PIL.Image
+
 
 NESTED = "nested"
 VALUES = [
@@ -179,7 +183,9 @@ def damage_png(rng, data):
         (length,) = struct.unpack(">I", data[at : at + 4])
         chunks.append((data[at + 4 : at + 8], data[at + 8 : at + 8 + length]))
         at += 12 + length
-    at, kind = rng.randrange(len(chunks)), rng.randrange(6)
+    at, kind = rng.randrange(len(chunks)), rng.randrange(8)
+    if kind > 5:
+        return repaint(rng, data)
     if kind <= 2:
         width, height, depth, color, *rest = struct.unpack(">IIBBBBB", chunks[0][1])
         side = rng.choice([0, 1, 3, 100, 30000, 2**16, 2**31 - 1, 2**32 - 1])
@@ -200,6 +206,24 @@ def damage_png(rng, data):
         struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
         for name, body in chunks
     )
+
+
+def repaint(rng, data):
+    """Keep an image's brighter half as one value in pixels of another kind, as masks may have."""
+    gray = np.array(PIL.Image.open(io.BytesIO(data)).convert("L"))
+    shape = (gray > np.median(gray)).astype(np.uint8)
+    shape = rng.choice([shape, 1 - shape, shape * 0, shape * 0 + 1, shape[1:]])
+    shape = shape * rng.choice([1, 2, 90, 128, 255])
+    if rng.random() < 0.3:
+        picture = PIL.Image.fromarray(shape)
+        picture.putpalette([0, 0, 0, *rng.randbytes(9)])
+        file = io.BytesIO()
+        picture.save(file, "PNG")
+        return file.getvalue()
+    empty = shape * 0
+    layers = [[shape], [empty, shape, empty], [*[empty] * 3, shape], [*[shape] * 3, empty]]
+    pixels = np.dstack(rng.choice(layers)) * rng.choice([np.uint8(1), np.uint16(1), np.uint16(257)])
+    return cv2.imencode(rng.choice([".png", ".tif"]), pixels)[1].tobytes()
 
 
 def damage_jpeg(rng, data):
@@ -257,6 +281,7 @@ def damage_torch(rng, data):
 BY_ENDING = {
     **{".json": damage_json, ".jsonl": damage_lines, ".txt": damage_text, ".bin": damage_numbers},
     **{".ply": damage_ply, ".npy": damage_npy, ".png": damage_png, ".jpg": damage_jpeg},
+    ".tif": damage_numbers,
     **{".pth": damage_torch},
 }
 

@@ -27,6 +27,9 @@ from tiny_capture import (
 from jaxcloseup.captures.load import SceneError, load_scene
 
 
+HEIC = b"\0\0\0\x24ftypheic\0\0\0\0mif1MiHEheic" + bytes(200)  # how such a file begins
+
+
 # Good captures: each function writes one into a folder.
 
 paper, colmap, llff = paper_capture, colmap_capture, llff_capture

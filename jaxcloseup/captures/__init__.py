@@ -10,7 +10,8 @@ __all__, __getattr__, __dir__ = lazy_names(
         "folder": "load_capture",
         "json_fields": "number read_object rigid_transform",
         "load": "load_scene",
-        "photo_files": "read_image read_mask",
+        "mask_values": "read_mask",
+        "photo_files": "read_image",
         "photo": "Reading",
     },
 )

@@ -2,4 +2,4 @@
 
 FORMATS = ("transforms", "colmap", "llff")  # of captures on disk
 SPLITS = ("given", "every8", "closest", "zoom")
-ALPHA_MODES = ("blend", "mask")
+ALPHA_MODES = ("blend", "mask", "ignore")

@@ -1,6 +1,7 @@
 """Load a capture: the photographs, cameras, points and depth range of one folder."""
 
 import functools
+import itertools
 import logging
 import pathlib
 import warnings
@@ -14,8 +15,14 @@ from jaxcloseup.captures.formats import Listing, read_listing
 from jaxcloseup.captures.json_fields import affine_transform, number
 from jaxcloseup.captures.names import unique_names
 from jaxcloseup.captures.photo import Photo, Reading
-from jaxcloseup.captures.photo_checks import check_sizes, check_weights
+from jaxcloseup.captures.photo_checks import (
+    check_sizes,
+    check_weights,
+    warn_copies,
+    without_transparent,
+)
 from jaxcloseup.captures.photo_files import pad_images, read_image
+from jaxcloseup.captures.photo_masks import understood_masks
 from jaxcloseup.captures.photo_reading import read_photos
 from jaxcloseup.captures.scale import LENGTH, check_positions
 from jaxcloseup.captures.triangulation import Triangulated, triangulate
@@ -67,17 +74,24 @@ def load_capture(
             f"{error.filename or path!s:.200} cannot be read ({error.strerror}): make it readable, "
             "or correct its name in the file that lists it."
         ) from error
+    masks, notes = understood_masks(
+        listing.folder.resolve().name,
+        itertools.chain(*listing.frames.values()),
+        inverted=reading.invert_masks,
+    )
+    listing = listing._replace(notes=(*listing.notes, *map(printable, notes)))
+    warn_copies(listing)
     for note in listing.notes:
         _log.info(note)
-    scene = _load(listing, reading._replace(downscale=listing.downscale))
+    scene = _load(listing, reading._replace(downscale=listing.downscale, masks=masks))
     scene.metadata.update(path=path, split=split)
     return scene
 
 
 def _load(listing: Listing, reading: Reading) -> Scene:
     transform, scale = _applied(listing)
-    parts = read_photos(listing.frames, reading)
-    photos = [photo for members in parts.values() for photo in members]
+    listing, parts = without_transparent(listing, read_photos(listing.frames, reading))
+    photos = list(itertools.chain(*parts.values()))
     check_weights(listing.folder, listing.frames, photos, reading)
     check_sizes(listing.file.parent, photos)
     intrinsics = np.stack([photo.intrinsics(reading.half_pixel) for photo in photos])
@@ -116,7 +130,7 @@ def _load(listing: Listing, reading: Reading) -> Scene:
         metadata["point_errors"] = listing.errors
     if listing.times_nearer is not None:
         metadata["times_nearer"] = listing.times_nearer
-    if reading.zoom > 1:
+    if reading.zoom > 1 and "test" in parts:
         metadata["corners"] = [photo.corner for photo in parts["test"]]
         names["test"] = [f"{name}_zoom{reading.zoom}" for name in names["test"]]
     return Scene(
@@ -221,7 +235,9 @@ def _points_of(reading: Reading, frames: Sequence[Frame]) -> tuple[list[Frame], 
     """Triangulate points of all photographs, to measure how near each is; see `FindPoints`."""
     size = frames[0].size or read_image(frames[0].file).shape[1::-1]
     downscale = max(1, round(max(size) / _MEASURED_SIDE))
-    photos = read_photos({"train": frames}, reading._replace(downscale=downscale, zoom=1))["train"]
+    masks, _ = understood_masks("", frames, inverted=reading.invert_masks)
+    reading = reading._replace(downscale=downscale, zoom=1, masks=masks)
+    photos = read_photos({"train": frames}, reading)["train"]
     poses = np.stack([frame.camtoworld for frame in frames])
     intrinsics = np.stack([photo.intrinsics(reading.half_pixel) for photo in photos])
     points, _, views = _triangulate(photos, poses, intrinsics)

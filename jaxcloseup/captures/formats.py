@@ -13,7 +13,7 @@ from jaxcloseup.captures.llff import read_llff
 from jaxcloseup.captures.photo_files import ENDINGS, size_of_image
 from jaxcloseup.captures.photo_masks import attach_masks
 from jaxcloseup.captures.points import read_ply_points
-from jaxcloseup.captures.reduced_photos import attach_reduced
+from jaxcloseup.captures.reduced_photos import attach_reduced, note_stand_ins, photographs_folder
 from jaxcloseup.captures.scale import check_positions, plausible
 from jaxcloseup.captures.splits import (
     FindPoints,
@@ -96,7 +96,7 @@ def read_listing(
     chosen = spread(scene, len(train), photographs)
     fewer = len(chosen) < len(train)
     frames = division.frames | {"train": [train[i] for i in chosen]}
-    frames, masked = attach_masks(folder, frames)
+    frames = attach_masks(folder, frames)
     if downscale is None:
         sizes = (size_of_image(frame.file) or frame.size for frame in frames["train"])
         downscale = fitting_divisor(filter(None, sizes), zoom**2 * pixels)
@@ -104,7 +104,7 @@ def read_listing(
     keep = np.ones(len(points), bool)
     if fewer or len(frames) > 1:
         keep = _seen_in_training(frames["train"], len(points))
-    notes = [note, *division.notes, *masked, *reduced]
+    notes = [note, *note_stand_ins(scene, content.frames), *division.notes, *reduced]
     if fewer:
         notes.append(f"{scene}: learns from {len(chosen)} of {len(train)} training photographs")
     if not keep.all():
@@ -182,7 +182,7 @@ def _detect(path: pathlib.Path) -> list[tuple[str, str]]:
 
 def _photographs_in(path: pathlib.Path) -> pathlib.Path | None:
     """Return the folder with photographs, if there are any: this one, or `images` in it."""
-    for folder in (path, path / "images"):
+    for folder in (path, photographs_folder(path)):
         if folder.is_dir() and any(one.suffix.lower() in ENDINGS for one in folder.iterdir()):
             return folder
     return None
@@ -198,7 +198,7 @@ def _folder_of_model(model: pathlib.Path) -> pathlib.Path:
     """Find the capture that a model belongs to: the nearest parent folder with `images`."""
     around = model.resolve()
     candidates = (around, *around.parents)[:4]
-    return next((folder for folder in candidates if (folder / "images").is_dir()), model)
+    return next((folder for folder in candidates if photographs_folder(folder).is_dir()), model)
 
 
 def _read_transforms(folder: pathlib.Path, file: pathlib.Path) -> _Content:
@@ -218,12 +218,12 @@ def _read_transforms(folder: pathlib.Path, file: pathlib.Path) -> _Content:
 
 
 def _read_model(folder: pathlib.Path, model: pathlib.Path) -> _Content:
-    file, frames, points, errors = read_colmap(model, folder / "images")
+    file, frames, points, errors = read_colmap(model, photographs_folder(folder))
     return _Content(file, {}, frames, None, points, errors)
 
 
 def _read_llff(folder: pathlib.Path, file: pathlib.Path) -> _Content:
-    fields, frames = read_llff(file, folder / "images")
+    fields, frames = read_llff(file, photographs_folder(folder))
     return _Content(file, fields, frames, None, _read_ply(file, fields, frames))
 
 

@@ -58,7 +58,7 @@ def load_scene(
       zoom: how many times finer `test` is with split `zoom`, 2 or more; None means 4.
       invert_masks: whether masks mark ignored pixels in white instead of black.
       alpha_mode: `blend` shows the background through transparent pixels; `mask` keeps the file's
-        colors and uses alpha as the weight.
+        colors and uses alpha as the weight; `ignore` keeps them and drops alpha.
       photographs: keep so many training photographs, evenly spread; None means all.
 
     Returns:

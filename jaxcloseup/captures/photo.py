@@ -4,8 +4,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxcloseup.captures.mask_values import MaskValues
 from jaxcloseup.captures.scale import check_lens
 from jaxcloseup.captures.world_frames import Frame, frame_intrinsics
+
+
+TRANSPARENT, CONSTANT = "fully transparent", "constant"  # flaws of photographs
 
 
 class Reading(NamedTuple):
@@ -17,8 +21,10 @@ class Reading(NamedTuple):
         that skip this factor.
       background: gray level in [0, 1] behind transparent pixels.
       half_pixel: whether the files put pixel centers at integers.
-      alpha_mode: one of `ALPHA_MODES`; transparent pixels show the background or weigh less.
+      alpha_mode: one of `ALPHA_MODES`; transparent pixels show the background, weigh less, or are
+        like others.
       invert_masks: whether masks mark ignored pixels in white.
+      masks: what the values of masks mean.
     """
 
     downscale: int = 1
@@ -27,6 +33,7 @@ class Reading(NamedTuple):
     half_pixel: bool = False
     alpha_mode: str = "blend"
     invert_masks: bool = False
+    masks: MaskValues = MaskValues()
 
 
 class Photo(NamedTuple):
@@ -40,6 +47,7 @@ class Photo(NamedTuple):
     scaled: tuple[float, float]
     # (x, y) of the crop's first pixel in the whole photograph at this scale
     corner: tuple[int, int] = (0, 0)
+    flaw: str = ""  # TRANSPARENT or CONSTANT, or nothing
 
     @property
     def size(self) -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""Decode, downscale and pad photographs and masks."""
+"""Decode, downscale and pad images."""
 
 import io
 import math
@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import PIL.Image
 
+from jaxcloseup.captures.file_kinds import as_stored, unread_format
 from jaxcloseup.io.files import read_bytes
 from jaxcloseup.photos.scene import SceneError
 
@@ -34,44 +35,50 @@ def read_file(path: pathlib.Path) -> np.ndarray:
 
 
 def read_image(
-    path: pathlib.Path,
-    *,
-    background: float = 1.0,
-    keep_alpha: bool = False,
-    data: np.ndarray | None = None,
+    path: pathlib.Path, *, background: float = 1.0, data: np.ndarray | None = None
 ) -> np.ndarray:
-    """Read a photograph as uint8 RGB, `[H, W, 3]`.
-
-    Gray becomes RGB, 16 bits become 8, and transparent pixels are composited over the background.
-    The EXIF orientation is ignored, because cameras refer to the stored pixels.
+    """Read a photograph as uint8 RGB, `[H, W, 3]`, with transparent pixels over a background.
 
     Args:
       path: path of the file.
       background: gray level in [0, 1] behind transparent pixels.
-      keep_alpha: composite over black, and return alpha as a fourth channel if the file has one.
       data: bytes of the file, if already read.
 
     Raises:
-      SceneError: the file is missing, truncated, damaged, not an image of 8 or 16 bits, or has more
-        than `MOST_PIXELS`.
+      SceneError: as `decode_image`.
     """
-    image, alpha = _decode(path, read_file(path) if data is None else data), None
-    if image.ndim == 2:
-        image = image[..., None]
-    if image.shape[-1] in (2, 4):
-        image, alpha = image[..., :-1], image[..., -1:]
-        share, behind = alpha.astype(np.float32) / 255, 0.0 if keep_alpha else 255 * background
-        image = np.rint(image * share + behind * (1 - share)).astype(np.uint8)
-    # OpenCV stores blue first.
-    image = np.repeat(image, 3, -1) if image.shape[-1] == 1 else image[..., ::-1]
-    if keep_alpha and alpha is not None:
-        image = np.concatenate([image, alpha], -1)
+    return composite(decode_image(path, data=data), background)
+
+
+def decode_image(path: pathlib.Path, *, data: np.ndarray | None = None) -> np.ndarray:
+    """Decode a photograph as uint8 RGB or RGBA, `[H, W, 3 or 4]`.
+
+    Gray becomes RGB, and 16 bits become 8. The EXIF orientation is ignored, because cameras refer
+    to the stored pixels.
+
+    Args:
+      path: path of the file.
+      data: bytes of the file, if already read.
+
+    Raises:
+      SceneError: the file is missing, truncated, damaged, not an image of 8 or 16 bits, of a format
+        that is not read, or has more than `MOST_PIXELS`.
+    """
+    colors, alpha = decode_channels(path, read_file(path) if data is None else data)
+    colors = np.repeat(colors, 3, -1) if colors.shape[-1] == 1 else colors
+    image = colors if alpha is None else np.concatenate([colors, alpha[..., None]], -1)
+    if image.dtype == np.uint16:
+        image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
     return np.ascontiguousarray(image)
 
 
-def read_mask(path: pathlib.Path, *, data: np.ndarray | None = None) -> np.ndarray:
-    """Read a mask as uint8 `[H, W]`: white is 255; black and transparent pixels are 0."""
-    return read_image(path, background=0.0, data=data)[..., 0]
+def composite(image: np.ndarray, background: float) -> np.ndarray:
+    """Return RGBA `[H, W, 4]` over a gray level in [0, 1]; RGB `[H, W, 3]` stays as it is."""
+    if image.shape[-1] == 3:
+        return image
+    share = image[..., 3:].astype(np.float32) / 255
+    rgb = image[..., :3] * share + 255 * background * (1 - share)
+    return np.rint(rgb).astype(np.uint8)
 
 
 def downscale_image(image: np.ndarray, factor: int) -> np.ndarray:
@@ -99,11 +106,26 @@ def size_of_image(path: pathlib.Path) -> tuple[int, int] | None:
         return None
 
 
-def _decode(path: pathlib.Path, data: np.ndarray) -> np.ndarray:
+def decode_channels(path: pathlib.Path, data: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Decode an image as it is stored, uint8 or uint16.
+
+    Args:
+      path: path of the file, for errors.
+      data: `[N]` bytes of the file.
+
+    Returns:
+      Gray `[H, W, 1]` or RGB `[H, W, 3]`; and alpha `[H, W]`, None where the file has none.
+
+    Raises:
+      SceneError: as `decode_image`.
+    """
+    if unread := unread_format(data):
+        raise SceneError(f"{path} {unread[0]}, which is not read: {unread[1]}.")
     image, large = None, _pixels(data) > MOST_PIXELS
     if not large and data.size and not _is_truncated_jpeg(data.tobytes()):
         try:
-            image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)  # ignores EXIF, keeps alpha and depth
+            # Ignores the EXIF orientation, keeps alpha and depth.
+            image = cv2.imdecode(as_stored(data), cv2.IMREAD_UNCHANGED)
         except cv2.error as error:
             large = "MAX_IMAGE" in str(error) or error.code == cv2.Error.StsNoMem
     if large:
@@ -115,13 +137,16 @@ def _decode(path: pathlib.Path, data: np.ndarray) -> np.ndarray:
         raise SceneError(
             f"{path} is not a readable image or is truncated: copy or export it again."
         )
-    if image.dtype == np.uint16:
-        image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
-    if image.dtype != np.uint8:
+    if image.dtype not in (np.uint8, np.uint16):
         raise SceneError(
             f"{path} holds {image.dtype} values: export it with 8 or 16 bits per channel."
         )
-    return image
+    if image.ndim == 2:
+        image = image[..., None]
+    alpha = None
+    if image.shape[-1] in (2, 4):
+        image, alpha = image[..., :-1], image[..., -1]
+    return image[..., ::-1], alpha  # OpenCV stores blue first
 
 
 def _pixels(data: np.ndarray) -> float:

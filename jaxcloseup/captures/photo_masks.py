@@ -3,13 +3,15 @@
 The mask of `images/a.jpg` is the first that exists of `masks/a.jpg.png` (COLMAP's name),
 `masks/a.mask.png`, `masks/a` with any image suffix, `images/a.jpg.png` and `images/a.mask.png`.
 White pixels are kept and black ones are ignored. `masks` mirrors the subfolders of `images`.
+instant-ngp's `images/dynamic_mask_a.png` comes last, and ignores all that is not black.
 """
 
 import collections
 import functools
 import pathlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
+from jaxcloseup.captures.mask_values import MaskValues, understand_masks
 from jaxcloseup.captures.photo_files import ENDINGS
 from jaxcloseup.captures.world_frames import Frame
 from jaxcloseup.photos.scene import SceneError
@@ -17,8 +19,9 @@ from jaxcloseup.photos.scene import SceneError
 
 FOLDER = "masks"
 # The full name comes first, because it tells the masks of a.jpg and a.png apart.
-_BESIDE = ("{name}", "{stem}.mask")
-_IN_FOLDER = (*_BESIDE, "{stem}")
+_IN_FOLDER = ("{name}", "{stem}.mask", "{stem}")
+_DYNAMIC = "dynamic_mask_{stem}"
+_BESIDE = (*_IN_FOLDER[:2], _DYNAMIC)
 
 
 def is_picture(path: pathlib.Path) -> bool:
@@ -33,10 +36,13 @@ def list_photographs(folder: pathlib.Path) -> list[pathlib.Path]:
     return [picture for picture in pictures if picture not in masks]
 
 
-def attach_masks(
-    folder: pathlib.Path, splits: dict[str, list[Frame]]
-) -> tuple[dict[str, list[Frame]], tuple[str, ...]]:
-    """Attach the masks found by name to the frames, and note how many photographs have one.
+def is_dynamic(frame: Frame) -> bool:
+    """Return True if a frame has a mask of instant-ngp's, which is not black where it ignores."""
+    return frame.mask is not None and frame.mask.stem == _DYNAMIC.format(stem=frame.file.stem)
+
+
+def attach_masks(folder: pathlib.Path, splits: dict[str, list[Frame]]) -> dict[str, list[Frame]]:
+    """Attach the masks found by name to the frames.
 
     Args:
       folder: folder of the capture; every folder between it and a photograph may hold `masks/`.
@@ -67,17 +73,36 @@ def attach_masks(
         beside = _find(pictures(file.parent), file, _BESIDE)
         found[file] = found[file] or (None if beside in listed else beside)
     masked = {file: mask for file, mask in found.items() if mask}
-    if not holders and not masked:
-        return splits, ()
     _check_shared(masked)
-    count = len(masked) + total - len(waiting)
-    note = f"{folder.resolve().name}: {count} of {total} photographs have a mask"
-    if count < total:
-        note += "; the others are used whole"
     return {
         split: [frame._replace(mask=frame.mask or found[frame.file]) for frame in frames]
         for split, frames in splits.items()
-    }, (note,)
+    }
+
+
+def understood_masks(
+    name: str, frames: Iterable[Frame], *, inverted: bool
+) -> tuple[MaskValues, tuple[str, ...]]:
+    """Find out what the values of the frames' masks mean, and note how many have one.
+
+    Args:
+      name: name of the capture, for the note.
+      frames: photographs of the capture.
+      inverted: whether masks mark ignored pixels in white.
+
+    Raises:
+      SceneError: a mask cannot be read, or the values could mean anything.
+    """
+    every = {frame.file: frame for frame in frames}.values()
+    masked = [frame for frame in every if frame.mask]
+    if not masked:
+        return MaskValues(), ()
+    files = [frame.mask for frame in masked if frame.mask and not is_dynamic(frame)]
+    values, words = understand_masks(files, inverted=inverted) if files else (MaskValues(), "")
+    if len(files) < len(masked):
+        words += "; " * bool(words) + "all but black of dynamic_mask files is ignored"
+    note = f"{name}: {len(masked)} of {len(every)} photographs have a mask ({words})"
+    return values, (note + "; the others are used whole" * (len(masked) < len(every)),)
 
 
 def _places(

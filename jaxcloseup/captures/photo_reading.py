@@ -14,14 +14,10 @@ import cv2
 import numpy as np
 
 from jaxcloseup.captures.distortion import Remap, undistort, undistortion_map
-from jaxcloseup.captures.photo import Photo, Reading, resized_intrinsics
-from jaxcloseup.captures.photo_files import (
-    downscale_image,
-    read_file,
-    read_image,
-    read_mask,
-    size_of_image,
-)
+from jaxcloseup.captures.mask_values import MaskValues, read_mask
+from jaxcloseup.captures.photo import CONSTANT, TRANSPARENT, Photo, Reading, resized_intrinsics
+from jaxcloseup.captures.photo_files import composite, decode_image, downscale_image, read_file
+from jaxcloseup.captures.photo_masks import is_dynamic
 from jaxcloseup.captures.world_frames import Frame, frame_intrinsics
 from jaxcloseup.io.cache import Stored, cache_path, cached, content_hash, hash_files
 from jaxcloseup.io.memory import installed_memory
@@ -29,7 +25,11 @@ from jaxcloseup.photos.scene import SceneError
 
 
 _MAX_CONCURRENT = 4  # each needs a few times its own size: 12 megapixels take about 100 MB
-_SOURCES = ("photo.py", "photo_reading.py", "photo_files.py", "distortion.py")
+_SOURCES = (
+    *("photo.py", "photo_reading.py", "photo_files.py", "file_kinds.py", "mask_values.py"),
+    "distortion.py",
+)
+_FEW = 1000  # values
 _BYTES_PER_PIXEL = 12  # peak of what stays: as read, padded, and weights in float32
 
 _log = logging.getLogger(__name__)
@@ -66,26 +66,6 @@ def read_photos(splits: Mapping[str, Sequence[Frame]], reading: Reading) -> dict
     return {split: found[split] for split in splits}
 
 
-def read_small(frame: Frame, reading: Reading, side: int) -> Photo:
-    """Read a photograph whole, with its longer side divided to about `side` pixels.
-
-    The lens is undistorted after the photograph is reduced, which is fast, and fine for features.
-
-    Raises:
-      SceneError: the photograph or its mask cannot be read, or their sizes differ.
-    """
-    largest = max(size_of_image(frame.file) or frame.size or (side,))
-    reading = reading._replace(downscale=max(1, round(largest / side)), zoom=1)
-    picture, mask = read_file(frame.file), read_file(frame.mask) if frame.mask else None
-    plain = frame._replace(distortion=None, reduced=None)
-    (photo,) = _make_photo(plain, False, picture, mask, reading, undistortion_map)
-    if frame.distortion:
-        lens = tuple(photo.intrinsics(reading.half_pixel).tolist())
-        remap = undistortion_map(frame.distortion, lens, *photo.size)
-        photo = photo._replace(rgb=undistort(photo.rgb, photo.mask, remap)[0])
-    return photo._replace(frame=frame)
-
-
 def _check_memory(photo: Photo, count: int, reading: Reading) -> None:
     """Raise before reading `count` photographs of this size that would not fit into memory."""
     needed = _BYTES_PER_PIXEL * count * photo.mask.size
@@ -116,13 +96,13 @@ def _read_photo(
     """Read a photograph and, if `closeup`, its most detailed crop without the zoom factor."""
     picture = read_file(frame.reduced or frame.file)
     mask = read_file(frame.mask) if frame.mask else None
-    make = functools.partial(_make_photo, frame, closeup, picture, mask, reading, find_remap)
+    make = functools.partial(make_photo, frame, closeup, picture, mask, reading, find_remap)
     if frame.reduced or reading.downscale * reading.zoom == 1:
         return make()
     # Everything that the result depends on.
     key = ["area", cv2.__version__, _code(), closeup, reading._replace(half_pixel=False)]
     key += [content_hash(picture), None if mask is None else content_hash(mask)]
-    key += [frame.size, frame.distortion]
+    key += [frame.size, frame.distortion, is_dynamic(frame)]
     if frame.distortion:
         # The size may be unknown before decoding. This stand-in is so large that a principal
         # point that defaults to its middle never equals a given one.
@@ -150,23 +130,24 @@ def _code() -> str:
 def _pack(photos: Sequence[Photo]) -> Stored:
     images = {f"rgb{i}": photo.rgb for i, photo in enumerate(photos)}
     images |= {f"mask{i}": photo.mask for i, photo in enumerate(photos)}
-    return Stored(images, [(photo.stored_size, photo.scaled, photo.corner) for photo in photos])
+    return Stored(images, [photo[3:] for photo in photos])
 
 
 def _unpack(frame: Frame, count: int, stored: Stored) -> list[Photo]:
     """Return the `count` photographs that `_pack` packed; raise an exception for other content."""
     photos = []
-    for i, (stored_size, scaled, corner) in enumerate(stored.record):
+    for i, (stored_size, scaled, corner, flaw) in enumerate(stored.record):
         rgb, mask = stored.arrays[f"rgb{i}"], stored.arrays[f"mask{i}"]
         if not (rgb.dtype == mask.dtype == np.uint8 and rgb.shape == (*mask.shape, 3)):
             raise ValueError("other arrays")
-        photos.append(Photo(frame, rgb, mask, tuple(stored_size), tuple(scaled), tuple(corner)))
+        sizes = tuple(stored_size), tuple(scaled), tuple(corner)
+        photos.append(Photo(frame, rgb, mask, *sizes, str(flaw)))
     if len(photos) != count:
         raise ValueError(f"{len(photos)} photographs instead of {count}")
     return photos
 
 
-def _make_photo(
+def make_photo(
     frame: Frame,
     closeup: bool,
     picture: np.ndarray,
@@ -174,9 +155,27 @@ def _make_photo(
     reading: Reading,
     find_remap: Callable[..., Remap],
 ) -> list[Photo]:
+    """Decode, mask, undistort and downscale a photograph, and crop it where that is asked for.
+
+    Args:
+      frame: the photograph.
+      closeup: whether its most detailed crop without the zoom factor follows.
+      picture: uint8 `[N]` bytes of its file.
+      mask_picture: uint8 `[N]` bytes of its mask's file, or None.
+      reading: how it is read.
+      find_remap: `undistortion_map`, or what keeps its results.
+
+    Raises:
+      SceneError: the photograph or its mask cannot be read, or their sizes do not fit.
+    """
     file = frame.reduced or frame.file
-    keep_alpha = reading.alpha_mode == "mask"
-    rgb = read_image(file, background=reading.background, keep_alpha=keep_alpha, data=picture)
+    image = decode_image(file, data=picture)
+    if reading.alpha_mode == "ignore":
+        image = np.ascontiguousarray(image[..., :3])
+    flaw = _flaw(image)
+    rgb = composite(image, 0.0 if reading.alpha_mode == "mask" else reading.background)
+    if reading.alpha_mode == "mask" and image.shape[-1] == 4:
+        rgb = np.concatenate([rgb, image[..., 3:]], -1)
     stored = width, height = rgb.shape[1], rgb.shape[0]
     downscale = reading.downscale
     if frame.reduced:
@@ -191,16 +190,7 @@ def _make_photo(
         )
     mask = None
     if mask_picture is not None:
-        assert frame.mask is not None
-        mask = read_mask(frame.mask, data=mask_picture)
-        mask = 255 - mask if reading.invert_masks else mask
-        if frame.reduced and mask.shape[::-1] == frame.size:
-            mask = cv2.resize(mask, stored, interpolation=cv2.INTER_AREA)
-        if mask.shape != (height, width):
-            raise SceneError(
-                f"{frame.mask} is {mask.shape[1]} x {mask.shape[0]} pixels but its photograph is "
-                f"{width} x {height}: give both the same size."
-            )
+        mask = _read_mask(frame, mask_picture, stored, reading)
     if frame.distortion:
         intrinsics = resized_intrinsics(frame, stored, stored, reading.half_pixel)
         remap = find_remap(frame.distortion, tuple(intrinsics.tolist()), width, height)
@@ -216,9 +206,36 @@ def _make_photo(
         mask = np.full(rgb.shape[:2], 255, np.uint8)
     else:
         mask = downscale_image(mask, downscale)
-    photo = Photo(frame, rgb, mask, stored, (rgb.shape[1], rgb.shape[0]))
+    photo = Photo(frame, rgb, mask, stored, (rgb.shape[1], rgb.shape[0]), flaw=flaw)
     photos = _zoomed(photo, reading.zoom, closeup) if reading.zoom > 1 else [photo]
     return [_without_alpha(photo) for photo in photos] if rgb.shape[-1] == 4 else photos
+
+
+def _flaw(image: np.ndarray) -> str:
+    """Say what makes RGB or RGBA `[H, W, 3 or 4]` show nothing; "" if it shows something."""
+    if image.shape[-1] == 4 and not image[..., 3].any():
+        return TRANSPARENT
+    # Few pixels may well be equal.
+    parts = (image[::16, ::16], image) if image.size > _FEW else ()
+    return CONSTANT if parts and all((part == image[0, 0]).all() for part in parts) else ""
+
+
+def _read_mask(
+    frame: Frame, data: np.ndarray, size: tuple[int, int], reading: Reading
+) -> np.ndarray:
+    """Read the mask of a photograph of this size, `[H, W]`: 255 where pixels are kept."""
+    assert frame.mask is not None
+    dynamic = is_dynamic(frame)
+    mask = read_mask(frame.mask, MaskValues(white=1) if dynamic else reading.masks, data=data)
+    mask = 255 - mask if dynamic or reading.invert_masks else mask
+    if mask.shape[::-1] == frame.size != size:
+        mask = cv2.resize(mask, size, interpolation=cv2.INTER_AREA)
+    if mask.shape[::-1] != size:
+        raise SceneError(
+            f"{frame.mask} is {mask.shape[1]} x {mask.shape[0]} pixels but its photograph is "
+            f"{size[0]} x {size[1]}: give both the same size."
+        )
+    return mask
 
 
 def _without_alpha(photo: Photo) -> Photo:

@@ -2,13 +2,58 @@
 
 import collections
 import pathlib
+from collections.abc import Sequence
 
 from jaxcloseup.captures.photo_masks import list_pictures
 from jaxcloseup.captures.world_frames import Frame
+from jaxcloseup.photos.scene import SceneError
 
 
 _FOLDER = "images"
 _FACTORS = (2, 4, 8)
+_PIXELS = {"fx", "fy", "fl_x", "fl_y", "cx", "cy"}  # fields in pixels of the full size
+
+
+def photographs_folder(folder: pathlib.Path) -> pathlib.Path:
+    """Return a capture's `images`; where that does not exist, the least shrunk that does."""
+    whole = folder / _FOLDER
+    shrunk = (folder / f"{_FOLDER}_{factor}" for factor in _FACTORS)
+    return whole if whole.exists() else next((one for one in shrunk if one.is_dir()), whole)
+
+
+def existing_place(file: pathlib.Path) -> pathlib.Path:
+    """Return where a file in `images` lies: there, or in the folder that stands in for it."""
+    root = next((root for root in file.parents if root.name == _FOLDER), None)
+    return file if root is None else photographs_folder(root.parent) / file.relative_to(root)
+
+
+def is_stand_in(frame: Frame) -> bool:
+    """Return True if a frame's file is shrunk, because `images` does not exist."""
+    names = {f"{_FOLDER}_{factor}" for factor in _FACTORS}
+    names -= set(pathlib.PurePath(frame.listed).parts)
+    return any(root.name in names for root in frame.file.parents)
+
+
+def note_stand_ins(name: str, frames: Sequence[Frame]) -> tuple[str, ...]:
+    """Return a note if shrunk photographs are read in place of their originals.
+
+    Args:
+      name: name of the capture, for the note.
+      frames: photographs of the capture.
+
+    Raises:
+      SceneError: intrinsics in pixels cannot be scaled, because the original size is unknown.
+    """
+    shrunk = [frame for frame in frames if is_stand_in(frame)]
+    for frame in shrunk:
+        if frame.size is None and not _PIXELS.isdisjoint([*frame.lens[0], *frame.lens[1]]):
+            raise SceneError(
+                f"{frame.label}: only {frame.file} exists, and the intrinsics cannot be scaled to "
+                "it: give w and h of the full-size photographs, or restore these."
+            )
+    return (
+        (f"{name}: reading shrunk photographs, because {_FOLDER} does not exist",) if shrunk else ()
+    )
 
 
 def attach_reduced(

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxcloseup.captures.distortion import COEFFICIENTS, read_distortion
 from jaxcloseup.captures.json_fields import image_side, read_object, rigid_transform
+from jaxcloseup.captures.reduced_photos import existing_place
 from jaxcloseup.captures.world_frames import Frame, check_photographs, frame_intrinsics
 from jaxcloseup.photos.scene import SceneError, UnknownKeyWarning
 
@@ -24,7 +25,7 @@ _FILE_KEYS = _LENS_KEYS | {
     *("frames", "near", "far", "ply_file_path", "applied_transform", "applied_scale"),
     *("train_filenames", "test_filenames", "val_filenames"),
 }
-_FRAME_KEYS = _LENS_KEYS | {"file_path", "transform_matrix", "mask_path"}
+_FRAME_KEYS = _LENS_KEYS | {"file_path", "transform_matrix", "mask_path", "mask_filename"}
 # Common fields that do not affect loading and are ignored without a warning.
 _UNUSED_KEYS = {
     *("aabb_scale", "scale", "offset", "render_aabb", "sharpness", "rotation", "colmap_im_id"),
@@ -75,10 +76,11 @@ def _read_frame(path: pathlib.Path, fields: dict[str, Any], entry: dict[str, Any
     if "transform_matrix" not in entry:
         raise SceneError(f"{label}: no transform_matrix: give its camera-to-world pose.")
     pose = rigid_transform(label, "transform_matrix", entry["transform_matrix"])
-    mask = entry.get("mask_path") or None
+    key = "mask_path" if entry.get("mask_path") else "mask_filename"
+    mask = entry.get(key) or None
     if not isinstance(mask, str | None):
         raise SceneError(
-            f"{label}: mask_path is {mask!r}: give the path of a mask, or remove the field."
+            f"{label}: {key} is {mask!r}: give the path of a mask, or remove the field."
         )
     frame = Frame(
         source=path,
@@ -96,6 +98,6 @@ def _read_frame(path: pathlib.Path, fields: dict[str, Any], entry: dict[str, Any
 
 def _find(folder: pathlib.Path, listed: str) -> pathlib.Path:
     """Find the listed file; Blender's datasets leave out the suffix."""
-    path = folder / listed.replace("\\", "/")
+    path = existing_place(folder / listed.replace("\\", "/"))
     candidates = [pathlib.Path(f"{path}{suffix}") for suffix in _SUFFIXES]
     return next((candidate for candidate in candidates if candidate.is_file()), path)

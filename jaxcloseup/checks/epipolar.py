@@ -69,7 +69,9 @@ def _rays(matches: Matches, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
     flat = (matches.pixels - lenses[..., 2:]) / lenses[..., :2]
     local = np.concatenate([flat, np.ones((*flat.shape[:-1], 1))], -1)
     world = np.einsum("mvij,mvj->mvi", cameras.camtoworld[matches.views, :, :3], local)
-    squared = np.sum(local**2, -1)  # 1 / cos^2, by which a pixel far from the axis is a smaller angle
+    squared = np.sum(
+        local**2, -1
+    )  # 1 / cos^2, by which a pixel far from the axis is a smaller angle
     focal = np.sqrt(lenses[..., 0] * lenses[..., 1])
     return world / np.sqrt(np.sum(world**2, -1, keepdims=True)), focal * squared
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxcloseup.captures.features import Features, find_features
 from jaxcloseup.captures.photo import Photo, Reading
-from jaxcloseup.captures.photo_reading import read_small
+from jaxcloseup.captures.small_photos import read_small
 from jaxcloseup.captures.world_frames import Frame
 from jaxcloseup.checks.epipolar import Cameras
 from jaxcloseup.checks.matches import Matches, find_matches
@@ -47,7 +47,12 @@ def gather(
     def measure(frame: Frame) -> tuple[Photo, np.ndarray, Features, np.ndarray]:
         photo = read_small(frame, reading, SIDE)
         gray = cv2.cvtColor(photo.rgb, cv2.COLOR_RGB2GRAY)
-        return photo._replace(rgb=photo.rgb[:0]), gray, find_features(photo.rgb, photo.mask, _FEATURES), look(photo.rgb, photo.mask)
+        return (
+            photo._replace(rgb=photo.rgb[:0]),
+            gray,
+            find_features(photo.rgb, photo.mask, _FEATURES),
+            look(photo.rgb, photo.mask),
+        )
 
     done = []
     with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:

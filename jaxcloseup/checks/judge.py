@@ -36,9 +36,7 @@ class Checked:
     worst: tuple[tuple[str, float], ...]  # photographs with the smallest shares of fitting matches
 
 
-def judge(
-    evidence: Evidence, points: np.ndarray, *, opengl: bool, ordered: bool = True
-) -> Checked:
+def judge(evidence: Evidence, points: np.ndarray, *, opengl: bool, ordered: bool = True) -> Checked:
     """Judge a capture.
 
     Args:
@@ -93,10 +91,14 @@ def _judge_poses(
     if found.share >= 1 - _MOST_WRONG and not bad:
         if found.median <= _BLURRED:
             return FITS, fits, ()
-        return LOOSE, (
-            f"{len(names)} photographs, poses are off by {found.median:.1f} px in the median (of "
-            f"{SIDE} px): close-ups will be blurred by as much"
-        ), ()
+        return (
+            LOOSE,
+            (
+                f"{len(names)} photographs, poses are off by {found.median:.1f} px in the median (of "
+                f"{SIDE} px): close-ups will be blurred by as much"
+            ),
+            (),
+        )
     said = (
         f"{round(found.share * count):,} of {count:,} features that match between photographs fit "
         f"their poses (median error {found.median:.0f} px of {SIDE})"
@@ -143,8 +145,9 @@ def _judge_points(
         return f"; {len(points):,} points fit", ()
     axes = find_points_mistake(points, evidence.gray, evidence.cameras)
     if axes:
-        return f"; {len(points):,} points lie in another world than the cameras, turned to ({axes})", (
-            f"points={axes}",
+        return (
+            f"; {len(points):,} points lie in another world than the cameras, turned to ({axes})",
+            (f"points={axes}",),
         )
     if found.fits:
         return f"; {len(points):,} points fit", ()

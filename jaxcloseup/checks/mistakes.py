@@ -29,7 +29,9 @@ class Mistake(NamedTuple):
 
 
 _POSES = {
-    ("axes",): "the cameras' axes are those of the other convention (OpenGL's y and z, or OpenCV's)",
+    (
+        "axes",
+    ): "the cameras' axes are those of the other convention (OpenGL's y and z, or OpenCV's)",
     ("inverse",): "the matrices are world-to-camera, not camera-to-world",
     ("inverse", "axes"): (
         "the matrices are world-to-camera, not camera-to-world, with the axes of the other "
@@ -151,7 +153,9 @@ def _search(
     step = 0.08
     while step > 1e-3:
         around = [
-            tuple(np.clip(np.add(best, sign * step * (np.arange(3) == axis)), np.negative(_FAR), _FAR))
+            tuple(
+                np.clip(np.add(best, sign * step * (np.arange(3) == axis)), np.negative(_FAR), _FAR)
+            )
             for axis in range(3)
             for sign in (-1, 1)
         ]

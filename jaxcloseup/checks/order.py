@@ -75,9 +75,7 @@ def _free(order: dict[int, int], count: int) -> np.ndarray:
     return np.setdiff1d(np.arange(count), list(order.values()))
 
 
-def _spread(
-    order: dict[int, int], pairs: dict[tuple[int, int], Matches], cameras: Cameras
-) -> None:
+def _spread(order: dict[int, int], pairs: dict[tuple[int, int], Matches], cameras: Cameras) -> None:
     """Add poses of photographs that have matches with those of an order, one a time."""
     refused: set[int] = set()
     while len(free := _free(order, len(cameras.intrinsics))):

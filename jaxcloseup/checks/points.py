@@ -96,9 +96,7 @@ def _turns() -> Iterator[str]:
                 yield axes
 
 
-def _alike(
-    points: np.ndarray, gray: Sequence[np.ndarray], cameras: Cameras
-) -> tuple[float, int]:
+def _alike(points: np.ndarray, gray: Sequence[np.ndarray], cameras: Cameras) -> tuple[float, int]:
     """Return the share of textured points whose patches look alike, and their number."""
     first, second, rows = _views(points, cameras)
     if not len(rows):
@@ -108,7 +106,9 @@ def _alike(
     pixels, depth = _project(points[rows], cameras, first)
     patch = pixels[:, None] + offsets
     lenses = cameras.intrinsics[first][:, None]
-    flat = np.concatenate([(patch - lenses[..., 2:]) / lenses[..., :2], np.ones((*patch.shape[:2], 1))], -1)
+    flat = np.concatenate(
+        [(patch - lenses[..., 2:]) / lenses[..., :2], np.ones((*patch.shape[:2], 1))], -1
+    )
     poses = cameras.camtoworld[first]
     world = np.einsum("nij,nkj->nki", poses[:, :, :3], flat * depth[:, None, None])
     world += poses[:, None, :, 3]
@@ -131,7 +131,9 @@ def _views(points: np.ndarray, cameras: Cameras) -> tuple[np.ndarray, np.ndarray
     rows, view = (x.ravel() for x in np.meshgrid(np.arange(count), np.arange(views), indexing="ij"))
     pixels, depth = _project(points[rows], cameras, view)
     margin = _SPACING * _RADIUS
-    inside = (depth > 0) & (pixels > margin).all(-1) & (pixels < cameras.sizes[view] - margin).all(-1)
+    inside = (
+        (depth > 0) & (pixels > margin).all(-1) & (pixels < cameras.sizes[view] - margin).all(-1)
+    )
     depth = np.where(inside, depth, np.inf).reshape(count, views)
     rays = cameras.camtoworld[None, :, :, 3] - points[:, None]
     rays /= np.maximum(np.linalg.norm(rays, axis=-1, keepdims=True), 1e-300)
@@ -167,5 +169,7 @@ def _sample(gray: Sequence[np.ndarray], views: np.ndarray, pixels: np.ndarray) -
         rows = np.flatnonzero(views == view)
         # OpenCV puts pixel centers at integers.
         x, y = np.moveaxis(pixels[rows] - 0.5, -1, 0).astype(np.float32)
-        values[rows] = cv2.remap(gray[view], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        values[rows] = cv2.remap(
+            gray[view], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
     return values

@@ -37,12 +37,16 @@ class ImageSizeWarning(SceneWarning):
     """Photographs differ in size from what their file states; intrinsics were scaled."""
 
 
+class BlankPhotographWarning(SceneWarning):
+    """Photographs are fully transparent, and were left out, or have one color everywhere."""
+
+
 class NearFarWarning(SceneWarning):
     """The files give no depth range, so it was estimated."""
 
 
 class DuplicateFileWarning(SceneWarning):
-    """A photograph is listed more than once."""
+    """A photograph is listed more than once, or under two names."""
 
 
 class PointsWarning(SceneWarning):

@@ -30,9 +30,11 @@ from posing import (
     summary_of,
     walk_around,
 )
+from wrong_input import HEIC, put
 
 from jaxcloseup.app.process import solver_process
 from jaxcloseup.app.process.pairs import choose_pairing, pairs_to_match, similarity
+from jaxcloseup.app.process.photo_folder import copy_photographs
 from jaxcloseup.app.process.video_frames import choose_frames
 from jaxcloseup.artifacts import video as video_writer
 from jaxcloseup.artifacts.video import write_video
@@ -272,6 +274,7 @@ def test_flags_that_make_no_sense_are_one_sentence(tmp_path):
     for i in range(3):
         (tmp_path / "texts" / f"{i}.txt").write_text("")
         (tmp_path / "few" / f"{i}.heic").write_text("")
+        put(f"heic/{i}.HEIC", HEIC)(tmp_path)
     (tmp_path / "video.mp4").write_bytes(b"no video" * 1000)
     os.mkfifo(tmp_path / "pipe")
     video, images, out = str(tmp_path / "video.mp4"), str(tmp_path / "few"), str(tmp_path / "out")
@@ -285,6 +288,10 @@ def test_flags_that_make_no_sense_are_one_sentence(tmp_path):
         ({"images": images, "output_dir": out}, "holds 2 photographs .* beside 3 files"),
         ({"images": str(tmp_path / "empty"), "output_dir": out}, "holds 0 photographs"),
         ({"images": str(tmp_path / "texts"), "output_dir": out}, "holds 0 photographs .* 3 files"),
+        (
+            {"images": str(tmp_path / "heic"), "output_dir": out},
+            "holds 0 photographs .* and 0.HEIC is a HEIC photograph, which is not read: export it",
+        ),
         ({"video": images, "output_dir": out}, "cannot be read .Is a directory.: name a video"),
         ({"video": str(tmp_path / "pipe"), "output_dir": out}, "cannot be read .Not an ordinary"),
         ({"video": f"{video}4", "output_dir": out}, "cannot be read .No such file"),
@@ -293,6 +300,11 @@ def test_flags_that_make_no_sense_are_one_sentence(tmp_path):
             run_process(**given)
         assert "\n" not in error.value.code and error.value.code.startswith("jaxcloseup process: ")
         assert not (tmp_path / "out").exists()
+    renamed = [tmp_path / f"heic/{i}.HEIC" for i in range(3)]
+    with pytest.raises(
+        solver_process.ProcessingError, match=r"only 0 .*0\.HEIC is a HEIC photograph, which"
+    ):
+        copy_photographs(renamed, tmp_path / "out")
     with pytest.raises(flags.IllegalFlagValueError, match="count"):
         run_process(video=video, count=2)
     write_noise(tmp_path / "noise", 3)

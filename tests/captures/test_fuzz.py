@@ -49,7 +49,8 @@ from jaxcloseup.app.view.camera_files import read_camera_path, read_camera_trans
 from jaxcloseup.app.view.camera_paths import CameraError
 from jaxcloseup.artifacts.checkpoints import CheckpointError, Checkpoints
 from jaxcloseup.captures.load import SceneError, load_scene
-from jaxcloseup.captures.photo_files import read_image, read_mask
+from jaxcloseup.captures.mask_values import read_mask
+from jaxcloseup.captures.photo_files import read_image
 from jaxcloseup.io.ply import PlyError, read_vertices
 from jaxcloseup.io.torch_file import TorchFileError, read_tensors
 
@@ -62,7 +63,13 @@ TESTS = pathlib.Path(__file__).parents[1]
 ERRORS = (SceneError, RunError, CheckpointError, CameraError, PlyError, TorchFileError)
 LOAD_OPTIONS = [
     *({}, {}, {"split": "every8"}, {"split": "closest"}, {"split": "zoom", "zoom": 2}),
-    *({"downscale": 2}, {"invert_masks": True}, {"alpha_mode": "mask"}, {"half_pixel": True}),
+    *(
+        {"downscale": 2},
+        {"invert_masks": True},
+        {"alpha_mode": "mask"},
+        {"alpha_mode": "ignore"},
+        {"half_pixel": True},
+    ),
 ]
 
 
@@ -145,6 +152,7 @@ def make_pictures(folder):
     write_image(folder / "b.png", picture)
     write_image(folder / "c.png", picture[..., 0])
     write_image(folder / "d.png", picture[..., :3].astype(np.uint16) * 257)
+    write_image(folder / "e.tif", picture)
 
 
 def read_pictures(rng, folder):

@@ -8,10 +8,11 @@ import numpy as np
 import PIL.Image
 import pytest
 from tiny_capture import HEIGHT, WIDTH, write_image
+from wrong_input import HEIC
 
 from jaxcloseup.captures import photo_files
 from jaxcloseup.captures.load import SceneError
-from jaxcloseup.captures.photo_files import read_image
+from jaxcloseup.captures.photo_files import decode_image, read_image
 
 
 def test_gray_deep_and_transparent_images(tmp_path):
@@ -38,6 +39,69 @@ def test_exif_orientation_is_not_applied(tmp_path):
     (tmp_path / "a.jpg").write_bytes(data[:2] + app1 + data[2:])
     assert cv2.imread(str(tmp_path / "a.jpg")).shape == (WIDTH, HEIGHT, 3)  # the tag is well-formed
     assert read_image(tmp_path / "a.jpg").shape == (HEIGHT, WIDTH, 3)
+
+
+@pytest.mark.parametrize("order", "<>")
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_tiff_orientation_is_not_applied(tmp_path, order, kind, channels):
+    """OpenCV would turn the image; the witness is the same image in a PNG."""
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, np.iinfo(kind).max, (HEIGHT, WIDTH, channels)).astype(kind)
+    write_image(tmp_path / "a.png", image[..., 0] if channels == 1 else image)
+    (tmp_path / "a.tif").write_bytes(tiff(image, order, 1))
+    plain = decode_image(tmp_path / "a.tif")
+    np.testing.assert_array_equal(plain, decode_image(tmp_path / "a.png"))
+    for orientation in range(2, 9):
+        (tmp_path / "a.tif").write_bytes(tiff(image, order, orientation))
+        np.testing.assert_array_equal(decode_image(tmp_path / "a.tif"), plain)
+
+
+def tiff(image, order, orientation, *more):
+    """Encode an uncompressed TIFF; `more` are further tags and their numbers."""
+    height, width, channels = image.shape
+    tags = {256: width, 257: height, 258: 8 * image.itemsize, 259: 1, 262: 1 + (channels > 1)}
+    tags |= {273: 8, 274: orientation, 277: channels, 278: height, 279: image.nbytes, 284: 1}
+    tags |= {338: 2} if channels == 4 else {}
+    tags |= dict(more)
+    entries = [struct.pack(order + "HHIHH", tag, 3, 1, tags[tag], 0) for tag in sorted(tags)]
+    if channels > 1:  # the bits of each channel follow the directory
+        bits = 8 + image.nbytes + 2 + 12 * len(entries) + 4
+        entries[sorted(tags).index(258)] = struct.pack(order + "HHII", 258, 3, channels, bits)
+    return b"".join(
+        [
+            b"II*\0" if order == "<" else b"MM\0*",
+            struct.pack(order + "I", 8 + image.nbytes),
+            image.astype(image.dtype.newbyteorder(order)).tobytes(),
+            struct.pack(order + "H", len(entries)),
+            *entries,
+            bytes(4),
+            struct.pack(order + f"{channels}H", *[8 * image.itemsize] * channels),
+        ]
+    )
+
+
+GRAY = np.zeros((HEIGHT, WIDTH, 1), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (HEIC, "is a HEIC photograph, which is not read: export it as JPEG"),
+        (b"\x76\x2f\x31\x01" + bytes(99), "is an OpenEXR image, .*: export it as PNG"),
+        (b"\xff\x0a" + bytes(99), "is a JPEG XL image"),
+        (b"\0\0\0\x0cJXL \r\n\x87\n" + bytes(99), "is a JPEG XL image"),
+        (b"\0\0\0\x18ftypcrx " + bytes(99), "is a camera's raw file, .*: develop it and"),
+        (b"II*\0\x10\0\0\0CR\x02\0" + bytes(99), "is a camera's raw file"),
+        (tiff(GRAY, "<", 1, (50706, 1)), "is a camera's raw file"),
+        (tiff(GRAY, ">", 1, (254, 1), (330, 8)), "is a camera's raw file"),
+        (tiff(np.repeat(GRAY, 4, -1), "<", 1, (262, 5)), "is a TIFF of CMYK colors.*: export it"),
+    ],
+)
+def test_formats_that_are_not_read_are_named_by_their_content(tmp_path, data, words):
+    (tmp_path / "a.jpg").write_bytes(data)
+    with pytest.raises(SceneError, match=rf"a\.jpg {words}"):
+        read_image(tmp_path / "a.jpg")
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])

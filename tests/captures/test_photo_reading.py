@@ -48,7 +48,7 @@ def test_photographs_that_exceed_memory_are_refused_before_they_are_read(tmp_pat
     monkeypatch.setattr(photo_reading, "installed_memory", lambda: 2 * 2**20)
     with pytest.raises(SceneError, match=r"9 photographs of 400 x 300 pixels need .* at least 3"):
         load_scene(tmp_path)
-    (tmp_path / "008.jpg").write_bytes((tmp_path / "007.jpg").read_bytes())
+    (tmp_path / "008.jpg").write_bytes((tmp_path / "007.jpg").read_bytes() + b"8")
     assert len(load_scene(tmp_path, downscale=3).train) == 7
 
 
@@ -68,8 +68,8 @@ def test_photographs_keep_the_order_of_their_frames(tmp_path):
     for i in range(9):
         side = 400 if i % 2 else 20
         (tmp_path / f"{i}.png").write_bytes(
-            cv2.imencode(".png", np.full((side, side, 3), i, np.uint8))[1].tobytes()
+            cv2.imencode(".png", np.tri(side, dtype=np.uint8) + i)[1].tobytes()
         )
     write_json(tmp_path / "transforms_train.json", [frame(f"{i}.png") for i in range(9)])
     scene = load_scene(tmp_path)
-    assert scene.train.rgb[:, 0, 0, 0].tolist() == list(range(9))
+    assert scene.train.rgb[:, 0, 0, 0].tolist() == list(range(1, 10))

@@ -1,9 +1,11 @@
 """Already shrunk photographs in `images_2`, and the cache of photographs shrunk here."""
 
+import shutil
+
 import cv2
 import numpy as np
 import pytest
-from tiny_capture import POSE, colmap_capture, llff_capture, write_image, write_json
+from tiny_capture import POSE, colmap_capture, llff_capture, single_file, write_image, write_json
 
 from jaxcloseup.captures import photo_reading
 from jaxcloseup.captures.load import SceneError, load_scene
@@ -47,7 +49,7 @@ def test_shrunk_photographs_are_used(tmp_path, size):
     )
     np.testing.assert_allclose(weight.mean((1, 2)), [1, 5 / 9, 1], atol=2e-3)
     assert scene.names["train"] == ["a", "b", "c"]
-    assert scene.metadata["notes"][-1].endswith("using the shrunk photographs in images_2")
+    assert scene.metadata["notes"][-2].endswith("using the shrunk photographs in images_2")
     assert (load(tmp_path)[0][1] == picture(1)).all()  # not used at full size
 
 
@@ -91,6 +93,39 @@ def test_a_size_that_no_rounding_explains(tmp_path):
         load_scene(tmp_path, downscale=2)
 
 
+@pytest.mark.parametrize(
+    "make", [lambda folder: single_file(folder, 3), llff_capture, colmap_capture]
+)
+def test_shrunk_photographs_alone_are_the_photographs(tmp_path, make):
+    """Their intrinsics follow the ratio of sizes, and masks of the full size shrink with them."""
+    if make is colmap_capture:
+        pytest.importorskip("pycolmap")
+    make(tmp_path)
+    lens = load(tmp_path)[2].train.cameras.intrinsics
+    names = [path.name for path in (tmp_path / "images").iterdir()]
+    shutil.rmtree(tmp_path / "images")
+    for name in names:
+        write_image(tmp_path / "images_2" / name, np.full((3, 4, 3), 77, np.uint8))
+        write_image(tmp_path / "masks" / name, np.tile(np.uint8([0, 255]), (6, 4)))
+    rgb, weight, scene = load(tmp_path)
+    assert (rgb == 77).all()
+    np.testing.assert_allclose(weight, 0.5, atol=0.01)
+    np.testing.assert_allclose(scene.train.cameras.intrinsics, lens / 2, rtol=1e-6)
+    words = "reading shrunk photographs, because images does not exist"
+    assert any(note.endswith(words) for note in scene.metadata["notes"])
+
+
+def test_shrunk_photographs_alone_need_sizes(tmp_path):
+    write_capture(tmp_path)
+    (tmp_path / "images").rename(tmp_path / "images_4")
+    frames = [{"file_path": "images/a.png", "transform_matrix": POSE.tolist()}]
+    write_json(tmp_path / "transforms_train.json", frames, camera_angle_x=0.6)
+    assert (load(tmp_path)[0][0] == picture(0)).all()
+    write_json(tmp_path / "transforms_train.json", frames, fl_x=7.0)
+    with pytest.raises(SceneError, match=r"only .*images_4/a\.png exists, .*: give w and h of"):
+        load_scene(tmp_path)
+
+
 # The cache.
 
 
@@ -110,13 +145,13 @@ def capture(tmp_path, cache):
 @pytest.fixture
 def decoded(monkeypatch):
     """Collects the names of the images that are decoded."""
-    names, read = [], photo_reading.read_image
+    names, read = [], photo_reading.decode_image
 
     def count(path, **options):
         names.append(path.name)
         return read(path, **options)
 
-    monkeypatch.setattr(photo_reading, "read_image", count)
+    monkeypatch.setattr(photo_reading, "decode_image", count)
     return names
 
 

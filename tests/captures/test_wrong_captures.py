@@ -1,12 +1,14 @@
 """Captures that cannot be loaded: each is refused in one sentence that says what to do."""
 
 import pathlib
+import shutil
 import warnings
 
 import numpy as np
 import pytest
 from tiny_capture import HEIGHT, PINHOLE, POSE, WIDTH, frame, image_line, single_file, write_json
 from wrong_input import (
+    HEIC,
     IMAGES,
     TRAIN,
     all_of,
@@ -34,7 +36,12 @@ from wrong_input import (
 
 from jaxcloseup.captures import photo_files
 from jaxcloseup.captures.load import SceneError, SceneWarning, load_scene
-from jaxcloseup.photos.scene import DuplicateFileWarning, PointsWarning, UnknownKeyWarning
+from jaxcloseup.photos.scene import (
+    BlankPhotographWarning,
+    DuplicateFileWarning,
+    PointsWarning,
+    UnknownKeyWarning,
+)
 
 
 pytestmark = pytest.mark.usefixtures("soon")
@@ -184,6 +191,8 @@ CASES = {
         (listing(test_filenames=["000.png"]), r"test_filenames names '000\.png', which is no fr"),
         (listing(val_filenames=["images/000.png", "images/001.png"]), "every frame is held out"),
         (put("masks/000.png", "x"), r"masks/000\.png is not a readable image"),
+        (put("masks/000.png", np.eye(3) + 1), r"masks/000\.png: masks hold 2 values from 1 to 2"),
+        (put("images/000.png", HEIC), r"images/000\.png is a HEIC photograph, which is not read"),
         (put("masks/000.png", BLACK), "3 x 3 pixels but its photograph is 8 x 6"),
         (put("images/000.mask.png", BLACK), r"images/000\.mask\.png is 3 x 3 pixels"),
         (pipe("masks/000.png"), NOT_ORDINARY),
@@ -347,8 +356,9 @@ WHOLE = "must be a whole number of at least"
             single,
             put("images/001.png", CLEAR),
             {"alpha_mode": "mask"},
-            "only opaque pixels are kept, so leave out alpha_mode",
+            "training photographs are fully transparent: .* set alpha_mode to ignore if",
         ),
+        (single, put("images/001.png", CLEAR), {}, "training photographs are fully transparent"),
         (single, shrunk(HALF, TALL), {"downscale": 2}, "4 x 7 pixels, which is not 8 x 6"),
         (single, shrunk(HALF, b"x"), {"downscale": 2}, r"images_2/001\.png is not a read"),
         (
@@ -395,7 +405,7 @@ def test_files_without_permission(tmp_path, monkeypatch):
         raise PermissionError(13, "Permission denied", str(path))
 
     for owner, name, words in (
-        (photo_files, "read_bytes", r"train/.\.png cannot be read \(Permission denied\): r"),
+        (photo_files, "read_bytes", r"t(rain|est)/.\.png cannot be read \(Permission denied\): r"),
         (pathlib.Path, "read_bytes", rf"{TRAIN} cannot be read \(Permission den"),
         (pathlib.Path, "is_file", r"\.json cannot be read \(Permission denied\): make it"),
     ):
@@ -436,16 +446,64 @@ def test_unknown_fields_warn_once_per_file(tmp_path):
     assert str(caught[0].message).endswith(words)
 
 
-def test_one_photograph_in_two_lists(tmp_path):
+def copy(name, other):
+    return lambda folder: shutil.copy(folder / name, folder / other)
+
+
+@pytest.mark.parametrize(
+    ("make", "change", "category", "words", "count"),
+    [
+        (
+            llff,
+            put("split.json", {"train": ["0.png", "1.png"], "test": ["1.png"]}),
+            DuplicateFileWarning,
+            r"lists 1 photographs more than once: 1\.png \(train and",
+            2,
+        ),
+        (
+            llff,
+            copy("images/0.png", "images/2.png"),
+            DuplicateFileWarning,
+            r"1 photographs are the same file as another, such as 2\.png as 0\.png: remove",
+            2,
+        ),
+        (
+            llff,
+            put("images/1.png", CLEAR),
+            BlankPhotographWarning,
+            r"fully transparent photographs were left out: 1, such as 1\.png",
+            1,
+        ),
+        (
+            paper,
+            put("train/a.png", np.full((30, 40, 3), 9)),
+            BlankPhotographWarning,
+            r"constant photographs show one color everywhere: 1, such as a\.png",
+            2,
+        ),
+        (
+            paper,
+            ply(3, "1 2 3\n4 5 6\n1e39 0 0\n"),
+            PointsWarning,
+            "1 of 3 points are not finite",
+            2,
+        ),
+    ],
+)
+def test_what_looks_like_a_mistake_warns(tmp_path, make, change, category, words, count):
+    make(tmp_path)
+    change(tmp_path)
+    with pytest.warns(category, match=words):
+        scene = load_scene(tmp_path)
+    assert len(scene.train) == len(scene.names["train"]) == count
+
+
+@pytest.mark.parametrize("options", [{}, {"split": "zoom", "zoom": 2}])
+def test_transparent_photographs_are_in_no_split(tmp_path, options):
     llff(tmp_path)
-    put("split.json", {"train": ["0.png", "1.png"], "test": ["1.png"]})(tmp_path)
-    words = r"lists 1 photographs more than once: 1\.png \(train and"
-    with pytest.warns(DuplicateFileWarning, match=words):
-        load_scene(tmp_path)
-
-
-def test_points_beyond_their_type_are_dropped(tmp_path):
-    paper(tmp_path)
-    ply(3, "1 2 3\n4 5 6\n1e39 0 0\n")(tmp_path)
-    with pytest.warns(PointsWarning, match="1 of 3 points are not finite"):
-        assert len(load_scene(tmp_path).points) == 2
+    for i in range(2):  # the held-out one, and the one whose crop is held out
+        put(f"images/{i}.png", CLEAR)(tmp_path)
+    with pytest.warns(BlankPhotographWarning, match="left out: 2, such"):
+        scene = load_scene(tmp_path, **options)
+    assert scene.names == {"train": ["2"]} and scene.test is None and scene.test_far is None
+    assert len(load_scene(tmp_path, alpha_mode="ignore", **options).train) == 2

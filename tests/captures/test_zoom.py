@@ -62,11 +62,11 @@ def test_zoom_multiplies_downscale(capture):
 def test_each_photograph_is_decoded_once_without_warnings(capture, monkeypatch):
     from jaxcloseup.captures import photo_reading
 
-    read, decode = [], photo_reading.read_image
+    read, decode = [], photo_reading.decode_image
     monkeypatch.setenv("XDG_CACHE_HOME", str(capture / "cache"))
     monkeypatch.setattr(
         photo_reading,
-        "read_image",
+        "decode_image",
         lambda path, *a, **k: read.append(path.name) or decode(path, *a, **k),
     )
     with warnings.catch_warnings():

@@ -94,7 +94,8 @@ with topic("The capture") as _CAPTURE:
         "alpha_mode",
         "blend",
         list(ALPHA_MODES),
-        "how to read transparent pixels: blend: over a white background; mask: as masked pixels",
+        "how to read transparent pixels: blend: over a white background; mask: as masked pixels; "
+        "ignore: as opaque ones",
     )
 with topic("The capture") as _PIXELS:
     flags.DEFINE_bool(

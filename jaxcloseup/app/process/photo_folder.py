@@ -19,6 +19,7 @@ from jaxcloseup.app.process.counting import progress
 from jaxcloseup.app.process.options import FEWEST
 from jaxcloseup.app.process.solver_process import ProcessingError
 from jaxcloseup.artifacts.images import encode_png
+from jaxcloseup.captures.file_kinds import unread_format
 from jaxcloseup.captures.photo_files import ENDINGS, read_file, read_image
 from jaxcloseup.io.files import write_file
 from jaxcloseup.io.messages import printable
@@ -29,6 +30,8 @@ _AT_ONCE = 4  # photographs in memory
 _LONGEST_STEM = 60  # characters
 _QUALITY = 95  # of a JPEG that was turned
 _KEPT = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}  # formats that COLMAP reads everywhere
+_HEAD = 2**16  # bytes that tell a format
+_OTHER = "is not a photograph"
 _NEEDS_CONVERSION = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"}
 
 
@@ -53,17 +56,29 @@ def list_files(folder: pathlib.Path) -> tuple[list[pathlib.Path], dict[str, str]
     photographs = [path for path in files if path.suffix.lower() in ENDINGS]
     left_out = {}
     for path in files:
-        if path.suffix.lower() in _NEEDS_CONVERSION:
-            left_out[printable(path.name)] = "has a format that is not read: export it as JPEG"
-        elif path.suffix.lower() not in ENDINGS:
-            left_out[printable(path.name)] = "is not a photograph"
+        if path.suffix.lower() not in ENDINGS:
+            left_out[printable(path.name)] = _why_not(path)
     if len(photographs) < FEWEST:
         others = f" beside {len(left_out)} files that are not" if left_out else ""
+        unread = [f", and {name} {why}" for name, why in left_out.items() if why != _OTHER]
         raise ProcessingError(
             f"--images={folder} holds {len(photographs)} photographs "
             f"({', '.join(sorted(ENDINGS))}){others}: poses need at least {FEWEST}"
+            + "".join(unread[:1])
         )
     return photographs, left_out
+
+
+def _why_not(path: pathlib.Path) -> str:
+    """Say why a file is left out, by what it holds or by the ending of its name."""
+    try:
+        with path.open("rb") as file:
+            known = unread_format(np.frombuffer(file.read(_HEAD), np.uint8))
+    except OSError as error:
+        return f"cannot be read ({error.strerror})"
+    if known is None and path.suffix.lower() in _NEEDS_CONVERSION:
+        known = "has another format", "export it as JPEG"
+    return _OTHER if known is None else f"{known[0]}, which is not read: {known[1]}"
 
 
 def copy_photographs(

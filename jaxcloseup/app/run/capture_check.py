@@ -76,7 +76,9 @@ def fitting_options(
         # Without the user's word a turn is not applied, but wrong points are not used either.
         applied += found.points if fix else ("points=none",)
         instead = f"turned by {found.points[0]}" if fix and turned else "not used"
-        print(f"{name}: points are {instead}" + ("; --fix turns them" if turned and not fix else ""))
+        print(
+            f"{name}: points are {instead}" + ("; --fix turns them" if turned and not fix else "")
+        )
     for note in found.notes:
         print(f"{name}: {note}")
     changed = {**options, "corrections": applied} if applied else dict(options)

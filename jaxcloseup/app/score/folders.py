@@ -9,7 +9,8 @@ import numpy as np
 
 from jaxcloseup.app import progress
 from jaxcloseup.app.score.scores import Perceptual, score_image, summarize
-from jaxcloseup.captures.photo_files import ENDINGS, read_image, read_mask
+from jaxcloseup.captures.mask_values import read_mask, understand_masks
+from jaxcloseup.captures.photo_files import ENDINGS, read_image
 from jaxcloseup.photos.views import to_float
 
 
@@ -67,12 +68,13 @@ def evaluate_folders(
     _check_names(f"--truth={truth}", true, f"--renders={renders}", pairs)
     if masks is not None:
         _check_names(f"--masks={masks}", weights, f"--renders={renders}", pairs)
+    values = understand_masks(list(weights.values()))[0] if weights else None
     views = {}
     for name, path in progress.track(list(pairs.items()), "scoring images"):
         image, target = read_image(path), read_image(true[name])
         weight = np.ones(image.shape[:2], np.uint8) * 255
         if masks is not None:
-            weight = read_mask(weights[name])
+            weight = read_mask(weights[name], values)
         for other, what in ((target, true[name]), (weight, weights.get(name))):
             if other.shape[:2] != image.shape[:2]:
                 raise ValueError(
