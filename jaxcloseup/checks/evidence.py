@@ -47,12 +47,9 @@ def gather(
     def measure(frame: Frame) -> tuple[Photo, np.ndarray, Features, np.ndarray]:
         photo = read_small(frame, reading, SIDE)
         gray = cv2.cvtColor(photo.rgb, cv2.COLOR_RGB2GRAY)
-        return (
-            photo._replace(rgb=photo.rgb[:0]),
-            gray,
-            find_features(photo.rgb, photo.mask, _FEATURES),
-            look(photo.rgb, photo.mask),
-        )
+        features = find_features(photo.rgb, photo.mask, _FEATURES)
+        # Colors are done with.
+        return photo._replace(rgb=photo.rgb[:, :, :0]), gray, features, look(photo.rgb, photo.mask)
 
     done = []
     with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -78,11 +75,12 @@ def look(rgb: np.ndarray, mask: np.ndarray) -> np.ndarray:
       rgb: `[H, W, 3]` uint8.
       mask: `[H, W]` uint8; pixels below 128 do not count.
     """
-    used = mask >= 128
+    used: np.ndarray = mask >= 128
     if not used.any():
         return np.zeros(4)
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     contrast = float(gray[used].std())
     edges = float(cv2.Laplacian(gray, cv2.CV_32F)[used].std())
-    black, white = (rgb <= 2).all(-1)[used].mean(), (rgb >= 253).all(-1)[used].mean()
+    inside = rgb[used]
+    black, white = (inside <= 2).all(-1).mean(), (inside >= 253).all(-1).mean()
     return np.array([contrast, edges / max(contrast, 1e-6), black, white])

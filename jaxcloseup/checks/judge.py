@@ -86,7 +86,7 @@ def _judge_poses(
 ) -> tuple[str, str, tuple[str, ...]]:
     """Return verdict, sentence and corrections for poses and lenses."""
     count = len(evidence.matches.views)
-    bad = [names[i] for i in np.flatnonzero(found.by_view < _BAD)]
+    bad = [name for name, share in zip(names, found.by_view, strict=True) if share < _BAD]
     fits = f"{len(names)} photographs, poses fit: {found.median:.1f} px"
     if found.share >= 1 - _MOST_WRONG and not bad:
         if found.median <= _BLURRED:
@@ -94,8 +94,8 @@ def _judge_poses(
         return (
             LOOSE,
             (
-                f"{len(names)} photographs, poses are off by {found.median:.1f} px in the median (of "
-                f"{SIDE} px): close-ups will be blurred by as much"
+                f"{len(names)} photographs, poses are off by {found.median:.1f} px of {SIDE} in "
+                "the median: close-ups will be blurred by as much"
             ),
             (),
         )
@@ -152,8 +152,8 @@ def _judge_points(
     if found.fits:
         return f"; {len(points):,} points fit", ()
     return (
-        f"; {len(points):,} points do not lie on what the photographs show "
-        f"({100 * found.share:.0f} % look alike in two of them, {100 * found.moved:.0f} % by chance)"
+        f"; {len(points):,} points do not lie on what photographs show ({100 * found.share:.0f} % "
+        f"look alike in two of them, {100 * found.moved:.0f} % by chance)"
     ), ("points=none",)
 
 

@@ -68,5 +68,5 @@ def exposures(matches: Matches, names: Sequence[str]) -> list[str]:
 
 
 def _some(names: Sequence[str], chosen: np.ndarray) -> str:
-    first = [names[i] for i in np.flatnonzero(chosen)]
+    first = [name for name, one in zip(names, chosen, strict=True) if one]
     return ", ".join(first[:_NAMED]) + (", ..." if len(first) > _NAMED else "")

@@ -25,7 +25,7 @@ class Matches(NamedTuple):
     pixels: np.ndarray  # `[M, 2, 2]` positions in pixels
     rgb: np.ndarray  # `[M, 2, 3]` uint8 colors
 
-    def __getitem__(self, rows: slice | np.ndarray) -> "Matches":  # type: ignore[override]
+    def take(self, rows: slice | np.ndarray) -> "Matches":
         """Return some of the matches."""
         return Matches(self.views[rows], self.pixels[rows], self.rgb[rows])
 

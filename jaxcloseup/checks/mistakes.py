@@ -29,9 +29,7 @@ class Mistake(NamedTuple):
 
 
 _POSES = {
-    (
-        "axes",
-    ): "the cameras' axes are those of the other convention (OpenGL's y and z, or OpenCV's)",
+    ("axes",): "the cameras' axes are of the other convention (OpenGL's y and z, or OpenCV's)",
     ("inverse",): "the matrices are world-to-camera, not camera-to-world",
     ("inverse", "axes"): (
         "the matrices are world-to-camera, not camera-to-world, with the axes of the other "
@@ -48,7 +46,7 @@ def find_mistake(matches: Matches, cameras: Cameras, *, opengl: bool) -> Mistake
       cameras: cameras as they were read.
       opengl: whether the files' matrices have OpenGL's axes.
     """
-    matches = matches[:: math.ceil(len(matches.views) / _TRIED)]
+    matches = matches.take(slice(None, None, math.ceil(len(matches.views) / _TRIED)))
     before = fit(matches, cameras).share
     tried = [
         Mistake(corrections, sentence, fit(changed, corrected).share)
@@ -153,9 +151,7 @@ def _search(
     step = 0.08
     while step > 1e-3:
         around = [
-            tuple(
-                np.clip(np.add(best, sign * step * (np.arange(3) == axis)), np.negative(_FAR), _FAR)
-            )
+            tuple(np.clip(np.add(best, sign * step * np.eye(3)[axis]), np.negative(_FAR), _FAR))
             for axis in range(3)
             for sign in (-1, 1)
         ]

@@ -46,7 +46,7 @@ def _pairs(matches: Matches) -> dict[tuple[int, int], Matches]:
     for pair in np.unique(matches.views, axis=0):
         rows = np.flatnonzero((matches.views == pair).all(-1))
         some = rows[np.linspace(0, len(rows) - 1, min(_USED, len(rows))).astype(int)]
-        found[int(pair[0]), int(pair[1])] = matches[some]
+        found[int(pair[0]), int(pair[1])] = matches.take(some)
     return found
 
 

@@ -1,4 +1,4 @@
-"""Whether points lie on what the photographs show, by comparing patches around their projections."""
+"""Whether points lie on what photographs show: patches around their projections look alike."""
 
 import itertools
 from collections.abc import Iterator, Sequence
@@ -169,7 +169,5 @@ def _sample(gray: Sequence[np.ndarray], views: np.ndarray, pixels: np.ndarray) -
         rows = np.flatnonzero(views == view)
         # OpenCV puts pixel centers at integers.
         x, y = np.moveaxis(pixels[rows] - 0.5, -1, 0).astype(np.float32)
-        values[rows] = cv2.remap(
-            gray[view], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
+        values[rows] = cv2.remap(gray[view], x, y, cv2.INTER_LINEAR)
     return values
