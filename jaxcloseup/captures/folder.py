@@ -112,8 +112,10 @@ def _load(listing: Listing, reading: Reading) -> Scene:
             split: [photo.own_size for photo in part] for split, part in parts.items()
         }
     if listing.errors is not None:
-        metadata["seen"] = [frame.seen for frame in listing.frames["train"]]
         metadata["point_errors"] = listing.errors
+    seen = [frame.seen for frame in listing.frames["train"]]
+    if all(part is not None for part in seen):
+        metadata["seen"] = seen
     if listing.times_nearer is not None:
         metadata["times_nearer"] = listing.times_nearer
     if reading.zoom > 1:

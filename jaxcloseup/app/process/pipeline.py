@@ -114,7 +114,7 @@ def make_capture(request: Request, folder: pathlib.Path, stages: Stages) -> dict
     }
     stages.keep("summary", summary)
     with saying("drawing cameras and points from above"):
-        draw_from_above(folder / MODEL, folder / IMAGES, folder / PICTURE)
+        draw_from_above(folder / MODEL, folder / PICTURE)
     return summary
 
 
