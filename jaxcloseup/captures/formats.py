@@ -26,6 +26,7 @@ from jaxcloseup.captures.splits import (
     splits_from_file,
     spread,
     warn_duplicates,
+    without_repeats,
 )
 from jaxcloseup.captures.transforms import read_transforms
 from jaxcloseup.captures.world_frames import Frame
@@ -173,7 +174,7 @@ def _read_transforms(folder: pathlib.Path, file: pathlib.Path) -> _Content:
         f"{path.name} lists {count} views without photographs, which are not scored"
         for path, count in absent.items()
     ]
-    frames = located.frames
+    frames = without_repeats(located.frames)
     if file.name == SINGLE:
         given = splits_from_fields(file, fields, frames)
     else:

@@ -92,10 +92,10 @@ def check_missing(capture: pathlib.Path, located: Located, folders: Sequence[pat
     total = sum(frame.source == source for frame in (*located.frames, *located.missing))
     first = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
     above = capture.resolve().parent
-    places = " and ".join(f"{os.path.relpath(folder.resolve(), above)}/" for folder in folders)
+    places = ", ".join(f"{os.path.relpath(folder.resolve(), above)}/" for folder in folders)
     raise SceneError(
-        f"{source}: {len(names)} of {total} listed images do not exist ({first}), nor in any case "
-        f"or with another ending in {places}: restore them or remove their frames."
+        f"{source}: {len(names)} of {total} listed images do not exist ({first}), nor in another "
+        f"case or with another ending in {places}: restore them or remove their frames."
     )
 
 
