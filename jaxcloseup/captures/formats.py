@@ -88,8 +88,7 @@ def read_listing(
       SceneError: the folder holds no known format, or one of its files is wrong.
     """
     detected, content = _read_content(path, format)
-    folder = detected.folder
-    scene = folder.resolve().name
+    folder, scene = detected.folder, detected.folder.resolve().name
     given = content.given
     if split == "given" and not given:
         given = splits_from_file(folder, content.frames)
@@ -109,11 +108,8 @@ def read_listing(
     keep = np.ones(len(points), bool)
     if fewer or len(frames) > 1:
         keep = _seen_in_training(frames["train"], len(points))
-    shown = [frame for part in frames.values() for frame in part]
-    used = [*(frame.file for frame in content.frames), *(f.mask for f in shown if f.mask)]
-    notes = [f"{scene}: {note}" for note in (detected.note, *content.notes)]
-    notes += [*division.notes, *masked, *reduced]
-    notes += [f"{scene}: {note}" for note in unused_note(folder, used)]
+    used = [*content.frames, *(frame for part in frames.values() for frame in part)]
+    notes = [*content.notes, *division.notes, *masked, *reduced, *unused_note(folder, used)]
     if fewer:
         notes.append(f"{scene}: learns from {len(chosen)} of {len(train)} training photographs")
     if not keep.all():
@@ -153,7 +149,9 @@ def _read_content(path: pathlib.Path, format: str | None) -> tuple[Detected, _Co
     readers = {"transforms": _read_transforms, "colmap": _read_model, "llff": _read_llff}
     content = readers[detected.format](detected.folder, detected.path)
     check_positions(content.frames)
-    return detected, content
+    scene = detected.folder.resolve().name
+    notes = tuple(f"{scene}: {note}" for note in (detected.note, *content.notes))
+    return detected, content._replace(notes=notes)
 
 
 def _read_transforms(folder: pathlib.Path, file: pathlib.Path) -> _Content:

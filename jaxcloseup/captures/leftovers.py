@@ -4,9 +4,10 @@ import collections
 import os
 import pathlib
 import re
-from collections.abc import Iterable
+from collections.abc import Sequence
 
 from jaxcloseup.captures.photo_masks import FOLDER, is_picture
+from jaxcloseup.captures.world_frames import Frame
 
 
 # Reduced photographs, other formats, and what `process` writes.
@@ -14,15 +15,16 @@ _KNOWN = re.compile(r"images_\d+|sparse|colmap|cameras\.png|\..*")
 _SHOWN = 3  # names of folders
 
 
-def unused_note(capture: pathlib.Path, used: Iterable[pathlib.Path]) -> tuple[str, ...]:
+def unused_note(capture: pathlib.Path, frames: Sequence[Frame]) -> tuple[str, ...]:
     """Count images beside the used files, and name folders without any; empty if there are none.
 
     Args:
       capture: folder of the capture; only it and folders of used files in it are listed.
-      used: paths of photographs and masks.
+      frames: all photographs, with their masks.
     """
     top = os.path.abspath(capture)
-    files = {os.path.abspath(path) for path in used}
+    used = [*(frame.file for frame in frames), *(frame.mask for frame in frames if frame.mask)]
+    files = set(map(os.path.abspath, used))
     within = {file for file in files if file.startswith(os.path.join(top, ""))}
     ways = {str(parent) for file in within for parent in pathlib.PurePath(file).parents}
     counts: collections.Counter[str] = collections.Counter()
@@ -43,5 +45,6 @@ def unused_note(capture: pathlib.Path, used: Iterable[pathlib.Path]) -> tuple[st
     if folders:
         names = sorted(folders)
         more = f" and {len(names) - _SHOWN} others" if len(names) > _SHOWN else ""
-        parts.append(f"the folders {', '.join(names[:_SHOWN])}{more}")
-    return (f"not used: {', '.join(parts)}",) if parts else ()
+        several = "s" if len(names) > 1 else ""
+        parts.append(f"the subfolder{several} {', '.join(names[:_SHOWN])}{more}")
+    return (f"{capture.resolve().name}: not used: {', '.join(parts)}",) if parts else ()

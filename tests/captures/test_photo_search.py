@@ -165,7 +165,9 @@ def test_what_is_not_used_is_counted(tmp_path):
         write_image(tmp_path / name)
     for name in ("images_2/000.png", "cameras.png", "images/._0.png"):  # not worth a word
         write_image(tmp_path / name)
-    note = f"{tmp_path.name}: not used: 2 images in images/, 1 masks in masks/, the folders extra/"
+    note = (
+        f"{tmp_path.name}: not used: 2 images in images/, 1 masks in masks/, the subfolder extra/"
+    )
     assert note in load_scene(tmp_path).metadata["notes"]
 
 
