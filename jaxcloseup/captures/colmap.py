@@ -6,15 +6,17 @@ poses are world-to-camera.
 
 import collections
 import pathlib
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxcloseup.captures.colmap_checks import check_files
+from jaxcloseup.captures.colmap_files import ModelFiles, prepare_model
 from jaxcloseup.captures.distortion import read_distortion
 from jaxcloseup.captures.json_fields import number
+from jaxcloseup.captures.points import read_ply_points
 from jaxcloseup.captures.scale import plausible
-from jaxcloseup.captures.world_frames import Frame, check_photographs
+from jaxcloseup.captures.world_frames import Frame
 from jaxcloseup.photos.scene import SceneError
 
 
@@ -27,95 +29,116 @@ _FIELDS: dict[str, str] = {
 _RIGID = 1e-3
 
 
-def holds_model(folder: pathlib.Path) -> bool:
-    """Return True if a folder holds a COLMAP model, complete or not."""
-    return any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))
+class Model(NamedTuple):
+    """A sparse model."""
+
+    source: pathlib.Path  # the file that lists the images
+    frames: list[
+        Frame
+    ]  # the images that have a pose, sorted by name; their files are not found yet
+    points: np.ndarray  # `[P, 3]` float32 world points, sorted by id; P may be 0
+    rgb: np.ndarray  # `[P, 3]` float32 colors of the points in [0, 1]
+    # `[P]` mean reprojection errors in pixels of the images, NaN where unknown; None of a PLY file
+    errors: np.ndarray | None
+    notes: tuple[str, ...]  # what is unusual about its points
 
 
-def read_colmap(
-    model: pathlib.Path, photographs: pathlib.Path
-) -> tuple[pathlib.Path, list[Frame], tuple[np.ndarray, np.ndarray], np.ndarray]:
+def read_colmap(files: ModelFiles) -> Model:
     """Read a sparse model, binary or text, with or without the rigs and frames of COLMAP 3.12.
 
-    Args:
-      model: folder of cameras, images and points3D; binary files win over text files.
-      photographs: folder of the images.
-
-    Returns:
-      The file that lists the images; the images that have a pose, sorted by name; the points
-      `[P, 3]` with their colors `[P, 3]` in [0, 1], float32, sorted by id; and the points' mean
-      reprojection errors `[P]` in pixels of the images, NaN where unknown.
+    Where no image observes a point, `seen` of the frames is None.
 
     Raises:
       SceneError: names the file and the record in it, and says what to do.
     """
-    suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"
-    reconstruction = _reconstruct(model, suffix)
-    source, cameras = model / f"images{suffix}", model / f"cameras{suffix}"
+    reconstruction, names = _reconstruct(files)
+    source, cameras = files.path("images"), files.path("cameras")
     lenses = {i: _lens(cameras, camera) for i, camera in reconstruction.cameras.items()}
-    images = [image for image in reconstruction.images.values() if image.has_pose]
-    images.sort(key=lambda image: image.name)
-    _check_names(source, [image.name for image in images])
-    table = model / f"points3D{suffix}"
-    numbers = sorted(reconstruction.points3D)
-    xyz = np.array([reconstruction.points3D[i].xyz for i in numbers], np.float64).reshape(-1, 3)
-    keep = plausible(table, xyz, np.stack([image.projection_center() for image in images]))
-    kept = [point for point, good in zip(numbers, keep, strict=True) if good]
-    known, rows = set(numbers), {point: row for row, point in enumerate(kept)}
+    posed = [image for image in reconstruction.images.values() if image.has_pose]
+    images = sorted(((names.get(i.image_id, i.name), i) for i in posed), key=lambda pair: pair[0])
+    _check_names(source, [name for name, _ in images])
+    positions = np.stack([image.projection_center() for _, image in images])
+    numbers, points, rgb, errors, notes = _read_points(files, reconstruction, positions)
+    known, rows = set(reconstruction.points3D), {point: row for row, point in enumerate(numbers)}
+    observed = False
     frames = []
-    for image in images:
+    for name, image in images:
         lens, size = lenses[image.camera_id]
-        frame = _frame(
-            image, source, photographs, lens, size, f"{cameras}: camera {image.camera_id}"
-        )
+        camera = f"{cameras}: camera {image.camera_id}"
+        frame = _frame(image, name, source, lens, size, camera)
         seen = {point.point3D_id for point in image.get_observation_points2D()}
-        if absent := seen - known:
+        if (absent := seen - known) and not files.ply:
             raise SceneError(
-                f"{source}: image {image.name!r} shows point {min(absent)}, which {table} lacks: "
-                "export the model again."
+                f"{source}: image {name!r} shows point {min(absent)}, which "
+                f"{files.path('points3D')} lacks: export the model again."
             )
         visible = np.array(sorted(rows[point] for point in seen & rows.keys()), np.int64)
+        observed |= bool(len(visible))
         frames.append(frame._replace(seen=visible))
-    check_photographs(source, frames)
+    if len(points) and not observed:
+        frames = [frame._replace(seen=None) for frame in frames]
+    return Model(source, frames, points, rgb, errors, notes)
+
+
+def _read_points(
+    files: ModelFiles, reconstruction: Any, positions: np.ndarray
+) -> tuple[list[int], np.ndarray, np.ndarray, np.ndarray | None, tuple[str, ...]]:
+    """Return the points' ids, none in a PLY file, and what `Model` holds of them."""
+    if files.ply:
+        points, rgb, notes = read_ply_points(files.ply)
+        keep = plausible(files.ply, points, positions)
+        return (
+            [],
+            points[keep],
+            rgb[keep],
+            None,
+            (f"its points are those of {files.ply.name}", *notes),
+        )
+    numbers = sorted(reconstruction.points3D)
+    xyz = np.array([reconstruction.points3D[i].xyz for i in numbers], np.float64).reshape(-1, 3)
+    keep = plausible(files.path("points3D"), xyz, positions)
+    kept = [point for point, good in zip(numbers, keep, strict=True) if good]
     colors = [reconstruction.points3D[i].color for i in kept]
     rgb = np.array(colors, np.float32).reshape(-1, 3) / 255
     errors = np.array([reconstruction.points3D[i].error for i in kept], np.float32).reshape(-1)
     errors = np.where(errors >= 0, errors, np.nan)  # COLMAP writes -1 for an unknown one
-    return source, frames, (xyz[keep].astype(np.float32), rgb), errors
+    return kept, xyz[keep].astype(np.float32), rgb, errors, ()
 
 
-def _reconstruct(model: pathlib.Path, suffix: str) -> Any:
-    """Check the files of a model, then let pycolmap read them."""
+def _reconstruct(files: ModelFiles) -> tuple[Any, dict[int, str]]:
+    """Check a model's files, then let pycolmap read them; return the names of `prepare_model`."""
     try:
         import pycolmap
     except ImportError as error:
         raise SceneError(
-            f"{model} is a COLMAP model, and reading it needs pycolmap: install it with "
+            f"{files.folder} is a COLMAP model, and reading it needs pycolmap: install it with "
             "pip install 'jaxcloseup[colmap]'."
         ) from error
 
     def count_parameters(name: int | str) -> int:
         kinds = pycolmap.CameraModelId
-        kind = kinds(int(name)) if suffix == ".bin" else kinds.__members__[str(name)]
+        kind = kinds(int(name)) if files.suffix == ".bin" else kinds.__members__[str(name)]
         return len(pycolmap.Camera.create_from_model_id(1, kind, 1.0, 1, 1).params)
 
-    check_files(model, suffix, count_parameters)
+    check_files(files, count_parameters)
     reconstruction = pycolmap.Reconstruction()
-    read = reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text
-    try:
-        read(str(model))
-    except Exception as error:  # pycolmap's C++ checks raise various types
-        reason = " ".join(str(error).split())
-        raise SceneError(
-            f"{model}: its files do not match each other ({reason}): export the model again."
-        ) from error
-    return reconstruction
+    read = reconstruction.read_binary if files.suffix == ".bin" else reconstruction.read_text
+    with prepare_model(files) as (folder, names):
+        try:
+            read(str(folder))
+        except Exception as error:  # pycolmap's C++ checks raise various types
+            reason = " ".join(str(error).replace(str(folder), str(files.folder)).split())
+            raise SceneError(
+                f"{files.folder}: its files do not match each other ({reason}): export the model "
+                "again."
+            ) from error
+    return reconstruction, names
 
 
 def _frame(
     image: Any,
+    name: str,
     source: pathlib.Path,
-    photographs: pathlib.Path,
     lens: dict[str, Any],
     size: tuple[int, int],
     camera: str,
@@ -128,13 +151,12 @@ def _frame(
         rigid = np.allclose(rotation.T @ rotation, np.eye(3), atol=_RIGID)
     if not rigid:
         raise SceneError(
-            f"{source}: image {image.name!r} has a pose whose rotation is none: export the "
-            "model again."
+            f"{source}: image {name!r} has a pose whose rotation is none: export the model again."
         )
     return Frame(
         source=source,
-        listed=image.name,
-        file=photographs / image.name,
+        listed=name,
+        file=source.parent / name,
         mask=None,
         camtoworld=np.column_stack([rotation, -rotation @ world_to_camera[:, 3]]),
         size=size,

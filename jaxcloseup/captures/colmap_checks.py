@@ -9,21 +9,20 @@ import pathlib
 import struct
 from collections.abc import Callable, Sequence
 
+from jaxcloseup.captures.colmap_files import NAMES, ModelFiles, image_records
 from jaxcloseup.io.files import read_bytes
 from jaxcloseup.photos.scene import SceneError
 
 
 LARGEST_FILE = 2**32  # bytes
-NAMES = ("cameras", "images", "points3D")
 _Count = Callable[[int | str], int]  # number of parameters of a camera model
 
 
-def check_files(folder: pathlib.Path, suffix: str, count_parameters: _Count) -> None:
+def check_files(files: ModelFiles, count_parameters: _Count) -> None:
     """Check every record of a model's cameras, images and points.
 
     Args:
-      folder: folder of the model.
-      suffix: ".bin" or ".txt".
+      files: files of the model.
       count_parameters: number of parameters of a camera model, given its id or name; raises
         ValueError or KeyError for an unknown model.
 
@@ -31,18 +30,17 @@ def check_files(folder: pathlib.Path, suffix: str, count_parameters: _Count) -> 
       SceneError: names the file, which has more than `LARGEST_FILE` bytes, or the line or record in
         it.
     """
-    missing = [name + suffix for name in NAMES if not (folder / (name + suffix)).is_file()]
-    if missing:
-        raise SceneError(f"{folder}: {', '.join(missing)} is missing: copy the whole model again.")
-    for name in NAMES:
-        path = folder / (name + suffix)
-        check = _check_binary if suffix == ".bin" else _check_text
-        check(path, _read(path), count_parameters)
-    for path in (folder / f"rigs{suffix}", folder / f"frames{suffix}"):  # since COLMAP 3.12
-        if path.exists():  # pycolmap reads them, whatever they are
-            data = _read(path)
-            if suffix == ".bin":
-                _check_binary(path, data, count_parameters)
+    needed = NAMES[:2] if files.ply else NAMES
+    if missing := [files.path(name).name for name in needed if name not in files.paths]:
+        raise SceneError(
+            f"{files.folder}: {', '.join(missing)} is missing: copy the whole model again."
+        )
+    for name, path in files.paths.items():  # pycolmap reads rigs and frames, whatever they are
+        data = _read(path)
+        if files.suffix == ".bin":
+            _check_binary(name, path, data, count_parameters)
+        elif name in NAMES:  # not the rigs and frames of COLMAP 3.12
+            _check_text(name, path, data, count_parameters)
 
 
 def _read(path: pathlib.Path) -> bytes:
@@ -52,8 +50,8 @@ def _read(path: pathlib.Path) -> bytes:
         raise SceneError(f"{path} cannot be read ({error.strerror}): restore the file.") from error
 
 
-def _check_binary(path: pathlib.Path, data: bytes, count_parameters: _Count) -> None:
-    walk = _WALKS[path.stem]
+def _check_binary(name: str, path: pathlib.Path, data: bytes, count_parameters: _Count) -> None:
+    walk = _WALKS[name]
     if not data:
         raise SceneError(f"{path} is empty: copy or export it again.")
     count, end = int.from_bytes(data[:8], "little"), 8
@@ -126,24 +124,24 @@ _WALKS = {
 }
 
 
-def _check_text(path: pathlib.Path, data: bytes, count_parameters: _Count) -> None:
+def _check_text(name: str, path: pathlib.Path, data: bytes, count_parameters: _Count) -> None:
     try:
-        lines = data.decode("utf-8-sig").splitlines()
+        text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise SceneError(f"{path}: not UTF-8 text: export it again as UTF-8.") from error
-    numbered = [(i, line.split()) for i, line in enumerate(lines, 1) if line[:1] != "#"]
-    if path.stem == "images":
-        while numbered and not numbered[0][1]:
-            numbered.pop(0)
-        # An image without points has an empty line, which may be missing at the end.
-        for number, words in numbered[1::2]:
-            if len(words) % 3:
+    if name == "images":
+        records = image_records(text)
+        numbered = [(number, image.split(maxsplit=9)) for (number, image), _ in records]
+        for _, (number, seen) in records:
+            if len(words := seen.split()) % 3:
                 raise SceneError(
                     f"{path}: line {number} holds {len(words)} numbers instead of triples of x, y "
                     "and point id: export it again."
                 )
-        numbered = numbered[::2]
-    fewest = {"cameras": 4, "images": 10, "points3D": 8}[path.stem]
+    else:
+        lines = enumerate(text.splitlines(), 1)
+        numbered = [(number, line.split()) for number, line in lines if line[:1] != "#"]
+    fewest = {"cameras": 4, "images": 10, "points3D": 8}[name]
     for number, words in numbered:
         if not words:
             continue
@@ -151,9 +149,9 @@ def _check_text(path: pathlib.Path, data: bytes, count_parameters: _Count) -> No
         if len(words) < fewest:
             raise SceneError(f"{label} ends after {len(words)} fields: export it again.")
         try:
-            if path.stem == "images":
+            if name == "images":
                 _check_pose(f"{path}: image {words[0]} ({words[9]})", [*map(float, words[1:8])])
-            elif path.stem == "points3D":
+            elif name == "points3D":
                 _check_finite(label, [*map(float, words[:8])])
             else:
                 _check_finite(label, [float(words[2]), float(words[3]), *map(float, words[4:])])
@@ -163,7 +161,7 @@ def _check_text(path: pathlib.Path, data: bytes, count_parameters: _Count) -> No
             raise SceneError(
                 f"{label} holds text where a number belongs: export it again."
             ) from error
-        if path.stem == "cameras":
+        if name == "cameras":
             expected = _parameters(path, f"camera {words[0]}", words[1], count_parameters)
             if len(words) != 4 + expected:
                 raise SceneError(

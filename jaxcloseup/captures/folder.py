@@ -120,14 +120,14 @@ def _load(listing: Listing, reading: Reading) -> Scene:
         "up": _UP if _is_oriented(listing) else None,
         "format": listing.format,
         "notes": listing.notes,
+        "point_errors": listing.errors,
     }
     if reading.zoom == 1:
         metadata["own_sizes"] = {
             split: [photo.own_size for photo in part] for split, part in parts.items()
         }
-    if listing.errors is not None:
+    if all(frame.seen is not None for frame in listing.frames["train"]):
         metadata["seen"] = [frame.seen for frame in listing.frames["train"]]
-        metadata["point_errors"] = listing.errors
     if listing.times_nearer is not None:
         metadata["times_nearer"] = listing.times_nearer
     if reading.zoom > 1 and "test" in parts:

@@ -1,19 +1,23 @@
-"""Detect the format of a capture folder and list its photographs."""
+"""List the photographs of a capture by split."""
 
+import collections
 import math
 import pathlib
-import shlex
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxcloseup.captures.colmap import holds_model, read_colmap
+from jaxcloseup.captures.colmap import read_colmap
+from jaxcloseup.captures.colmap_files import find_model_files
+from jaxcloseup.captures.detection import SEPARATE, SINGLE, Detected, detect
+from jaxcloseup.captures.leftovers import unused_note
 from jaxcloseup.captures.llff import read_llff
-from jaxcloseup.captures.photo_files import ENDINGS, size_of_image
+from jaxcloseup.captures.photo_files import size_of_image
 from jaxcloseup.captures.photo_masks import attach_masks
+from jaxcloseup.captures.photo_search import check_missing, list_first, locate, photograph_folders
 from jaxcloseup.captures.points import read_ply_points
-from jaxcloseup.captures.reduced_photos import attach_reduced, note_stand_ins, photographs_folder
+from jaxcloseup.captures.reduced_photos import attach_reduced, note_stand_ins
 from jaxcloseup.captures.scale import check_positions, plausible
 from jaxcloseup.captures.splits import (
     FindPoints,
@@ -22,6 +26,7 @@ from jaxcloseup.captures.splits import (
     splits_from_file,
     spread,
     warn_duplicates,
+    without_repeats,
 )
 from jaxcloseup.captures.transforms import read_transforms
 from jaxcloseup.captures.world_frames import Frame
@@ -30,12 +35,10 @@ from jaxcloseup.photos.scene import SceneError
 
 
 _FILES = {
-    "train": ("transforms_train.json",),
+    "train": (SEPARATE,),
     "test": ("transforms_test.json",),
     "test_far": ("transforms_test_far.json", "transforms_val.json"),
 }
-_SEPARATE, _SINGLE, _LLFF = "transforms_train.json", "transforms.json", "poses_bounds.npy"
-_MODELS = ("sparse/0", "sparse", "colmap/sparse/0")
 
 
 class Listing(NamedTuple):
@@ -65,6 +68,7 @@ class _Content(NamedTuple):
     given: dict[str, list[Frame]] | None
     points: tuple[np.ndarray, np.ndarray]
     errors: np.ndarray | None = None
+    notes: tuple[str, ...] = ()  # sentences on how it was read
 
 
 def read_listing(
@@ -83,8 +87,8 @@ def read_listing(
     Raises:
       SceneError: the folder holds no known format, or one of its files is wrong.
     """
-    kind, folder, content, note = _read_content(path, format)
-    scene = folder.resolve().name
+    detected, content = _read_content(path, format)
+    folder, scene = detected.folder, detected.folder.resolve().name
     given = content.given
     if split == "given" and not given:
         given = splits_from_file(folder, content.frames)
@@ -104,7 +108,9 @@ def read_listing(
     keep = np.ones(len(points), bool)
     if fewer or len(frames) > 1:
         keep = _seen_in_training(frames["train"], len(points))
-    notes = [note, *note_stand_ins(scene, content.frames), *division.notes, *reduced]
+    used = [*content.frames, *(frame for part in frames.values() for frame in part)]
+    notes = [*content.notes, *note_stand_ins(scene, content.frames), *division.notes, *reduced]
+    notes += unused_note(folder, used)
     if fewer:
         notes.append(f"{scene}: learns from {len(chosen)} of {len(train)} training photographs")
     if not keep.all():
@@ -113,7 +119,7 @@ def read_listing(
             "training photographs see"
         )
     return Listing(
-        format=kind,
+        format=detected.format,
         folder=folder,
         file=content.file,
         fields=content.fields,
@@ -138,98 +144,70 @@ def fitting_divisor(sizes: Iterable[tuple[int, int]], pixels: int) -> int:
     return max(1, round(math.sqrt(float(np.median(areas or [1])) / pixels)))
 
 
-def _read_content(
-    path: pathlib.Path, format: str | None
-) -> tuple[str, pathlib.Path, _Content, str]:
-    """Return the format that is read, its folder, its content, and a sentence about it."""
-    found = [(kind, name) for kind, name in _detect(path) if format in (None, kind)]
-    if not found:
-        raise _no_capture(path, format)
-    (kind, name), *others = found
-    folder = _folder_of_model(path) if name == "." else path
+def _read_content(path: pathlib.Path, format: str | None) -> tuple[Detected, _Content]:
+    """Read what a folder holds of a format, and find the photographs that its files list."""
+    detected = detect(path, format)
     readers = {"transforms": _read_transforms, "colmap": _read_model, "llff": _read_llff}
-    content = readers[kind](folder, path / name)
+    content = readers[detected.format](detected.folder, detected.path)
     check_positions(content.frames)
-    rejected = " or ".join(_describe(*other, path) for other in others)
-    note = f"{folder.resolve().name}: reading {_describe(kind, name, path)}"
-    return kind, folder, content, note + (f" and not {rejected}" if rejected else "")
-
-
-def _no_capture(path: pathlib.Path, format: str | None) -> SceneError:
-    """Return the error for a folder that holds no capture of this format."""
-    kind = f" in the format {format}" if format else ""
-    files = (
-        f"add {_SEPARATE}, {_SINGLE}, {_LLFF}, or a COLMAP model in {', '.join(_MODELS)} or in "
-        "the folder itself."
-    )
-    if pictures := None if format else _photographs_in(path):
-        target = shlex.quote(f"{path.resolve().name}_capture")
-        return SceneError(
-            f"{path} holds no capture but photographs: find their poses with jaxcloseup "
-            f"process --images={shlex.quote(str(pictures))} --output_dir={target}, or "
-            f"{files}"
-        )
-    return SceneError(f"{path} holds no capture{kind}: {files}")
-
-
-def _detect(path: pathlib.Path) -> list[tuple[str, str]]:
-    """Find (format, file or model folder) pairs in a folder, in order of precedence."""
-    files = [("transforms", _SEPARATE), ("transforms", _SINGLE)]
-    found = [(kind, name) for kind, name in files if (path / name).is_file()]
-    found += [("colmap", name) for name in (*_MODELS, ".") if holds_model(path / name)]
-    return found + [("llff", _LLFF)] * (path / _LLFF).is_file()
-
-
-def _photographs_in(path: pathlib.Path) -> pathlib.Path | None:
-    """Return the folder with photographs, if there are any: this one, or `images` in it."""
-    for folder in (path, photographs_folder(path)):
-        if folder.is_dir() and any(one.suffix.lower() in ENDINGS for one in folder.iterdir()):
-            return folder
-    return None
-
-
-def _describe(kind: str, name: str, path: pathlib.Path) -> str:
-    if kind != "colmap":
-        return name
-    return f"the COLMAP model in {path.resolve().name if name == '.' else name}"
-
-
-def _folder_of_model(model: pathlib.Path) -> pathlib.Path:
-    """Find the capture that a model belongs to: the nearest parent folder with `images`."""
-    around = model.resolve()
-    candidates = (around, *around.parents)[:4]
-    return next((folder for folder in candidates if photographs_folder(folder).is_dir()), model)
+    scene = detected.folder.resolve().name
+    notes = tuple(f"{scene}: {note}" for note in (detected.note, *content.notes))
+    return detected, content._replace(notes=notes)
 
 
 def _read_transforms(folder: pathlib.Path, file: pathlib.Path) -> _Content:
-    if file.name == _SINGLE:
-        fields, frames = read_transforms(file)
+    named = _FILES if file.name == SEPARATE else {"train": (SINGLE,)}
+    present = {
+        split: next((folder / name for name in names if (folder / name).is_file()), None)
+        for split, names in named.items()
+    }
+    read = {split: read_transforms(path) for split, path in present.items() if path}
+    fields, listed = read["train"][0], [frame for _, part in read.values() for frame in part]
+    places = list(dict.fromkeys((folder, *photograph_folders(folder))))
+    located = locate(folder, listed, places)
+    absent = collections.Counter(frame.source for frame in located.missing)
+    if absent.pop(file, 0):
+        missing = [frame for frame in located.missing if frame.source == file]
+        check_missing(folder, located._replace(missing=missing), places)
+    unrendered = [
+        f"{path.name} lists {count} views without photographs, which are not scored"
+        for path, count in absent.items()
+    ]
+    frames = without_repeats(located.frames)
+    if file.name == SINGLE:
         given = splits_from_fields(file, fields, frames)
     else:
-        present = {
-            split: next((folder / name for name in names if (folder / name).is_file()), None)
-            for split, names in _FILES.items()
+        parts = {
+            split: [frame for frame in frames if frame.source == present[split]] for split in read
         }
-        read = {split: read_transforms(path) for split, path in present.items() if path}
-        fields = read["train"][0]
-        given = {split: frames for split, (_, frames) in read.items()}
-        frames = [frame for members in given.values() for frame in members]
-    return _Content(file, fields, frames, given, _read_ply(file, fields, frames))
+        given = {split: part for split, part in parts.items() if part}
+    points, rgb, about = _read_ply(file, fields, frames)
+    notes = (*located.notes, *unrendered, *about)
+    return _Content(file, fields, frames, given, (points, rgb), notes=notes)
 
 
-def _read_model(folder: pathlib.Path, model: pathlib.Path) -> _Content:
-    file, frames, points, errors = read_colmap(model, photographs_folder(folder))
-    return _Content(file, {}, frames, None, points, errors)
+def _read_model(folder: pathlib.Path, path: pathlib.Path) -> _Content:
+    files = find_model_files(path)
+    assert files is not None  # it was detected
+    model = read_colmap(files)
+    places = photograph_folders(folder, path)
+    located = locate(folder, model.frames, places)
+    check_missing(folder, located, places)
+    notes = (*located.notes, *model.notes)
+    points = model.points, model.rgb
+    return _Content(model.source, {}, located.frames, None, points, model.errors, notes)
 
 
 def _read_llff(folder: pathlib.Path, file: pathlib.Path) -> _Content:
-    fields, frames = read_llff(file, photographs_folder(folder))
-    return _Content(file, fields, frames, None, _read_ply(file, fields, frames))
+    fields, frames = read_llff(file, *list_first(photograph_folders(folder)))
+    points, rgb, notes = _read_ply(file, fields, frames)
+    return _Content(file, fields, frames, None, (points, rgb), notes=notes)
 
 
 def _read_ply(
     file: pathlib.Path, fields: dict[str, Any], frames: list[Frame]
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Read the points `[P, 3]` beside a file, their colors `[P, 3]`, and notes on them."""
     folder, named = file.parent, fields.get("ply_file_path")
     if named and not (folder / str(named)).is_file():
         raise SceneError(
@@ -237,10 +215,10 @@ def _read_ply(
         )
     ply = folder / str(named or "points3d.ply")
     if ply.is_file():
-        points, rgb = read_ply_points(ply)
+        points, rgb, notes = read_ply_points(ply)
         keep = plausible(ply, points, np.stack([frame.camtoworld[:, 3] for frame in frames]))
-        return points[keep], rgb[keep]
-    return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
+        return points[keep], rgb[keep], notes
+    return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), ()
 
 
 def _renumbered(frames: list[Frame], keep: np.ndarray) -> list[Frame]:

@@ -6,19 +6,21 @@ bound what the camera sees.
 """
 
 import pathlib
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from jaxcloseup.captures.json_fields import image_side, number, rigid_transform
-from jaxcloseup.captures.photo_masks import list_photographs
 from jaxcloseup.captures.world_frames import Frame
 from jaxcloseup.io.files import check_file
 from jaxcloseup.photos.scene import SceneError
 
 
-def read_llff(file: pathlib.Path, photographs: pathlib.Path) -> tuple[dict[str, Any], list[Frame]]:
-    """Read the fields `near` and `far` of the whole capture, and the frames.
+def read_llff(
+    file: pathlib.Path, folder: pathlib.Path, files: Sequence[pathlib.Path]
+) -> tuple[dict[str, Any], list[Frame]]:
+    """Read the fields `near` and `far` of the whole capture, and the frames of a folder's files.
 
     Rows belong to the photographs sorted by name. Near is 0.9 of the smallest near bound, as in
     NeRF's own loader, and far is the largest far bound.
@@ -47,10 +49,9 @@ def read_llff(file: pathlib.Path, photographs: pathlib.Path) -> tuple[dict[str, 
         raise SceneError(
             f"{file} holds {rows.dtype} values instead of real numbers: export it again."
         )
-    files = list_photographs(photographs)
     if len(files) != len(rows):
         raise SceneError(
-            f"{file} has {len(rows)} poses but {photographs} has {len(files)} photographs: restore "
+            f"{file} has {len(rows)} poses but {folder} has {len(files)} photographs: restore "
             "missing photographs, or remove those without a pose."
         )
     frames = [_frame(file, path, row) for path, row in zip(files, rows, strict=True)]

@@ -21,12 +21,6 @@ def photographs_folder(folder: pathlib.Path) -> pathlib.Path:
     return whole if whole.exists() else next((one for one in shrunk if one.is_dir()), whole)
 
 
-def existing_place(file: pathlib.Path) -> pathlib.Path:
-    """Return where a file in `images` lies: there, or in the folder that stands in for it."""
-    root = next((root for root in file.parents if root.name == _FOLDER), None)
-    return file if root is None else photographs_folder(root.parent) / file.relative_to(root)
-
-
 def is_stand_in(frame: Frame) -> bool:
     """Return True if a frame's file is shrunk, because `images` does not exist."""
     names = {f"{_FOLDER}_{factor}" for factor in _FACTORS}

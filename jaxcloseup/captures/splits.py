@@ -136,8 +136,29 @@ def spread(name: str, total: int, count: int | None) -> list[int]:
     return [(2 * i + 1) * total // (2 * count) for i in range(count)]
 
 
+def without_repeats(frames: Sequence[Frame]) -> list[Frame]:
+    """Keep the first of the frames that one file lists for one photograph, and warn of others."""
+    first: dict[tuple[pathlib.Path, pathlib.Path], Frame] = {}
+    repeated = []
+    for frame in frames:
+        if first.setdefault((frame.source, frame.file), frame) is not frame:
+            repeated.append(frame)
+    if repeated:
+        names = list(dict.fromkeys(frame.listed for frame in repeated))
+        kept = [first[frame.source, frame.file].camtoworld for frame in repeated]
+        pairs = zip(repeated, kept, strict=True)
+        differ = any((frame.camtoworld != pose).any() for frame, pose in pairs)
+        warnings.warn(
+            f"{repeated[0].source} lists {_some(names)} in more than one frame"
+            f"{', with different poses' if differ else ''}: the first frame of each is used.",
+            DuplicateFileWarning,
+            stacklevel=2,
+        )
+    return list(first.values())
+
+
 def warn_duplicates(folder: pathlib.Path, splits: dict[str, list[Frame]]) -> None:
-    """Warn about photographs that are listed more than once."""
+    """Warn about photographs that are in more than one split."""
     seen: dict[pathlib.Path, str] = {}
     repeated = []
     for split, members in splits.items():
@@ -146,14 +167,16 @@ def warn_duplicates(folder: pathlib.Path, splits: dict[str, list[Frame]]) -> Non
                 repeated.append(f"{frame.listed} ({seen[frame.file]} and {split})")
             seen.setdefault(frame.file, split)
     if repeated:
-        more = ", ..." if len(repeated) > 3 else ""
         warnings.warn(
-            f"{folder} lists {len(repeated)} photographs more than once: "
-            f"{', '.join(repeated[:3])}{more}; a score on a training photograph says nothing about "
-            "new views.",
+            f"{folder} lists {len(repeated)} photographs more than once: {_some(repeated)}; a "
+            "score on a training photograph says nothing about new views.",
             DuplicateFileWarning,
             stacklevel=2,
         )
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
 
 
 def _every_eighth(frames: Sequence[Frame]) -> dict[str, list[Frame]]:
@@ -240,7 +263,8 @@ def _choose(
                 f"{file}: {key} names {unlisted[0]!r}, which is no frame's {field} "
                 f"({len(unlisted)} of {len(names)} such names): correct it."
             )
-        splits[split] = [frame for name in names if (frame := members[name]) is not None]
+        chosen = (frame for frame in members.values() if frame is not None)
+        splits[split] = list({frame.file: frame for frame in chosen}.values())
     return splits
 
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from jaxcloseup.captures.distortion import COEFFICIENTS, read_distortion
 from jaxcloseup.captures.json_fields import image_side, read_object, rigid_transform
-from jaxcloseup.captures.reduced_photos import existing_place
-from jaxcloseup.captures.world_frames import Frame, check_photographs, frame_intrinsics
+from jaxcloseup.captures.photo_search import find_exact
+from jaxcloseup.captures.world_frames import Frame, frame_intrinsics
 from jaxcloseup.photos.scene import SceneError, UnknownKeyWarning
 
 
@@ -32,11 +32,10 @@ _UNUSED_KEYS = {
     *("orientation_override", "auto_scale_poses_override"),
     *("depth_file_path", "depth_unit_scale_factor", "integer_depth_scale"),
 }
-_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 
 
 def read_transforms(path: pathlib.Path) -> tuple[dict[str, Any], list[Frame]]:
-    """Read and check the fields of a `transforms*.json` and its frames.
+    """Read and check the fields of a `transforms*.json` and its frames, whose files are not found.
 
     Raises:
       SceneError: names the file, the frame and the field, and says what to do.
@@ -57,9 +56,7 @@ def read_transforms(path: pathlib.Path) -> tuple[dict[str, Any], list[Frame]]:
         warnings.warn(
             f"{path}: these fields are ignored: {names}.", UnknownKeyWarning, stacklevel=2
         )
-    frames = [_read_frame(path, fields, entry) for entry in entries]
-    check_photographs(path, frames)
-    return fields, frames
+    return fields, [_read_frame(path, fields, entry) for entry in entries]
 
 
 def _read_frame(path: pathlib.Path, fields: dict[str, Any], entry: dict[str, Any]) -> Frame:
@@ -85,8 +82,8 @@ def _read_frame(path: pathlib.Path, fields: dict[str, Any], entry: dict[str, Any
     frame = Frame(
         source=path,
         listed=listed,
-        file=_find(path.parent, listed),
-        mask=_find(path.parent, mask) if mask else None,
+        file=path.parent / listed,
+        mask=(find_exact(path.parent, mask) or path.parent / mask) if mask else None,
         camtoworld=pose * np.array([1, -1, -1, 1]),  # OpenGL to OpenCV: y and z change sign
         size=size,
         lens=(entry, fields),
@@ -94,10 +91,3 @@ def _read_frame(path: pathlib.Path, fields: dict[str, Any], entry: dict[str, Any
     )
     frame_intrinsics(frame, *(size or (1, 1)))  # raises before any image is decoded
     return frame
-
-
-def _find(folder: pathlib.Path, listed: str) -> pathlib.Path:
-    """Find the listed file; Blender's datasets leave out the suffix."""
-    path = existing_place(folder / listed.replace("\\", "/"))
-    candidates = [pathlib.Path(f"{path}{suffix}") for suffix in _SUFFIXES]
-    return next((candidate for candidate in candidates if candidate.is_file()), path)

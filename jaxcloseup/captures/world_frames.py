@@ -2,7 +2,6 @@
 
 import math
 import pathlib
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -60,17 +59,6 @@ def frame_intrinsics(
         for key, side in (("cx", width), ("cy", height))
     ]
     return np.array([*focal, *center])
-
-
-def check_photographs(path: pathlib.Path, frames: Sequence[Frame]) -> None:
-    """Raise one `SceneError` for all photographs that `path` lists but that do not exist."""
-    missing = [frame.listed for frame in frames if not frame.file.is_file()]
-    if missing:
-        first = ", ".join(missing[:3]) + (", ..." if len(missing) > 3 else "")
-        raise SceneError(
-            f"{path}: {len(missing)} of {len(frames)} listed images do not exist ({first}): "
-            "restore them or remove their frames."
-        )
 
 
 def _focal(label: str, lens: dict[str, Any], width: int, height: int) -> tuple[float, float] | None:

@@ -34,7 +34,7 @@ from wrong_input import HEIC, put
 
 from jaxcloseup.app.process import solver_process
 from jaxcloseup.app.process.pairs import choose_pairing, pairs_to_match, similarity
-from jaxcloseup.app.process.photo_folder import copy_photographs
+from jaxcloseup.app.process.photo_folder import copy_photographs, list_files
 from jaxcloseup.app.process.video_frames import choose_frames
 from jaxcloseup.artifacts import video as video_writer
 from jaxcloseup.artifacts.video import write_video
@@ -204,6 +204,30 @@ def test_the_same_command_continues_and_gives_the_same(walk, tmp_path):
 
 
 # Parts.
+
+
+def test_photographs_in_subfolders(tmp_path, capsys):
+    """Of two cameras, with equal names, beside what is no photograph of the scene."""
+    write_noise(tmp_path / "in", 2)
+    for i, name in enumerate(["left cam", "right", "masks", "images_2", ".hidden", "made"]):
+        write_noise(tmp_path / "in" / name, 2 + i)
+    (tmp_path / "in/made/process.json").write_text("{}")
+    names = ["0.png", "1.png", "left cam/0.png", "left cam/1.png"]
+    names += [f"right/{i}.png" for i in range(3)]
+    found, left_out = list_files(tmp_path / "in")
+    assert [path.as_posix() for path in found] == names and not left_out
+    for i, name in enumerate(names):  # none is a copy of another
+        image = np.random.default_rng(i).integers(0, 255, (60, 80, 3))
+        cv2.imwrite(str(tmp_path / "in" / name), image)
+    with pytest.raises(SystemExit, match="no two photographs show the same"):
+        run_process(images=str(tmp_path / "in"), output_dir=str(tmp_path / "out"))
+    assert "lie in 3 folders, each with a lens of its own" in capsys.readouterr().out
+    database = pycolmap.Database.open(str(tmp_path / "out/colmap/database.db"))
+    lenses = {image.name: image.camera_id for image in database.read_all_images()}
+    database.close()
+    assert set(lenses) == {name.replace(" ", "_") for name in names}
+    groups = {(pathlib.PurePath(name).parent, lens) for name, lens in lenses.items()}
+    assert len(groups) == len(set(lenses.values())) == 3
 
 
 def test_frames_are_sharp_and_evenly_spread():

@@ -17,6 +17,7 @@ from tiny_capture import (
     single_file,
     write_image,
     write_model,
+    write_ply,
 )
 
 from jaxcloseup.captures import folder as folder_module
@@ -142,6 +143,85 @@ def test_points_that_training_does_not_see_are_dropped(tmp_path):
     scene = load_scene(tmp_path)
     np.testing.assert_allclose(scene.points, [[-2, 0.5, 5]])
     assert "dropped 1 of 2 points, which fewer than two training" in scene.metadata["notes"][-1]
+
+
+@pytest.mark.parametrize("rigs", [None, True])
+def test_files_in_another_case(tmp_path, rigs):
+    """RealityCapture writes such, beside the photographs; a byte order mark may come first."""
+    colmap_capture(tmp_path)
+    expected = load_scene(tmp_path)
+    model = tmp_path / "sparse/0"
+    if rigs:
+        to_binary(model)
+    else:
+        (model / "images.txt").write_bytes(b"\xef\xbb\xbf" + (model / "images.txt").read_bytes())
+    for path in [*model.iterdir(), *(tmp_path / "images").iterdir()]:
+        (tmp_path / "flat").mkdir(exist_ok=True)
+        path.rename(tmp_path / "flat" / path.name.capitalize())
+    scene = load_scene(tmp_path / "flat")
+    assert scene.name == "flat" and scene.names == expected.names
+    jax.tree.map(np.testing.assert_array_equal, scene.train, expected.train)
+    np.testing.assert_array_equal(scene.points, expected.points)
+
+
+@pytest.mark.filterwarnings("ignore:.*no near and far")
+def test_names_with_spaces(tmp_path):
+    """A name is not what stands before its first space, and the last line may be missing."""
+    names = ["my photos/a.png", "my photos/a.png edited.png", "my  photos/b é (1).png"]
+    for i, name in enumerate(names):
+        write_image(tmp_path / "images" / name, value=i)
+    lines = [part for i, name in enumerate(names) for part in (image_line(9 - i, name), "")]
+    write_model(tmp_path / "sparse/0", lines[:-1], points=())
+    scene = load_scene(tmp_path, split="every8")
+    files = [*scene.metadata["files"]["test_far"], *scene.metadata["files"]["train"]]
+    assert files == [tmp_path / "images" / name for name in sorted(names)]
+    assert scene.test_far.rgb[0, 0, 0, 0] == 2
+    assert scene.train.rgb[:, 0, 0, 0].tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_the_largest_of_several_models_is_read(tmp_path, binary):
+    for number, count in enumerate([3, 4, 2]):
+        colmap_capture(tmp_path, count, model=f"sparse/{number}")
+        if binary:
+            to_binary(tmp_path / f"sparse/{number}")
+    scene = load_scene(tmp_path)
+    assert sum(map(len, scene.names.values())) == 4
+    assert scene.metadata["notes"][0].endswith(
+        "reading the COLMAP model in sparse/1 (4 photographs) and not the COLMAP model in sparse/0 "
+        "(3 photographs) or the COLMAP model in sparse/2 (2 photographs)"
+    )
+    named = load_scene(tmp_path / "sparse/0")
+    assert sum(map(len, named.names.values())) == 3
+    assert f"{named.name}: not used: 1 images in images/" in named.metadata["notes"]
+
+
+@pytest.mark.parametrize("ply", [False, True])
+def test_points_that_no_image_observes(tmp_path, ply):
+    """They are kept, and seen where they project: the nearest photograph is held out."""
+    depths = [8.0, 8.2, 4.0, 8.6]
+    poses = [f"1 0 0 0 0 0 {depth - 5}" for depth in depths]
+    for i in range(4):
+        write_image(tmp_path / f"images/{i}.png")
+    lines = [
+        part for i, pose in enumerate(poses) for part in (image_line(i + 1, f"{i}.png", pose), "")
+    ]
+    write_model(tmp_path / "sparse/0", lines)
+    if ply:
+        (tmp_path / "sparse/0/points3D.txt").unlink()
+        rows = np.zeros(5, [(axis, "f4") for axis in "xyz"])
+        rows["x"], rows["y"], rows["z"] = np.arange(5) - 2, 0.5, 5
+        write_ply(tmp_path / "sparse/0/points3D.ply", rows)
+    scene = load_scene(tmp_path, split="closest")
+    np.testing.assert_allclose(scene.points, [[i - 2, 0.5, 5] for i in range(5)])
+    assert scene.names["test"] == ["2"] and "seen" not in scene.metadata
+    about = [note.split(": ", 1)[1] for note in scene.metadata["notes"][1:3]]
+    said = [
+        "its points are those of points3D.ply",
+        "points3D.ply has no colors: its points are gray",
+    ]
+    assert (about == said) is ply
+    assert sum(map(len, load_scene(tmp_path).names.values())) == 4
 
 
 def test_pycolmap_is_not_installed(tmp_path, monkeypatch):

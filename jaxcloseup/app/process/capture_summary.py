@@ -16,6 +16,7 @@ from matplotlib.ticker import MaxNLocator
 
 from jaxcloseup.app.process.options import FEWEST
 from jaxcloseup.captures.colmap import read_colmap
+from jaxcloseup.captures.colmap_files import find_model_files
 from jaxcloseup.io.files import write_file
 
 
@@ -98,7 +99,7 @@ def summary_lines(summary: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def draw_from_above(model: pathlib.Path, images: pathlib.Path, path: pathlib.Path) -> None:
+def draw_from_above(model: pathlib.Path, path: pathlib.Path) -> None:
     """Draw the cameras and points of a model from above, as a PNG.
 
     Up is as perpendicular as possible to the cameras' horizontal axes, since few people tilt a
@@ -108,7 +109,9 @@ def draw_from_above(model: pathlib.Path, images: pathlib.Path, path: pathlib.Pat
       SceneError: the model cannot be read.
       OSError: the picture cannot be written.
     """
-    _, frames, (points, rgb), _ = read_colmap(model, images)
+    files = find_model_files(model)
+    assert files is not None  # the mapping has written it
+    _, frames, points, rgb, *_ = read_colmap(files)
     poses = np.stack([frame.camtoworld for frame in frames])
     plane = _horizontal(poses[:, :, :3])
     if len(points) > _MOST_POINTS:

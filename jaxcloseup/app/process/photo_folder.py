@@ -15,6 +15,7 @@ import PIL.Image
 import PIL.ImageOps
 from PIL.ExifTags import IFD, Base
 
+from jaxcloseup.app.process.capture_stages import NAME
 from jaxcloseup.app.process.counting import progress
 from jaxcloseup.app.process.options import FEWEST
 from jaxcloseup.app.process.solver_process import ProcessingError
@@ -32,32 +33,43 @@ _QUALITY = 95  # of a JPEG that was turned
 _KEPT = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}  # formats that COLMAP reads everywhere
 _HEAD = 2**16  # bytes that tell a format
 _OTHER = "is not a photograph"
+_OTHERS = re.compile(r"\..*|masks|images_\d+")  # folders without photographs
 _NEEDS_CONVERSION = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"}
 
 
 class Copied(NamedTuple):
     """A photograph in the capture."""
 
-    name: str  # its name in the folder `images`
-    source: str  # name of the file that it was made from
-    # identifies the lens: size in pixels and, if EXIF has them, camera and focal length
+    name: str  # its path in the folder `images`
+    source: str  # path of the file that it was made from, in the folder of photographs
+    # identifies the lens: folder, size in pixels and, if EXIF has them, camera and focal length
     lens: list[Any]
 
 
 def list_files(folder: pathlib.Path) -> tuple[list[pathlib.Path], dict[str, str]]:
-    """List the photographs of a folder by name, and why its other files are left out.
+    """List the photographs of a folder and its subfolders, and why other files are left out.
+
+    Both by path in the folder. Hidden folders, masks, reduced copies and captures that `process`
+    made are not looked at.
 
     Raises:
       ProcessingError: it is not a folder, or has fewer than 3 photographs.
     """
     if not folder.is_dir():
         raise ProcessingError(f"--images={folder} is not a folder: name a folder of photographs")
-    files = sorted(path for path in folder.iterdir() if path.is_file() and path.name[0] != ".")
+    files = []
+    for place, folders, names in os.walk(folder, onerror=_refuse):
+        inside = pathlib.Path(place).relative_to(folder)
+        captured = place != str(folder) and NAME in names
+        folders[:] = [name for name in folders if not captured and not _OTHERS.fullmatch(name)]
+        paths = [inside / name for name in names if not captured and name[0] != "."]
+        files += [path for path in paths if (folder / path).is_file()]
+    files.sort()
     photographs = [path for path in files if path.suffix.lower() in ENDINGS]
     left_out = {}
     for path in files:
         if path.suffix.lower() not in ENDINGS:
-            left_out[printable(path.name)] = _why_not(path)
+            left_out[printable(path.as_posix())] = _why_not(folder / path)
     if len(photographs) < FEWEST:
         others = f" beside {len(left_out)} files that are not" if left_out else ""
         unread = [f", and {name} {why}" for name, why in left_out.items() if why != _OTHER]
@@ -81,10 +93,16 @@ def _why_not(path: pathlib.Path) -> str:
     return _OTHER if known is None else f"{known[0]}, which is not read: {known[1]}"
 
 
+def _refuse(error: OSError) -> None:
+    raise error
+
+
 def copy_photographs(
-    photographs: Sequence[pathlib.Path], folder: pathlib.Path
+    photographs: Sequence[pathlib.Path], root: pathlib.Path, folder: pathlib.Path
 ) -> tuple[list[Copied], dict[str, str]]:
-    """Copy photographs into a folder.
+    """Copy photographs, given by their paths in the folder `root`, into a folder.
+
+    Subfolders stay, and photographs in different ones do not share a lens.
 
     JPEG and PNG files are copied as they are, unless their EXIF orientation turns them: then the
     pixels are turned and the orientation is removed, so that COLMAP and `run` see the same. Other
@@ -112,17 +130,19 @@ def copy_photographs(
         # In parts, because all that waits in a queue is in memory.
         for start in range(0, len(photographs), workers):
             part = photographs[start : start + workers]
-            for path, made in zip(part, pool.map(_read, part), strict=True):
-                source = printable(path.name)
+            reading = pool.map(_read, (root / path for path in part))
+            for path, made in zip(part, reading, strict=True):
+                source = printable(path.as_posix())
                 if isinstance(made, str):
                     left_out[source] = made
                 elif made.digest in first:
                     left_out[source] = f"is the same file as {first[made.digest]}"
                 else:
                     first[made.digest] = source
-                    name = _new_name(path.stem, made.ending, taken)
+                    name = _new_name(path, made.ending, taken)
+                    (folder / name).parent.mkdir(parents=True, exist_ok=True)
                     write_file(folder / name, made.data)
-                    copied.append(Copied(name, source, made.lens))
+                    copied.append(Copied(name, source, [path.parent.as_posix(), *made.lens]))
             report(start + len(part), len(photographs))
     if len(copied) < FEWEST:
         reasons = "; ".join(f"{name} {why}" for name, why in list(left_out.items())[:3])
@@ -192,12 +212,17 @@ def _turned(data: bytes) -> tuple[bytes, str]:
         return file.getvalue(), ".png"
 
 
-def _new_name(stem: str, ending: str, taken: set[str]) -> str:
-    """Return an unused name without spaces, which separate the names in COLMAP's lists."""
-    stem = re.sub(r"[^\w.+-]+", "_", stem)[:_LONGEST_STEM].lstrip(".-") or "photograph"
+def _new_name(path: pathlib.Path, ending: str, taken: set[str]) -> str:
+    """Return an unused path without spaces, which separate the names in COLMAP's lists."""
+    *folders, stem = (_portable(part) for part in (*path.parent.parts, path.stem))
+    stem = "/".join([*folders, stem])
     name, count = stem + ending, 1
     while name.lower() in taken:
         count += 1
         name = f"{stem}_{count}{ending}"
     taken.add(name.lower())
     return name
+
+
+def _portable(name: str) -> str:
+    return re.sub(r"[^\w.+-]+", "_", name)[:_LONGEST_STEM].lstrip(".-") or "photograph"

@@ -40,9 +40,14 @@ class Request:
           ProcessingError: the folder or the video cannot be read, or holds too little.
           OSError: likewise.
         """
-        files = [] if self.images is None else list_files(self.images)[0]
-        files += [] if self.video is None else [self.video]
-        held = [[path.name, path.stat().st_size] for path in files]
+        held = []
+        if self.images is not None:
+            sizes = (
+                (path, (self.images / path).stat().st_size) for path in list_files(self.images)[0]
+            )
+            held = [[path.as_posix(), size] for path, size in sizes]
+        if self.video is not None:
+            held = [[self.video.name, self.video.stat().st_size]]
         return {
             "images": None if self.images is None else str(self.images.resolve()),
             "video": None if self.video is None else str(self.video.resolve()),
@@ -114,7 +119,7 @@ def make_capture(request: Request, folder: pathlib.Path, stages: Stages) -> dict
     }
     stages.keep("summary", summary)
     with saying("drawing cameras and points from above"):
-        draw_from_above(folder / MODEL, folder / IMAGES, folder / PICTURE)
+        draw_from_above(folder / MODEL, folder / PICTURE)
     return summary
 
 
@@ -126,7 +131,10 @@ def _gather(request: Request, folder: pathlib.Path) -> dict[str, Any]:
         return {"copied": [each._asdict() for each in copied], "left_out": {}, "frames": frames}
     assert request.images is not None
     photographs, left_out = list_files(request.images)
-    copied, unread = copy_photographs(photographs, folder)
+    copied, unread = copy_photographs(photographs, request.images, folder)
+    places = {each.lens[0] for each in copied}
+    if len(places) > 1:
+        print(f"the photographs lie in {len(places)} folders, each with a lens of its own")
     return {"copied": [each._asdict() for each in copied], "left_out": left_out | unread}
 
 
