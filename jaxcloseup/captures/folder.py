@@ -48,6 +48,7 @@ def load_capture(
     split: str = "given",
     photographs: int | None = None,
     pixels: int | None = None,
+    corrections: Sequence[str] = (),
 ) -> Scene:
     """Load the capture in a folder, as `jaxcloseup.captures.load.load_scene` describes.
 
@@ -68,6 +69,7 @@ def load_capture(
             pixels=pixels or 1,
             photographs=photographs,
             find_points=functools.partial(_points_of, reading),
+            corrections=corrections,
         )
     except OSError as error:  # from listing folders; reading a file raises SceneError
         raise SceneError(

@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxcloseup.captures.colmap import read_colmap
 from jaxcloseup.captures.colmap_files import find_model_files
+from jaxcloseup.captures.corrections import correct_frames, correct_points
 from jaxcloseup.captures.detection import SEPARATE, SINGLE, Detected, detect
 from jaxcloseup.captures.leftovers import unused_note
 from jaxcloseup.captures.llff import read_llff
@@ -59,6 +60,16 @@ class Listing(NamedTuple):
     downscale: int  # divisor of the photographs' size, chosen where none was given
 
 
+class Listed(NamedTuple):
+    """All photographs of a capture, and its points."""
+
+    format: str  # one of `FORMATS`
+    folder: pathlib.Path  # folder of the capture
+    frames: list[Frame]  # photographs of all splits, in the order of their files
+    points: np.ndarray  # `[P, 3]` float32 world points; P may be 0
+    rgb: np.ndarray  # `[P, 3]` float32 colors of the points in [0, 1]
+
+
 class _Content(NamedTuple):
     """What one format's reader returns; `given` holds the splits if the files list any."""
 
@@ -81,13 +92,14 @@ def read_listing(
     pixels: int = 1,
     photographs: int | None = None,
     find_points: FindPoints | None = None,
+    corrections: Sequence[str] = (),
 ) -> Listing:
     """List a folder's photographs by split; `load_scene` and `divide` document the arguments.
 
     Raises:
       SceneError: the folder holds no known format, or one of its files is wrong.
     """
-    detected, content = _read_content(path, format)
+    detected, content = _read_content(path, format, corrections)
     folder, scene = detected.folder, detected.folder.resolve().name
     given = content.given
     if split == "given" and not given:
@@ -144,15 +156,56 @@ def fitting_divisor(sizes: Iterable[tuple[int, int]], pixels: int) -> int:
     return max(1, round(math.sqrt(float(np.median(areas or [1])) / pixels)))
 
 
-def _read_content(path: pathlib.Path, format: str | None) -> tuple[Detected, _Content]:
+def list_photographs(
+    path: pathlib.Path, *, format: str | None = None, corrections: Sequence[str] = ()
+) -> Listed:
+    """List a folder's photographs of all splits; `load_scene` documents the arguments.
+
+    Raises:
+      SceneError: the folder holds no known format, or one of its files is wrong.
+    """
+    detected, content = _read_content(path, format, corrections)
+    frames = attach_masks(detected.folder, {"all": content.frames})["all"]
+    return Listed(detected.format, detected.folder, frames, *content.points)
+
+
+def _read_content(
+    path: pathlib.Path, format: str | None, corrections: Sequence[str]
+) -> tuple[Detected, _Content]:
     """Read what a folder holds of a format, and find the photographs that its files list."""
     detected = detect(path, format)
     readers = {"transforms": _read_transforms, "colmap": _read_model, "llff": _read_llff}
     content = readers[detected.format](detected.folder, detected.path)
+    content = _corrected(content, corrections, opengl=detected.format == "transforms")
     check_positions(content.frames)
     scene = detected.folder.resolve().name
     notes = tuple(f"{scene}: {note}" for note in (detected.note, *content.notes))
     return detected, content._replace(notes=notes)
+
+
+def _corrected(content: _Content, corrections: Sequence[str], *, opengl: bool) -> _Content:
+    """Apply corrections to photographs, their splits and points."""
+    if not corrections:
+        return content
+    points, rgb = content.points
+    frames = correct_frames(content.frames, corrections, opengl=opengl)
+    for correction in corrections:
+        points = correct_points(points, correction)
+    if not len(points):
+        frames = [frame._replace(seen=None) for frame in frames]
+    changed = {id(old): new for old, new in zip(content.frames, frames, strict=True)}
+    given = content.given and {
+        split: [changed[id(frame)] for frame in part] for split, part in content.given.items()
+    }
+    errors = content.errors if len(points) else None
+    note = f"{content.file}: corrected by {', '.join(corrections):.200}"
+    return content._replace(
+        frames=frames,
+        given=given,
+        points=(points, rgb[: len(points)]),
+        errors=errors,
+        notes=(*content.notes, note),
+    )
 
 
 def _read_transforms(folder: pathlib.Path, file: pathlib.Path) -> _Content:

@@ -14,6 +14,7 @@ padded with weight 0. Points come from the model, a PLY file, or triangulated fe
 """
 
 import pathlib
+from collections.abc import Sequence
 
 from jaxcloseup.captures import ALPHA_MODES, FORMATS, SPLITS, Reading, load_capture
 from jaxcloseup.captures.formats import fitting_divisor
@@ -41,6 +42,7 @@ def load_scene(
     invert_masks: bool = False,
     alpha_mode: str = "blend",
     photographs: int | None = None,
+    corrections: Sequence[str] = (),
 ) -> Scene:
     """Load a drawn scene by its name, or a capture from its folder.
 
@@ -60,6 +62,7 @@ def load_scene(
       alpha_mode: `blend` shows the background through transparent pixels; `mask` keeps the file's
         colors and uses alpha as the weight; `ignore` keeps them and drops alpha.
       photographs: keep so many training photographs, evenly spread; None means all.
+      corrections: corrections of known mistakes, as `captures.corrections` lists them.
 
     Returns:
       The scene in the capture's coordinates, float32. For a folder, `metadata` holds path,
@@ -74,10 +77,10 @@ def load_scene(
     zoom = (zoom or _DEFAULT_ZOOM) if split == "zoom" else 1
     wanted = None if downscale else pixels
     path = pathlib.Path(name_or_path)
+    if is_drawn(name_or_path):
+        _check_drawn(path.name, format, split, invert_masks, alpha_mode)
+        return _draw(path.name, downscale, pixels, photographs)
     if len(path.parts) == 1 and str(name_or_path) == path.name:
-        if path.name in DRAWN_SCENES:
-            _check_drawn(path.name, format, split, invert_masks, alpha_mode)
-            return _draw(path.name, downscale, pixels, photographs)
         if not path.exists():
             raise SceneError(
                 f"{path} is neither a folder nor a built-in scene: choose one of "
@@ -85,8 +88,19 @@ def load_scene(
             )
     reading = Reading(downscale or 1, zoom, background, half_pixel, alpha_mode, invert_masks)
     return load_capture(
-        path, reading, format=format, split=split, photographs=photographs, pixels=wanted
+        path,
+        reading,
+        format=format,
+        split=split,
+        photographs=photographs,
+        pixels=wanted,
+        corrections=corrections,
     )
+
+
+def is_drawn(name_or_path: str | pathlib.Path) -> bool:
+    """Return True for the name of a built-in scene; `./table` names a folder."""
+    return str(name_or_path) in DRAWN_SCENES
 
 
 def _draw(name: str, downscale: int | None, pixels: int, photographs: int | None) -> Scene:

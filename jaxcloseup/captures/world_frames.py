@@ -28,6 +28,8 @@ class Frame(NamedTuple):
     seen: np.ndarray | None = None
     # path of an already shrunk copy to read instead of `file`, or None
     reduced: pathlib.Path | None = None
+    # quarter turns counterclockwise of the image after reading; the camera is of the turned one
+    turns: int = 0
 
     @property
     def label(self) -> str:

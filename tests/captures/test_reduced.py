@@ -78,7 +78,8 @@ def test_shrunk_photographs_are_used_only_if_complete(tmp_path):
     frames = [{"file_path": "images/c.png", "transform_matrix": POSE.tolist()}]
     write_json(tmp_path / "transforms_train.json", frames, fl_x=7.0)
     rgb, _, scene = load(tmp_path, downscale=2)
-    assert rgb.any() and "because the capture gives no w and h" in scene.metadata["notes"][-1]
+    notes = " ".join(scene.metadata["notes"])
+    assert rgb.any() and "because the capture gives no w and h" in notes
 
 
 def test_a_size_that_no_rounding_explains(tmp_path):
