@@ -12,6 +12,7 @@ from jaxcloseup.captures.colmap import holds_model, read_colmap
 from jaxcloseup.captures.llff import read_llff
 from jaxcloseup.captures.photo_files import ENDINGS, size_of_image
 from jaxcloseup.captures.photo_masks import attach_masks
+from jaxcloseup.captures.placing import describe_offset, find_placement, place
 from jaxcloseup.captures.points import read_ply_points
 from jaxcloseup.captures.reduced_photos import attach_reduced
 from jaxcloseup.captures.scale import check_positions, plausible
@@ -26,6 +27,7 @@ from jaxcloseup.captures.splits import (
 from jaxcloseup.captures.transforms import read_transforms
 from jaxcloseup.captures.world_frames import Frame
 from jaxcloseup.io.messages import printable
+from jaxcloseup.io.placement import UNMOVED, Placement
 from jaxcloseup.photos.scene import SceneError
 
 
@@ -39,14 +41,14 @@ _MODELS = ("sparse/0", "sparse", "colmap/sparse/0")
 
 
 class Listing(NamedTuple):
-    """The photographs, points and fields that a capture's files list."""
+    """The photographs, points and fields that a capture's files list, placed as their scene."""
 
     format: str  # one of `FORMATS`
     folder: pathlib.Path  # folder of the capture
     file: pathlib.Path  # main file of the capture, which error messages name
     fields: dict[str, Any]  # fields of the main file
     frames: dict[str, list[Frame]]  # photographs of each split present, `train` first
-    points: np.ndarray  # `[P, 3]` float32 world points; P may be 0
+    points: np.ndarray  # `[P, 3]` float32 points of the scene; P may be 0
     rgb: np.ndarray  # `[P, 3]` float32 colors of the points in [0, 1]
     notes: tuple[str, ...]  # sentences on what was read and how it was split
     times_nearer: tuple[float, ...] | None  # see `splits.Division`
@@ -54,6 +56,7 @@ class Listing(NamedTuple):
     # where unknown; None if the format has none
     errors: np.ndarray | None
     downscale: int  # divisor of the photographs' size, chosen where none was given
+    placement: Placement  # of the scene in the coordinates of the files, which `fields` have
 
 
 class _Content(NamedTuple):
@@ -84,6 +87,7 @@ def read_listing(
       SceneError: the folder holds no known format, or one of its files is wrong.
     """
     kind, folder, content, note = _read_content(path, format)
+    content, placement = _placed(content)
     scene = folder.resolve().name
     given = content.given
     if split == "given" and not given:
@@ -104,7 +108,7 @@ def read_listing(
     keep = np.ones(len(points), bool)
     if fewer or len(frames) > 1:
         keep = _seen_in_training(frames["train"], len(points))
-    notes = [note, *division.notes, *masked, *reduced]
+    notes = [note, *division.notes, *masked, *reduced, *describe_offset(scene, placement)]
     if fewer:
         notes.append(f"{scene}: learns from {len(chosen)} of {len(train)} training photographs")
     if not keep.all():
@@ -124,7 +128,20 @@ def read_listing(
         times_nearer=division.times_nearer,
         errors=None if content.errors is None else content.errors[keep],
         downscale=downscale,
+        placement=placement,
     )
+
+
+def _placed(content: _Content) -> tuple[_Content, Placement]:
+    """Return what was read, in the coordinates of the scene, and where this lies."""
+    frames, (points, rgb) = content.frames, content.points
+    check_positions(frames, UNMOVED)
+    placement = find_placement(np.stack([frame.camtoworld[:, 3] for frame in frames]), points)
+    check_positions(frames, placement)
+    given = content.given and {k: place(part, placement) for k, part in content.given.items()}
+    points = placement.to_scene(points).astype(np.float32)
+    frames = place(frames, placement)
+    return content._replace(frames=frames, given=given, points=(points, rgb)), placement
 
 
 def fitting_divisor(sizes: Iterable[tuple[int, int]], pixels: int) -> int:
@@ -149,7 +166,6 @@ def _read_content(
     folder = _folder_of_model(path) if name == "." else path
     readers = {"transforms": _read_transforms, "colmap": _read_model, "llff": _read_llff}
     content = readers[kind](folder, path / name)
-    check_positions(content.frames)
     rejected = " or ".join(_describe(*other, path) for other in others)
     note = f"{folder.resolve().name}: reading {_describe(kind, name, path)}"
     return kind, folder, content, note + (f" and not {rejected}" if rejected else "")

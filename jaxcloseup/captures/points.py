@@ -10,7 +10,7 @@ from jaxcloseup.photos.scene import PointsWarning, SceneError
 
 
 def read_ply_points(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read positions `[P, 3]` and colors `[P, 3]` in [0, 1], float32, from a PLY file's vertices.
+    """Read positions `[P, 3]`, float64, and colors `[P, 3]` in [0, 1], float32, of PLY vertices.
 
     Properties may come in any order, and unknown ones are ignored. Integer colors are divided by
     the maximum of their type; float colors are divided by 255 if any exceeds 1. Without red, green
@@ -24,9 +24,9 @@ def read_ply_points(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
     except PlyError as error:
         raise SceneError(str(error)) from error
     with np.errstate(over="ignore"):  # too large for float32 becomes infinite
-        points = np.stack([vertices[axis] for axis in "xyz"], -1).astype(np.float32)
+        points = np.stack([vertices[axis] for axis in "xyz"], -1).astype(np.float64)
         rgb = _colors(vertices)
-    finite = np.isfinite(points).all(-1) & np.isfinite(rgb).all(-1)
+    finite = (np.abs(points) <= np.finfo(np.float32).max).all(-1) & np.isfinite(rgb).all(-1)
     if not finite.all():
         count, dropped = len(vertices), (~finite).sum()
         warnings.warn(

@@ -10,6 +10,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from jaxcloseup.captures.depth_range import SMALLEST
+
 
 _LONGEST_SIDE = 1600  # in pixels; larger photographs are searched at this size
 _MAX_FEATURES = 2000  # per photograph; matching cost grows with their square
@@ -53,7 +55,7 @@ def triangulate(
     Args:
       images: uint8 pinhole photographs `[H, W, 3]`; sizes may differ.
       masks: uint8 masks `[H, W]`; features are used where the mask is at least 128.
-      camtoworld: `[V, 3, 4]` OpenCV poses.
+      camtoworld: `[V, 3, 4]` OpenCV poses in a scene of about size 1.
       intrinsics: `[V, 4]` fx, fy, cx, cy in pixels.
     """
     found = [_find_features(image, mask) for image, mask in zip(images, masks, strict=True)]
@@ -95,8 +97,7 @@ def _neighbors(camtoworld: np.ndarray) -> Iterator[tuple[int, int]]:
     axes, positions = camtoworld[:, :, 2], camtoworld[:, :, 3]
     away = np.linalg.norm(positions[:, None] - positions, axis=-1)
     # Rotation in place shows no depth, and a view is not its own neighbor.
-    smallest = np.finfo(np.float32).eps * np.abs(positions).max()  # as positions are stored
-    fit = (axes @ axes.T > _MIN_AXIS_COSINE) & (away > max(1e-6 * away.max(), smallest))
+    fit = (axes @ axes.T > _MIN_AXIS_COSINE) & (away > SMALLEST)
     order = np.argsort(np.where(fit, away, np.inf), axis=1, kind="stable")[:, :_NEIGHBORS]
     pairs = {
         (min(i, j), max(i, j)) for i, row in enumerate(order.tolist()) for j in row if fit[i, j]

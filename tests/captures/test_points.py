@@ -18,7 +18,7 @@ def test_ply_encodings(tmp_path, encoding, color):
     write_ply(tmp_path / "p.ply", rows, encoding, after=b"3 0 1 2\n")
     points, rgb = read_ply_points(tmp_path / "p.ply")
     scale = {"u1": 255, "u2": 65535, "f4": 1}[color]
-    assert points.dtype == rgb.dtype == np.float32
+    assert (points.dtype, rgb.dtype) == (np.float64, np.float32)
     np.testing.assert_allclose(points, np.stack([rows[axis] for axis in "xyz"], -1), rtol=1e-6)
     for channel, name in enumerate(("red", "green", "blue")):
         np.testing.assert_allclose(rgb[:, channel], rows[name] / scale, rtol=1e-5)
