@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 
-SMALLEST = 1e-6  # of a scene's size: float32 hardly tells smaller distances from 0
+SMALLEST = 1e-6  # in a scene: float32 hardly tells smaller distances from 0
 _MAX_POINTS = 20_000
 
 
@@ -58,7 +58,7 @@ def depths_in_view(
 
 
 def near_far_from_cameras(camtoworld: np.ndarray) -> tuple[float, float]:
-    """Guess near and far from the poses `[V, 3, 4]` of a scene of about size 1 alone.
+    """Guess near and far from the poses `[V, 3, 4]` of a scene alone.
 
     The guess assumes that all cameras look at one subject, the point nearest to all optical axes.
     Near is a tenth of the smallest depth of the subject and far four times the largest. If the axes

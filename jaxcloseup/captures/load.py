@@ -62,8 +62,8 @@ def load_scene(
       photographs: keep so many training photographs, evenly spread; None means all.
 
     Returns:
-      The scene, float32. That of a folder has its middle at 0 and about size 1, in any unit and
-      with any origin of its files: `placement.to_capture` maps points back to their coordinates, in
+      The scene, float32. That of a folder has its middle at 0 and one size, in any unit and with
+      any origin of its files: `placement.to_capture` maps points back to their coordinates, in
       float64. Drawn scenes keep theirs. For a folder, `metadata` holds path, downscale, format,
       split; files and sizes (width, height) by split; applied_transform `[3, 4]` and applied_scale;
       up `[3]` or None; notes, sentences on what was read; for `closest` and `zoom` times_nearer of

@@ -12,17 +12,18 @@ from jaxcloseup.captures.world_frames import Frame
 from jaxcloseup.io.placement import Placement
 
 
+SIZE = 3.5  # about what COLMAP gives a capture; settings with lengths were chosen there
 _ITERATIONS = 100
 _ROUNDING = 1e-12  # of coordinates; cameras closer to each other stand in one place
 
 
 def find_placement(positions: np.ndarray, points: np.ndarray) -> Placement:
-    """Return the shift and scale that give a capture its middle at 0 and size 1.
+    """Return the shift and scale that give a capture its middle at 0 and its size `SIZE`.
 
-    The middle is the geometric median of the cameras, and the size their median distance from it,
-    which is 0.6 to 1 in drawn scenes. Both follow a capture that is moved, turned or scaled, and
-    a few stray cameras hardly change them. The scale is exact instead of a power of two, so that a
-    capture in any unit becomes the same numbers, up to rounding.
+    The middle is the geometric median of the cameras, and the size their median distance from it.
+    Both follow a capture that is moved, turned or scaled, and a few stray cameras hardly change
+    them. The scale is exact instead of a power of two, so that a capture in any unit becomes the
+    same numbers, up to rounding.
 
     Args:
       positions: `[V, 3]` float64 positions of all cameras, whatever their split, so that every
@@ -38,8 +39,8 @@ def find_placement(positions: np.ndarray, points: np.ndarray) -> Placement:
     spread = np.median(_distances(positions, center))
     reach = np.median(_distances(points, center)) if len(points) else 0.0
     if spread <= max(smallest, 1e-6 * reach):
-        spread = reach if reach > smallest else 1.0
-    return Placement(center, float(1 / spread))
+        spread = reach if reach > smallest else SIZE
+    return Placement(center, float(SIZE / spread))
 
 
 def place(frames: Sequence[Frame], placement: Placement) -> list[Frame]:

@@ -55,7 +55,7 @@ def triangulate(
     Args:
       images: uint8 pinhole photographs `[H, W, 3]`; sizes may differ.
       masks: uint8 masks `[H, W]`; features are used where the mask is at least 128.
-      camtoworld: `[V, 3, 4]` OpenCV poses in a scene of about size 1.
+      camtoworld: `[V, 3, 4]` OpenCV poses in a scene.
       intrinsics: `[V, 4]` fx, fy, cx, cy in pixels.
     """
     found = [_find_features(image, mask) for image, mask in zip(images, masks, strict=True)]

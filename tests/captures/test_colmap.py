@@ -138,7 +138,8 @@ def test_points_that_training_does_not_see_are_dropped(tmp_path):
     for i in range(3):
         write_image(tmp_path / f"images/{i:03d}.png")
     seen = ["4 3 1 4 3 2", "4 3 1", "4 3 1 4 3 2"]  # the first photograph is held out
-    lines = [part for i in range(3) for part in (image_line(i + 1, f"{i:03d}.png"), seen[i])]
+    pose = "1 0 0 0 0.1 0 0"  # the point is well inside the image
+    lines = [part for i in range(3) for part in (image_line(i + 1, f"{i:03d}.png", pose), seen[i])]
     points = [f"{POINTS[0]} 1 0 2 0 3 0", f"{POINTS[1]} 1 1 3 1"]
     write_model(tmp_path / "sparse", lines, points=points)
     scene = load_scene(tmp_path)

@@ -3,6 +3,7 @@
 import math
 import pathlib
 import time
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from jaxcloseup.app.view import surface
 from jaxcloseup.artifacts.mesh_files import write_mesh
 from jaxcloseup.io.files import write_json
 from jaxcloseup.io.memory import installed_memory
+from jaxcloseup.io.placement import Placement
 from jaxcloseup.photos.scene import Scene
 
 
@@ -69,13 +71,11 @@ def write_run_mesh(
         region = surface.box_around(points)
     longest = np.ptp(region, axis=0).max()
     grid = surface.make_grid(region, voxel * placement.scale if voxel else longest / resolution)
-    mesh = _fuse(maps, grid, grid.voxel / placement.scale)
+    mesh = _fuse(maps, grid, placement.scale)
     write_mesh(output_dir / "mesh.ply", mesh, placement)
     about = {
         "stage": stage,
-        "voxel": grid.voxel / placement.scale,
-        "region": placement.to_capture(region).tolist(),
-        "offset": placement.offset.tolist(),
+        **_in_capture(grid.voxel, region, placement),
         "min_views": min_views,
         "vertices": len(mesh.vertices),
         "triangles": len(mesh.faces),
@@ -85,11 +85,18 @@ def write_run_mesh(
     print(f"mesh: {output_dir / 'mesh.ply'}, {len(mesh.faces)} triangles")
 
 
-def _fuse(maps: surface.Maps, grid: surface.Grid, side: float) -> surface.Mesh:
-    """Return the mesh of a grid; `side` is that of its voxels in the capture's unit."""
+def _in_capture(voxel: float, region: np.ndarray, placement: Placement) -> dict[str, Any]:
+    """Return a voxel's side, a region and what `mesh.ply` leaves out, as the capture has them."""
+    box = placement.to_capture(region)
+    offset = placement.offset
+    return {"voxel": voxel / placement.scale, "region": box.tolist(), "offset": offset.tolist()}
+
+
+def _fuse(maps: surface.Maps, grid: surface.Grid, unit: float) -> surface.Mesh:
+    """Return the mesh of a grid; `unit` is the capture's."""
     _check_memory(grid)
     counts = " x ".join(map(str, grid.shape))
-    what = f"{len(maps.depths)} depth maps into {counts} voxels of {side:.3g}"
+    what = f"{len(maps.depths)} depth maps into {counts} voxels of {grid.voxel / unit:.3g}"
     began = time.perf_counter()
     with progress.saying(f"fusing {what}"):
         mesh = surface.fuse_mesh(maps, grid)
