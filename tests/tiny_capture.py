@@ -27,6 +27,15 @@ def write_image(path, image=None, value=100):
     path.write_bytes(data)
 
 
+def own_poses(scene, split="train"):
+    """Return OpenCV poses `[V, 3, 4]` in the coordinates of the capture's files."""
+    return scene.placement.poses_to_capture(getattr(scene, split).cameras.camtoworld)
+
+
+def own_points(scene):
+    return scene.placement.to_capture(scene.points)
+
+
 def frame(listed, **changes):
     return {"file_path": listed, "transform_matrix": POSE.tolist(), **LENS, **changes}
 

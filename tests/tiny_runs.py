@@ -92,7 +92,8 @@ def keep_run(folder, capture_folder):
         points = np.stack([*np.meshgrid(side, side), np.zeros((24, 24))], -1).reshape(-1, 3)
         programs = Programs(KEPT, scene)
         bound = {"field": programs.field, "optimizer": programs.optimizer}
-        data = (jnp.asarray(x, jnp.float32) for x in (points, plane.texture(points)))
+        placed = scene.placement.to_scene(points)
+        data = (jnp.asarray(x, jnp.float32) for x in (placed, plane.texture(points)))
         state = init_state(jax.random.key(0), *data, **bound)
         flat = {
             "opacity_logits": jnp.full_like(state.params.opacity_logits, 3.0),

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxcloseup.io.placement import UNMOVED, Placement
 from jaxcloseup.io.ply import write_vertices
 
 
@@ -51,14 +52,20 @@ def surface_mesh(
     return Mesh(vertices, faces.reshape(-1, 3).astype(np.int32), np.zeros(vertices.shape, np.uint8))
 
 
-def write_mesh(path: str | pathlib.Path, mesh: Mesh) -> None:
+def write_mesh(path: str | pathlib.Path, mesh: Mesh, placement: Placement = UNMOVED) -> None:
     """Write a mesh as a binary PLY file with colors of vertices, whole or not at all.
+
+    Args:
+      path: path of the file.
+      mesh: the mesh.
+      placement: of the mesh in the coordinates to write, see `Placement.to_file`.
 
     Raises:
       OSError: one sentence that names the path and the reason.
     """
     names = [(name, "f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
     rows = np.empty(len(mesh.vertices), names)
+    vertices = placement.to_file(mesh.vertices)
     for i, (name, _) in enumerate(names):
-        rows[name] = (mesh.vertices if i < 3 else mesh.rgb)[:, i % 3]
-    write_vertices(path, rows, mesh.faces)
+        rows[name] = (vertices if i < 3 else mesh.rgb)[:, i % 3]
+    write_vertices(path, rows, mesh.faces, offset=placement.offset)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxcloseup.artifacts.viewer_gaussians import thickened
 from jaxcloseup.fields.splats.surfels import Surfels
 from jaxcloseup.geometry.rotations import quaternion_to_matrix
+from jaxcloseup.io.placement import UNMOVED, Placement
 from jaxcloseup.io.ply import PlyError, read_vertices, write_vertices
 
 
@@ -21,9 +22,14 @@ _matrices = jax.jit(quaternion_to_matrix)
 
 
 def write_surfels(
-    path: str | pathlib.Path, surfels: Surfels, alive: jax.Array, *, num_scales: int = 3
+    path: str | pathlib.Path,
+    surfels: Surfels,
+    alive: jax.Array,
+    *,
+    num_scales: int = 3,
+    placement: Placement = UNMOVED,
 ) -> int:
-    """Write the surfels that are alive, atomically and in their own coordinates.
+    """Write the surfels that are alive, atomically.
 
     Args:
       path: path of the file.
@@ -31,6 +37,8 @@ def write_surfels(
       alive: `[N]` bool.
       num_scales: 3 for viewers of 3-D Gaussians, which surfels get a thickness of 1/1000 of the
         smaller radius for; 2 for viewers of discs.
+      placement: of the surfels in the coordinates to write: `to_file`, as viewers read float32
+        alone. By default they stay.
 
     Returns:
       The number of alive surfels that were dropped because a value is not finite.
@@ -43,7 +51,7 @@ def write_surfels(
         raise ValueError(f"num_scales must be 2 or 3, got {num_scales}")
     surfels, alive = jax.device_get((surfels, alive))
     sh = np.asarray(surfels.sh, np.float32)
-    scales = np.asarray(surfels.log_scales, np.float32)
+    scales = np.asarray(surfels.log_scales, np.float32) - np.float32(np.log(placement.scale))
     normals = np.asarray(_matrices(surfels.quaternions))[..., 2]
     if scales.shape[1] == 3:
         if num_scales == 2:
@@ -52,7 +60,7 @@ def write_surfels(
     if num_scales == 3:
         scales = thickened(scales)
     columns = {
-        **dict(zip("xyz", np.asarray(surfels.means).T, strict=True)),
+        **dict(zip("xyz", placement.to_file(np.asarray(surfels.means)).T, strict=True)),
         **dict(zip(("nx", "ny", "nz"), normals.T, strict=True)),
         **_numbered("f_dc", sh[:, 0]),
         **_numbered("f_rest", sh[:, 1:].swapaxes(1, 2).reshape(len(sh), 3 * (sh.shape[1] - 1))),
@@ -64,7 +72,7 @@ def write_surfels(
     for name, column in columns.items():
         vertices[name] = column
     finite = np.all([np.isfinite(column) for column in columns.values()], axis=0)
-    write_vertices(path, vertices[alive & finite])
+    write_vertices(path, vertices[alive & finite], offset=placement.offset)
     return int(np.sum(alive & ~finite))
 
 

@@ -36,7 +36,7 @@ class Model(NamedTuple):
     frames: list[
         Frame
     ]  # the images that have a pose, sorted by name; their files are not found yet
-    points: np.ndarray  # `[P, 3]` float32 world points, sorted by id; P may be 0
+    points: np.ndarray  # `[P, 3]` float64 world points, sorted by id; P may be 0
     rgb: np.ndarray  # `[P, 3]` float32 colors of the points in [0, 1]
     # `[P]` mean reprojection errors in pixels of the images, NaN where unknown; None of a PLY file
     errors: np.ndarray | None
@@ -102,7 +102,7 @@ def _read_points(
     rgb = np.array(colors, np.float32).reshape(-1, 3) / 255
     errors = np.array([reconstruction.points3D[i].error for i in kept], np.float32).reshape(-1)
     errors = np.where(errors >= 0, errors, np.nan)  # COLMAP writes -1 for an unknown one
-    return kept, xyz[keep].astype(np.float32), rgb, errors, ()
+    return kept, xyz[keep], rgb, errors, ()
 
 
 def _reconstruct(files: ModelFiles) -> tuple[Any, dict[int, str]]:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 
+SMALLEST = 1e-6  # in a scene: float32 hardly tells smaller distances from 0
 _MAX_POINTS = 20_000
 
 
@@ -57,7 +58,7 @@ def depths_in_view(
 
 
 def near_far_from_cameras(camtoworld: np.ndarray) -> tuple[float, float]:
-    """Guess near and far, in world units, from the poses `[V, 3, 4]` alone.
+    """Guess near and far from the poses `[V, 3, 4]` of a scene alone.
 
     The guess assumes that all cameras look at one subject, the point nearest to all optical axes.
     Near is a tenth of the smallest depth of the subject and far four times the largest. If the axes
@@ -65,17 +66,15 @@ def near_far_from_cameras(camtoworld: np.ndarray) -> tuple[float, float]:
     camera positions (or times 1 if that is 0).
     """
     axes, positions = camtoworld[:, :, 2], camtoworld[:, :, 3]
-    # Positions are stored as float32, which cannot tell smaller distances from 0.
-    smallest = np.finfo(np.float32).eps * float(np.abs(positions).max())
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # projects onto the image plane
     total = across.mean(0)
     # The smallest eigenvalue is about the mean squared sine of the angle between the axes.
     if np.linalg.eigvalsh(total)[0] > 1e-4:
         subject = np.linalg.solve(total, np.einsum("vij,vj->i", across, positions) / len(axes))
         depths = np.einsum("vi,vi->v", axes, subject - positions)
-        if (depths > smallest).mean() > 0.5:
-            depths = depths[depths > smallest]
+        if (depths > SMALLEST).mean() > 0.5:
+            depths = depths[depths > SMALLEST]
             return 0.1 * float(depths.min()), 4 * float(depths.max())
     spread = float(np.linalg.norm(positions - positions.mean(0), axis=-1).max())
-    spread = spread if spread > smallest else 1.0
+    spread = spread if spread > SMALLEST else 1.0
     return 0.1 * spread, 100 * spread

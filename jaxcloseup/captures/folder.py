@@ -24,7 +24,7 @@ from jaxcloseup.captures.photo_checks import (
 from jaxcloseup.captures.photo_files import pad_images, read_image
 from jaxcloseup.captures.photo_masks import understood_masks
 from jaxcloseup.captures.photo_reading import read_photos
-from jaxcloseup.captures.scale import LENGTH, check_positions
+from jaxcloseup.captures.scale import LENGTH
 from jaxcloseup.captures.triangulation import Triangulated, triangulate
 from jaxcloseup.captures.world_frames import Frame
 from jaxcloseup.geometry.cameras import Camera
@@ -102,7 +102,6 @@ def _load(listing: Listing, reading: Reading) -> Scene:
     if not len(listing.points):
         listing = _with_points(listing, parts["train"], camtoworld, intrinsics)
     near, far = _near_far(listing, camtoworld, intrinsics, sizes)
-    check_positions([photo.frame for photo in photos], far=far)
 
     width, height = sizes.max(0).tolist()
     ends = np.cumsum([len(members) for members in parts.values()])[:-1]
@@ -148,6 +147,7 @@ def _load(listing: Listing, reading: Reading) -> Scene:
         metadata=metadata,
         # With a zoom, finer photographs would show the very crops that are held out.
         photographs_at=None if reading.zoom > 1 else functools.partial(_read_at, listing, reading),
+        placement=listing.placement,
     )
 
 
@@ -250,9 +250,9 @@ def _points_of(reading: Reading, frames: Sequence[Frame]) -> tuple[list[Frame], 
 def _near_far(
     listing: Listing, camtoworld: np.ndarray, intrinsics: np.ndarray, sizes: np.ndarray
 ) -> tuple[float, float]:
-    label = str(listing.file)
+    label, unit = str(listing.file), listing.placement.scale
     given = {
-        key: number(label, key, listing.fields[key], above=0)
+        key: unit * number(label, key, listing.fields[key], above=0)
         for key in ("near", "far")
         if listing.fields.get(key) is not None
     }
@@ -265,16 +265,18 @@ def _near_far(
         absent = " and ".join(key for key in ("near", "far") if key not in given)
         if source == "poses" or listing.format != "colmap":  # COLMAP has no such field
             warnings.warn(
-                f"{label}: no {absent}; estimated near {near:.4g} and far {far:.4g} from the "
-                f"{source}: give both in world units if they do not enclose the scene.",
+                f"{label}: no {absent}; estimated near {near / unit:.4g} and far {far / unit:.4g} "
+                f"from the {source}: give both in its unit if they do not enclose the scene.",
                 NearFarWarning,
                 stacklevel=2,
             )
     if near >= far:
-        raise SceneError(f"{label}: near {near:.4g} is not less than far {far:.4g}: correct them.")
+        raise SceneError(
+            f"{label}: near {near / unit:.4g} is not less than far {far / unit:.4g}: correct them."
+        )
     if near < 1 / LENGTH or far > LENGTH:
         raise SceneError(
-            f"{label}: near {near:.4g} and far {far:.4g} must lie between {1 / LENGTH:g} and "
-            f"{LENGTH:g}: correct them."
+            f"{label}: near {near / unit:.4g} and far {far / unit:.4g} must lie between "
+            f"{1 / LENGTH / unit:.3g} and {LENGTH / unit:.3g}: correct them."
         )
     return near, far

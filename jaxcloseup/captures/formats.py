@@ -1,6 +1,5 @@
 """List the photographs of a capture by split."""
 
-import collections
 import math
 import pathlib
 from collections.abc import Iterable, Sequence
@@ -8,49 +7,27 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxcloseup.captures.colmap import read_colmap
-from jaxcloseup.captures.colmap_files import find_model_files
-from jaxcloseup.captures.corrections import correct_frames, correct_points
-from jaxcloseup.captures.detection import SEPARATE, SINGLE, Detected, detect
+from jaxcloseup.captures.contents import read_content
 from jaxcloseup.captures.leftovers import unused_note
-from jaxcloseup.captures.llff import read_llff
 from jaxcloseup.captures.photo_files import size_of_image
 from jaxcloseup.captures.photo_masks import attach_masks
-from jaxcloseup.captures.photo_search import check_missing, list_first, locate, photograph_folders
-from jaxcloseup.captures.points import read_ply_points
+from jaxcloseup.captures.placing import describe_offset
 from jaxcloseup.captures.reduced_photos import attach_reduced, note_stand_ins
-from jaxcloseup.captures.scale import check_positions, plausible
-from jaxcloseup.captures.splits import (
-    FindPoints,
-    divide,
-    splits_from_fields,
-    splits_from_file,
-    spread,
-    warn_duplicates,
-    without_repeats,
-)
-from jaxcloseup.captures.transforms import read_transforms
+from jaxcloseup.captures.splits import FindPoints, divide, splits_from_file, spread, warn_duplicates
 from jaxcloseup.captures.world_frames import Frame
 from jaxcloseup.io.messages import printable
-from jaxcloseup.photos.scene import SceneError
-
-
-_FILES = {
-    "train": (SEPARATE,),
-    "test": ("transforms_test.json",),
-    "test_far": ("transforms_test_far.json", "transforms_val.json"),
-}
+from jaxcloseup.io.placement import Placement
 
 
 class Listing(NamedTuple):
-    """The photographs, points and fields that a capture's files list."""
+    """The photographs, points and fields that a capture's files list, placed as their scene."""
 
     format: str  # one of `FORMATS`
     folder: pathlib.Path  # folder of the capture
     file: pathlib.Path  # main file of the capture, which error messages name
     fields: dict[str, Any]  # fields of the main file
     frames: dict[str, list[Frame]]  # photographs of each split present, `train` first
-    points: np.ndarray  # `[P, 3]` float32 world points; P may be 0
+    points: np.ndarray  # `[P, 3]` float32 points of the scene; P may be 0
     rgb: np.ndarray  # `[P, 3]` float32 colors of the points in [0, 1]
     notes: tuple[str, ...]  # sentences on what was read and how it was split
     times_nearer: tuple[float, ...] | None  # see `splits.Division`
@@ -58,28 +35,7 @@ class Listing(NamedTuple):
     # where unknown; None if the format has none
     errors: np.ndarray | None
     downscale: int  # divisor of the photographs' size, chosen where none was given
-
-
-class Listed(NamedTuple):
-    """All photographs of a capture, and its points."""
-
-    format: str  # one of `FORMATS`
-    folder: pathlib.Path  # folder of the capture
-    frames: list[Frame]  # photographs of all splits, in the order of their files
-    points: np.ndarray  # `[P, 3]` float32 world points; P may be 0
-    rgb: np.ndarray  # `[P, 3]` float32 colors of the points in [0, 1]
-
-
-class _Content(NamedTuple):
-    """What one format's reader returns; `given` holds the splits if the files list any."""
-
-    file: pathlib.Path
-    fields: dict[str, Any]
-    frames: list[Frame]
-    given: dict[str, list[Frame]] | None
-    points: tuple[np.ndarray, np.ndarray]
-    errors: np.ndarray | None = None
-    notes: tuple[str, ...] = ()  # sentences on how it was read
+    placement: Placement  # of the scene in the coordinates of the files, which `fields` have
 
 
 def read_listing(
@@ -99,7 +55,7 @@ def read_listing(
     Raises:
       SceneError: the folder holds no known format, or one of its files is wrong.
     """
-    detected, content = _read_content(path, format, corrections)
+    detected, content, placement = read_content(path, format, corrections)
     folder, scene = detected.folder, detected.folder.resolve().name
     given = content.given
     if split == "given" and not given:
@@ -122,7 +78,7 @@ def read_listing(
         keep = _seen_in_training(frames["train"], len(points))
     used = [*content.frames, *(frame for part in frames.values() for frame in part)]
     notes = [*content.notes, *note_stand_ins(scene, content.frames), *division.notes, *reduced]
-    notes += unused_note(folder, used)
+    notes += [*unused_note(folder, used), *describe_offset(scene, placement)]
     if fewer:
         notes.append(f"{scene}: learns from {len(chosen)} of {len(train)} training photographs")
     if not keep.all():
@@ -142,6 +98,7 @@ def read_listing(
         times_nearer=division.times_nearer,
         errors=None if content.errors is None else content.errors[keep],
         downscale=downscale,
+        placement=placement,
     )
 
 
@@ -154,124 +111,6 @@ def fitting_divisor(sizes: Iterable[tuple[int, int]], pixels: int) -> int:
     """
     areas = [width * height for width, height in sizes]
     return max(1, round(math.sqrt(float(np.median(areas or [1])) / pixels)))
-
-
-def list_photographs(
-    path: pathlib.Path, *, format: str | None = None, corrections: Sequence[str] = ()
-) -> Listed:
-    """List a folder's photographs of all splits; `load_scene` documents the arguments.
-
-    Raises:
-      SceneError: the folder holds no known format, or one of its files is wrong.
-    """
-    detected, content = _read_content(path, format, corrections)
-    frames = attach_masks(detected.folder, {"all": content.frames})["all"]
-    return Listed(detected.format, detected.folder, frames, *content.points)
-
-
-def _read_content(
-    path: pathlib.Path, format: str | None, corrections: Sequence[str]
-) -> tuple[Detected, _Content]:
-    """Read what a folder holds of a format, and find the photographs that its files list."""
-    detected = detect(path, format)
-    readers = {"transforms": _read_transforms, "colmap": _read_model, "llff": _read_llff}
-    content = readers[detected.format](detected.folder, detected.path)
-    content = _corrected(content, corrections, opengl=detected.format == "transforms")
-    check_positions(content.frames)
-    scene = detected.folder.resolve().name
-    notes = tuple(f"{scene}: {note}" for note in (detected.note, *content.notes))
-    return detected, content._replace(notes=notes)
-
-
-def _corrected(content: _Content, corrections: Sequence[str], *, opengl: bool) -> _Content:
-    """Apply corrections to photographs, their splits and points."""
-    if not corrections:
-        return content
-    points, rgb = content.points
-    frames = correct_frames(content.frames, corrections, opengl=opengl)
-    for correction in corrections:
-        points = correct_points(points, correction)
-    if not len(points):
-        frames = [frame._replace(seen=None) for frame in frames]
-    changed = {id(old): new for old, new in zip(content.frames, frames, strict=True)}
-    given = content.given and {
-        split: [changed[id(frame)] for frame in part] for split, part in content.given.items()
-    }
-    errors = content.errors if len(points) else None
-    note = f"{content.file}: corrected by {', '.join(corrections):.200}"
-    return content._replace(
-        frames=frames,
-        given=given,
-        points=(points, rgb[: len(points)]),
-        errors=errors,
-        notes=(*content.notes, note),
-    )
-
-
-def _read_transforms(folder: pathlib.Path, file: pathlib.Path) -> _Content:
-    named = _FILES if file.name == SEPARATE else {"train": (SINGLE,)}
-    present = {
-        split: next((folder / name for name in names if (folder / name).is_file()), None)
-        for split, names in named.items()
-    }
-    read = {split: read_transforms(path) for split, path in present.items() if path}
-    fields, listed = read["train"][0], [frame for _, part in read.values() for frame in part]
-    places = list(dict.fromkeys((folder, *photograph_folders(folder))))
-    located = locate(folder, listed, places)
-    absent = collections.Counter(frame.source for frame in located.missing)
-    if absent.pop(file, 0):
-        missing = [frame for frame in located.missing if frame.source == file]
-        check_missing(folder, located._replace(missing=missing), places)
-    unrendered = [
-        f"{path.name} lists {count} views without photographs, which are not scored"
-        for path, count in absent.items()
-    ]
-    frames = without_repeats(located.frames)
-    if file.name == SINGLE:
-        given = splits_from_fields(file, fields, frames)
-    else:
-        parts = {
-            split: [frame for frame in frames if frame.source == present[split]] for split in read
-        }
-        given = {split: part for split, part in parts.items() if part}
-    points, rgb, about = _read_ply(file, fields, frames)
-    notes = (*located.notes, *unrendered, *about)
-    return _Content(file, fields, frames, given, (points, rgb), notes=notes)
-
-
-def _read_model(folder: pathlib.Path, path: pathlib.Path) -> _Content:
-    files = find_model_files(path)
-    assert files is not None  # it was detected
-    model = read_colmap(files)
-    places = photograph_folders(folder, path)
-    located = locate(folder, model.frames, places)
-    check_missing(folder, located, places)
-    notes = (*located.notes, *model.notes)
-    points = model.points, model.rgb
-    return _Content(model.source, {}, located.frames, None, points, model.errors, notes)
-
-
-def _read_llff(folder: pathlib.Path, file: pathlib.Path) -> _Content:
-    fields, frames = read_llff(file, *list_first(photograph_folders(folder)))
-    points, rgb, notes = _read_ply(file, fields, frames)
-    return _Content(file, fields, frames, None, (points, rgb), notes=notes)
-
-
-def _read_ply(
-    file: pathlib.Path, fields: dict[str, Any], frames: list[Frame]
-) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Read the points `[P, 3]` beside a file, their colors `[P, 3]`, and notes on them."""
-    folder, named = file.parent, fields.get("ply_file_path")
-    if named and not (folder / str(named)).is_file():
-        raise SceneError(
-            f"{file}: ply_file_path {named!r} does not exist: restore it or remove the field."
-        )
-    ply = folder / str(named or "points3d.ply")
-    if ply.is_file():
-        points, rgb, notes = read_ply_points(ply)
-        keep = plausible(ply, points, np.stack([frame.camtoworld[:, 3] for frame in frames]))
-        return points[keep], rgb[keep], notes
-    return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), ()
 
 
 def _renumbered(frames: list[Frame], keep: np.ndarray) -> list[Frame]:

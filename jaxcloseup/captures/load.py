@@ -65,10 +65,12 @@ def load_scene(
       corrections: corrections of known mistakes, as `captures.corrections` lists them.
 
     Returns:
-      The scene in the capture's coordinates, float32. For a folder, `metadata` holds path,
-      downscale, format, split; files and sizes (width, height) by split; applied_transform
-      `[3, 4]` and applied_scale; up `[3]` or None; notes, sentences on what was read; for `closest`
-      and `zoom` times_nearer of each `test` view; for `zoom` the crops' corners.
+      The scene, float32. That of a folder has its middle at 0 and one size, in any unit and with
+      any origin of its files: `placement.to_capture` maps points back to their coordinates, in
+      float64. Drawn scenes keep theirs. For a folder, `metadata` holds path, downscale, format,
+      split; files and sizes (width, height) by split; applied_transform `[3, 4]` and applied_scale;
+      up `[3]` or None; notes, sentences on what was read; for `closest` and `zoom` times_nearer of
+      each `test` view; for `zoom` the crops' corners.
 
     Raises:
       SceneError: one sentence that names the file and the field and says what to do.
@@ -80,12 +82,11 @@ def load_scene(
     if is_drawn(name_or_path):
         _check_drawn(path.name, format, split, invert_masks, alpha_mode)
         return _draw(path.name, downscale, pixels, photographs)
-    if len(path.parts) == 1 and str(name_or_path) == path.name:
-        if not path.exists():
-            raise SceneError(
-                f"{path} is neither a folder nor a built-in scene: choose one of "
-                f"{', '.join(DRAWN_SCENES)}, or give the path of a capture."
-            )
+    if len(path.parts) == 1 and str(name_or_path) == path.name and not path.exists():
+        raise SceneError(
+            f"{path} is neither a folder nor a built-in scene: choose one of "
+            f"{', '.join(DRAWN_SCENES)}, or give the path of a capture."
+        )
     reading = Reading(downscale or 1, zoom, background, half_pixel, alpha_mode, invert_masks)
     return load_capture(
         path,

@@ -102,7 +102,7 @@ def _read_photo(
     # Everything that the result depends on.
     key = ["area", cv2.__version__, _code(), closeup, reading._replace(half_pixel=False)]
     key += [content_hash(picture), None if mask is None else content_hash(mask)]
-    key += [frame.size, frame.distortion, is_dynamic(frame)]
+    key += [frame.size, frame.distortion, frame.turns, is_dynamic(frame)]
     if frame.distortion:
         # The size may be unknown before decoding. This stand-in is so large that a principal
         # point that defaults to its middle never equals a given one.
@@ -169,7 +169,7 @@ def make_photo(
       SceneError: the photograph or its mask cannot be read, or their sizes do not fit.
     """
     file = frame.reduced or frame.file
-    image = decode_image(file, data=picture)
+    image = np.rot90(decode_image(file, data=picture), frame.turns)
     if reading.alpha_mode == "ignore":
         image = np.ascontiguousarray(image[..., :3])
     flaw = _flaw(image)

@@ -19,7 +19,7 @@ _HARMONIC = 0.28209479177387814  # the spherical harmonic of degree 0, 1 / sqrt(
 
 
 def read_ply_points(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Read positions `[P, 3]` and colors `[P, 3]` in [0, 1], float32, from a PLY file's vertices.
+    """Read positions `[P, 3]`, float64, and colors `[P, 3]` in [0, 1], float32, of PLY vertices.
 
     Properties may come in any order, and unknown ones are ignored. Colors are red, green and blue,
     also as diffuse_red or r, or splats' harmonics f_dc. Integer colors are divided by the maximum
@@ -35,13 +35,13 @@ def read_ply_points(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray, tuple[s
     except PlyError as error:
         raise SceneError(str(error)) from error
     with np.errstate(over="ignore"):  # too large for float32 becomes infinite
-        points = np.stack([vertices[axis] for axis in "xyz"], -1).astype(np.float32)
+        points = np.stack([vertices[axis] for axis in "xyz"], -1).astype(np.float64)
         rgb = _colors(vertices)
     notes: tuple[str, ...] = ()
     if rgb is None:
         rgb = np.full((len(vertices), 3), 0.5, np.float32)
         notes = (f"{path.name} has no colors: its points are gray",) if len(vertices) else ()
-    finite = np.isfinite(points).all(-1) & np.isfinite(rgb).all(-1)
+    finite = (np.abs(points) <= np.finfo(np.float32).max).all(-1) & np.isfinite(rgb).all(-1)
     if not finite.all():
         count, dropped = len(vertices), (~finite).sum()
         warnings.warn(

@@ -1,7 +1,6 @@
 """Bounds on what a capture's numbers may be beside each other, since they are stored as float32.
 
-They are far beyond any lens and any scene. What exceeds them is a mistake in a file, or coordinates
-of a map whose origin is thousands of kilometers away.
+They are far beyond any lens and any scene. What exceeds them is a mistake in a file.
 """
 
 import warnings
@@ -10,13 +9,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxcloseup.captures.world_frames import Frame
+from jaxcloseup.io.placement import Placement
 from jaxcloseup.photos.scene import PointsWarning, SceneError
 
 
 FOCAL = (0.01, 1e4)  # focal length in multiples of the photograph's longer side
 CENTER = 100  # distance of the principal point from the middle, likewise
 LENGTH = 1e12  # any distance, and 1 / the smallest one: squares and cubes stay finite
-ORIGIN = 1e4  # distance of cameras from the origin, in multiples of the scene's size
 STRAY = 1e5  # distance of points from the cameras, in multiples of the cameras' spread or median
 
 
@@ -37,22 +36,15 @@ def check_lens(label: str, intrinsics: np.ndarray, width: int, height: int) -> N
         )
 
 
-def check_positions(frames: Sequence[Frame], *, far: float = np.inf) -> None:
-    """Raise if float32 cannot tell a camera's position from others so far from the origin.
-
-    Args:
-      frames: photographs of the capture.
-      far: upper bound of z-depth, which is as large as the scene; infinity checks `LENGTH` alone.
-    """
-    positions = np.stack([frame.camtoworld[:, 3] for frame in frames])
+def check_positions(frames: Sequence[Frame], placement: Placement) -> None:
+    """Raise if a camera of a capture is absurdly far away, in a scene that lies there."""
+    positions = placement.to_scene(np.stack([frame.camtoworld[:, 3] for frame in frames]))
     away = np.abs(positions).max(-1)
-    size = max(far, np.median(np.abs(positions - np.median(positions, 0)).max(-1)))
     worst = int(np.argmax(away))
-    if not away[worst] <= min(LENGTH, ORIGIN * size):
-        beside = f" of a scene {size:.3g} large" if ORIGIN * size < LENGTH else ""
+    if not away[worst] <= LENGTH:
         raise SceneError(
-            f"{frames[worst].label}: its camera lies {away[worst]:.3g} from the origin{beside}, "
-            "too far for numbers of 32 bits: correct its pose, or shift the origin to the cameras."
+            f"{frames[worst].label}: its camera lies {away[worst] / placement.scale:.3g} from "
+            f"{'the origin' if placement.scale == 1 else 'the others'}: correct its pose."
         )
 
 

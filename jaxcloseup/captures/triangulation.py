@@ -10,6 +10,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from jaxcloseup.captures.depth_range import SMALLEST
 from jaxcloseup.captures.features import find_features, match_features
 
 
@@ -41,7 +42,7 @@ def triangulate(
     Args:
       images: uint8 pinhole photographs `[H, W, 3]`; sizes may differ.
       masks: uint8 masks `[H, W]`; features are used where the mask is at least 128.
-      camtoworld: `[V, 3, 4]` OpenCV poses.
+      camtoworld: `[V, 3, 4]` OpenCV poses in a scene.
       intrinsics: `[V, 4]` fx, fy, cx, cy in pixels.
     """
     found = [find_features(image, mask) for image, mask in zip(images, masks, strict=True)]
@@ -65,8 +66,7 @@ def _neighbors(camtoworld: np.ndarray) -> Iterator[tuple[int, int]]:
     axes, positions = camtoworld[:, :, 2], camtoworld[:, :, 3]
     away = np.linalg.norm(positions[:, None] - positions, axis=-1)
     # Rotation in place shows no depth, and a view is not its own neighbor.
-    smallest = np.finfo(np.float32).eps * np.abs(positions).max()  # as positions are stored
-    fit = (axes @ axes.T > _MIN_AXIS_COSINE) & (away > max(1e-6 * away.max(), smallest))
+    fit = (axes @ axes.T > _MIN_AXIS_COSINE) & (away > SMALLEST)
     order = np.argsort(np.where(fit, away, np.inf), axis=1, kind="stable")[:, :_NEIGHBORS]
     pairs = {
         (min(i, j), max(i, j)) for i, row in enumerate(order.tolist()) for j in row if fit[i, j]

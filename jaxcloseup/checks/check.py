@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxcloseup.captures.formats import list_photographs
+from jaxcloseup.captures.contents import list_photographs
 from jaxcloseup.captures.photo import Reading
 from jaxcloseup.checks.evidence import gather
 from jaxcloseup.checks.judge import Checked, judge

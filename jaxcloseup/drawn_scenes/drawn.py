@@ -76,7 +76,9 @@ def draw_scene(name: str, *, downscale: int = 1) -> Scene:
 
     return Scene(
         name=name,
-        **splits,
+        train=splits["train"],
+        test=splits["test"],
+        test_far=splits["test_far"],
         points=capture["points"],
         rgb=capture["colors"],
         near=float(capture["near"]),

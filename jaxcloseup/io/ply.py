@@ -1,6 +1,7 @@
 """Vertices in PLY files, as NumPy structured arrays, and triangles beside them."""
 
 import pathlib
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -65,7 +66,11 @@ def read_vertices(path: str | pathlib.Path) -> np.ndarray:
 
 
 def write_vertices(
-    path: str | pathlib.Path, vertices: np.ndarray, faces: np.ndarray | None = None
+    path: str | pathlib.Path,
+    vertices: np.ndarray,
+    faces: np.ndarray | None = None,
+    *,
+    offset: Sequence[float] | np.ndarray = (0, 0, 0),
 ) -> None:
     """Write a structured array `[P]` as a binary little-endian PLY file, whole or not at all.
 
@@ -73,13 +78,17 @@ def write_vertices(
       path: path of the file.
       vertices: `[P]`; its fields become properties.
       faces: `[F, 3]` indices of the vertices of triangles; None writes no such element.
+      offset: `[3]` shift that the coordinates leave out, which a comment says if it is not 0.
 
     Raises:
       OSError: one sentence that names the path and the reason.
     """
     names = vertices.dtype.names or ()
     fields = [(name, vertices.dtype[name].str[1:]) for name in names]
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    lines = ["ply", "format binary_little_endian 1.0"]
+    if any(offset):
+        lines += ["comment add offset " + " ".join(f"{value:.15g}" for value in offset)]
+    lines += [f"element vertex {len(vertices)}"]
     lines += [f"property {_NAMES[kind]} {name}" for name, kind in fields]
     data = vertices.astype([(name, "<" + kind) for name, kind in fields]).tobytes()
     if faces is not None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxcloseup.geometry.cameras import Camera, points_to_pixels
 from jaxcloseup.io.messages import printable
+from jaxcloseup.io.placement import UNMOVED, Placement
 from jaxcloseup.photos.views import Views, camera_at
 
 
@@ -70,7 +71,7 @@ class Surface(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """A capture in memory.
+    """A capture in memory, in coordinates of its own: world units, which `placement` maps.
 
     Attributes:
       name: name of the scene.
@@ -91,6 +92,7 @@ class Scene:
       photographs_at: reads the photographs of a split again at 1 / n of their own size, given n
         and the split, "train" by default, and returns `Views` and what `sizes` says of these; None
         where they have no finer size to be read at.
+      placement: maps this world to that of the capture's files, which programs write and print.
     """
 
     name: str
@@ -105,6 +107,7 @@ class Scene:
     metadata: dict[str, Any] = dataclasses.field(default_factory=dict)
     surface: Callable[[Camera], Surface] | None = None
     photographs_at: Callable[..., tuple[Views, list[tuple[int, int]]]] | None = None
+    placement: Placement = UNMOVED
 
     def sizes(self, split: str) -> list[tuple[int, int]]:
         """Return width and height of each photograph of a split, without its padding."""

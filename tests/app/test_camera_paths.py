@@ -226,7 +226,8 @@ def test_an_orbit_recovers_cameras_that_stand_on_a_circle(capture_folder):
     scene = load_scene(str(capture_folder))
     center = np.array([1.0, -2.0, 0.5])
     cameras = ring(center, 3.0, 2.0)
-    scene = dataclasses.replace(scene, train=scene.train.replace(cameras=cameras))
+    train = scene.train.replace(cameras=cameras)
+    scene = dataclasses.replace(scene, train=train, near=0.1, far=10.0)
     shots = camera_paths.orbit(scene, 12)
     np.testing.assert_allclose(shots.cameras.camtoworld, cameras.camtoworld, atol=1e-4)
     pixel, depth = jax.vmap(points_to_pixels, (0, None))(shots.cameras, jnp.asarray(center, "f"))
@@ -238,7 +239,8 @@ def test_an_orbit_turns_around_the_given_up_direction(capture_folder):
     scene = load_scene(str(capture_folder))
     center, radius, height = np.array([1.0, -2.0, 0.5]), 3.0, 2.0
     cameras = ring(center, radius, height)
-    scene = dataclasses.replace(scene, train=scene.train.replace(cameras=cameras))
+    train = scene.train.replace(cameras=cameras)
+    scene = dataclasses.replace(scene, train=train, near=0.1, far=10.0)
     # Around -z the circle is the same, and every camera is upside down.
     shots = camera_paths.orbit(scene, 12, up=(0, 0, -3))
     offset = np.asarray(shots.cameras.position) - center

@@ -10,6 +10,8 @@ from tiny_capture import (
     POSE,
     WIDTH,
     frame,
+    own_points,
+    own_poses,
     paper_capture,
     single_file,
     vertices,
@@ -55,7 +57,7 @@ def test_opengl_pose_becomes_opencv(capture):
     """OpenGL's identity looks along -z with y up, so points above the axis land higher up."""
     scene = load_scene(capture)
     points = POSE[:3, 3] + [[0, 0, -2], [1, 0, -2], [0, 1, -2]]
-    pixels, depth = reference.project(scene.train.cameras.camtoworld[0], [10, 11, 4, 3], points)
+    pixels, depth = reference.project(own_poses(scene)[0], [10, 11, 4, 3], points)
     np.testing.assert_allclose(depth, 2, atol=1e-6)
     np.testing.assert_allclose(pixels, [[4, 3], [9, 3], [4, 3 - 5.5]], atol=1e-6)
 
@@ -264,7 +266,7 @@ def test_messages_hold_no_control_characters(tmp_path):
 def test_points_come_with_the_capture(capture):
     rows = vertices()
     write_ply(capture / "points3d.ply", rows)
-    np.testing.assert_allclose(load_scene(capture).points[:, 0], rows["x"])
+    np.testing.assert_allclose(own_points(load_scene(capture))[:, 0], rows["x"], rtol=1e-6)
     write_ply(capture / "other.ply", rows[:2])
     frames = [frame("train/a.png")]
     write_json(capture / "transforms_train.json", frames, ply_file_path="other.ply")
@@ -289,7 +291,8 @@ def test_missing_near_far_is_estimated(capture, given):
     write_ply(capture / "points3d.ply", rows)
     with pytest.warns(NearFarWarning, match="from the points"):
         scene = load_scene(capture)
-    np.testing.assert_allclose([scene.near, scene.far], [given["near"] or 7, 15])
+    limits = np.array([scene.near, scene.far]) / scene.placement.scale
+    np.testing.assert_allclose(limits, [given["near"] or 7, 15])
 
 
 def test_names_of_built_in_scenes(monkeypatch, tmp_path, capture):

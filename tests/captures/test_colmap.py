@@ -13,6 +13,8 @@ from tiny_capture import (
     WIDTH,
     colmap_capture,
     image_line,
+    own_points,
+    own_poses,
     random_pose,
     single_file,
     write_image,
@@ -48,7 +50,7 @@ def test_folders(tmp_path, model, caplog):
     assert scene.metadata["notes"] == tuple(caplog.messages)
     assert scene.names == {"train": ["001", "002"], "test_far": ["000"]}
     np.testing.assert_allclose(scene.train.cameras.intrinsics, [[10, 11, 4, 3]] * 2)
-    np.testing.assert_allclose(scene.points[0], [-2, 0.5, 5])
+    np.testing.assert_allclose(own_points(scene)[0], [-2, 0.5, 5], rtol=1e-6)
     np.testing.assert_allclose(scene.rgb[4], [50 / 255, 20 / 255, 1], rtol=1e-6)
     assert scene.train.rgb[:, 0, 0, 0].tolist() == [1, 2]
     assert scene.metadata["format"] == "colmap" and scene.name == tmp_path.name
@@ -78,7 +80,7 @@ def test_poses_are_world_to_camera(tmp_path):
         scene = load_scene(tmp_path)
     inside = rng.uniform([-1, -1, 3], [1, 1, 5], (20, 3))
     pixels, depth = reference.project(
-        scene.train.cameras.camtoworld[0], [10, 11, 4, 3], (inside - position) @ rotation
+        own_poses(scene)[0], [10, 11, 4, 3], (inside - position) @ rotation
     )
     expected = inside[:, :2] / inside[:, 2:] * [10, 11] + [4, 3]
     np.testing.assert_allclose(pixels, expected, atol=1e-4)
@@ -137,11 +139,12 @@ def test_points_that_training_does_not_see_are_dropped(tmp_path):
     for i in range(3):
         write_image(tmp_path / f"images/{i:03d}.png")
     seen = ["4 3 1 4 3 2", "4 3 1", "4 3 1 4 3 2"]  # the first photograph is held out
-    lines = [part for i in range(3) for part in (image_line(i + 1, f"{i:03d}.png"), seen[i])]
+    pose = "1 0 0 0 0.1 0 0"  # the point is well inside the image
+    lines = [part for i in range(3) for part in (image_line(i + 1, f"{i:03d}.png", pose), seen[i])]
     points = [f"{POINTS[0]} 1 0 2 0 3 0", f"{POINTS[1]} 1 1 3 1"]
     write_model(tmp_path / "sparse", lines, points=points)
     scene = load_scene(tmp_path)
-    np.testing.assert_allclose(scene.points, [[-2, 0.5, 5]])
+    np.testing.assert_allclose(own_points(scene), [[-2, 0.5, 5]], rtol=1e-6)
     assert "dropped 1 of 2 points, which fewer than two training" in scene.metadata["notes"][-1]
 
 
@@ -245,7 +248,8 @@ def test_plush_loads_three_ways(shared, monkeypatch):
     with pytest.warns(UserWarning, match="from the poses"):
         listed = load_scene(folder)
     assert listed.metadata["format"] == "transforms"
-    assert binary.near < 1.2 and 10 < binary.far < 30
+    unit = binary.placement.scale
+    assert binary.near < 1.2 * unit and 10 * unit < binary.far < 30 * unit
     corners = np.array([[0.5, 0.5], [639.5, 0.5], [320, 240], [0.5, 479.5], [639.5, 479.5]])
     for other in (text, listed):
         assert other.names == binary.names

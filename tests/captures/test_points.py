@@ -19,7 +19,7 @@ def test_ply_encodings(tmp_path, encoding, color):
     points, rgb, notes = read_ply_points(tmp_path / "p.ply")
     assert not notes
     scale = {"u1": 255, "u2": 65535, "f4": 1}[color]
-    assert points.dtype == rgb.dtype == np.float32
+    assert (points.dtype, rgb.dtype) == (np.float64, np.float32)
     np.testing.assert_allclose(points, np.stack([rows[axis] for axis in "xyz"], -1), rtol=1e-6)
     for channel, name in enumerate(("red", "green", "blue")):
         np.testing.assert_allclose(rgb[:, channel], rows[name] / scale, rtol=1e-5)

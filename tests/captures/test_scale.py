@@ -6,8 +6,7 @@ from tiny_capture import (
     POSE,
     colmap_capture,
     frame,
-    llff_capture,
-    llff_rows,
+    own_points,
     paper_capture,
     vertices,
     write_image,
@@ -40,19 +39,6 @@ def test_lenses_of_cached_photographs_are_checked(capture):
         load_scene(capture, downscale=2)
 
 
-def test_coordinates_of_a_map_need_another_origin(tmp_path):
-    """All cameras are far away, at a spread of a few units."""
-    rows = llff_rows(3)[0]
-    llff_capture(tmp_path)
-    rows[:, 3] += 4e6
-    np.save(tmp_path / "poses_bounds.npy", rows)
-    with pytest.raises(SceneError, match="shift the origin to the cameras"):
-        load_scene(tmp_path)
-    rows[:, 3] -= 4e6 - 1e4
-    np.save(tmp_path / "poses_bounds.npy", rows)
-    assert len(load_scene(tmp_path).train) == 2
-
-
 @pytest.mark.parametrize("noise", [0.0, 1e-15])
 @pytest.mark.parametrize("count", [1, 3])
 def test_cameras_at_one_place_load(tmp_path, count, noise):
@@ -76,7 +62,7 @@ def test_stray_points_are_dropped(capture):
         pytest.warns(PointsWarning, match="1 of 9 points are not finite and were dropped"),
         pytest.warns(PointsWarning, match="ply: 2 of 8 points are not finite, or 100000 times"),
     ):
-        points = load_scene(capture).points
+        points = own_points(load_scene(capture))
     np.testing.assert_allclose(points[:, 1], np.delete(rows["y"], [2, 3, 4]), rtol=1e-6)
 
 

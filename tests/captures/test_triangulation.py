@@ -1,7 +1,7 @@
 import cv2
 import numpy as np
 import pytest
-from tiny_capture import write_image, write_json
+from tiny_capture import own_points, write_image, write_json
 
 from jaxcloseup.captures import folder as folder_module
 from jaxcloseup.captures.load import load_scene
@@ -80,15 +80,16 @@ def test_a_capture_without_points_gets_triangulated_ones(tmp_path, views):
     with pytest.warns(UserWarning, match="from the points"):
         scene = load_scene(tmp_path)
     assert scene.names["train"] == ["1", "2", "3"]
-    assert np.median(np.abs(scene.points[:, 2] - DEPTH)) < 0.02
-    assert 2 < scene.near < 4.5 and 5 < scene.far < 10
+    assert np.median(np.abs(own_points(scene)[:, 2] - DEPTH)) < 0.02
+    unit = scene.placement.scale
+    assert 2 < scene.near / unit < 4.5 and 5 < scene.far / unit < 10
     assert "were triangulated from features of its 3 training" in scene.metadata["notes"][-1]
     write_json(tmp_path / "transforms.json", frames, **lens)
     closest = load_scene(tmp_path, split="closest")
     assert closest.names == {"train": ["1", "2"], "test": ["3"], "test_far": ["0"]}
     assert closest.metadata["times_nearer"] == pytest.approx([4.7 / 4.4], rel=0.03)
     again = load_scene(tmp_path, downscale=2)
-    assert np.median(np.abs(again.points[:, 2] - DEPTH)) < 0.05
+    assert np.median(np.abs(own_points(again)[:, 2] - DEPTH)) < 0.05
 
 
 def test_too_few_points_are_dropped(tmp_path, views, monkeypatch):

@@ -30,7 +30,7 @@ def main(arguments: list[str]) -> None:
         from jaxcloseup.app import progress
         from jaxcloseup.app.report.check_page import write_check
         from jaxcloseup.app.run.capture_check import check_scene, said_of
-        from jaxcloseup.captures.formats import list_photographs
+        from jaxcloseup.captures.contents import list_photographs
         from jaxcloseup.captures.photo import Reading
         from jaxcloseup.checks.judge import MISFIT
         from jaxcloseup.photos.scene import SceneError

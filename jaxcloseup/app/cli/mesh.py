@@ -35,7 +35,7 @@ flags.DEFINE_integer(
     lower_bound=8,
     upper_bound=4096,
 )
-flags.DEFINE_float("voxel", None, "side of a voxel in world units, in place of --resolution")
+flags.DEFINE_float("voxel", None, "side of a voxel in the capture's unit, in place of --resolution")
 flags.DEFINE_list(
     "region",
     None,
@@ -69,7 +69,7 @@ def main(_: list[str]) -> None:
         # Cheap checks come before loading the scene and the state.
         region = _region()
         if FLAGS.voxel is not None and not 0 < FLAGS.voxel < math.inf:
-            raise MeshError(f"--voxel={FLAGS.voxel:g} must be a length above 0, in world units")
+            raise MeshError(f"--voxel={FLAGS.voxel:g} must be a length above 0")
         record, stage = run_from_flags()
         output_dir = check_unused(FLAGS.output_dir or dated(record.folder / "meshes"))
         prepare_to_stop(output_dir)

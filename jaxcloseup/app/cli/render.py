@@ -157,6 +157,7 @@ def _cameras(
         scene = load()
         if transform is not None:
             shots = camera_files.to_capture(shots, *transform, scene)
+        shots = camera_files.to_scene(shots, scene)
         return scene, lambda programs, state: shots
     scene = load()
     if source == "from":

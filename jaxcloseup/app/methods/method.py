@@ -15,6 +15,7 @@ if TYPE_CHECKING:  # flags read presets, and must not wait for JAX
 
     from jaxcloseup.artifacts.viewer_gaussians import Gaussians
     from jaxcloseup.fields.contract import RadianceField
+    from jaxcloseup.io.placement import Placement
     from jaxcloseup.photos.scene import Scene
     from jaxcloseup.training.state import TrainState
 
@@ -126,8 +127,9 @@ class Method:
     # `(buffers, expected) -> buffers` of a field that renders its expected depth (true) or its
     # median depth (false) as depth; None for fields without a choice.
     with_expected_depth: Callable[[Any, bool], Any] | None = None
-    # `(folder, stage, params, buffers) -> None` writes a stage's state for other programs.
-    export: Callable[[pathlib.Path, str, Any, Any], None] = lambda *state: None
+    # `(folder, stage, params, buffers, placement) -> None` writes a stage's state for other
+    # programs, in the capture's coordinates.
+    export: "Callable[[pathlib.Path, str, Any, Any, Placement], None]" = lambda *state: None
     # `(params, buffers, position) -> Gaussians`, what viewers draw, with the colors that are seen
     # from `position[3]`; None: they draw the scene's points.
     gaussians: "Callable[[Any, Any, Any], Gaussians] | None" = None

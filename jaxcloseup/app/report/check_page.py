@@ -9,7 +9,7 @@ import numpy as np
 from jaxcloseup.app.process.from_above import draw_cameras
 from jaxcloseup.app.report.page import fill_page
 from jaxcloseup.app.report.record_table import Table
-from jaxcloseup.captures.formats import Listed
+from jaxcloseup.captures.contents import Listed
 from jaxcloseup.captures.photo import Reading
 from jaxcloseup.captures.small_photos import read_small
 from jaxcloseup.checks.judge import MISFIT, Checked

@@ -58,6 +58,11 @@ def about_scene(scene: Scene, load_options: Mapping[str, Any]) -> dict[str, Any]
     return {
         "scene": scene.name if path is None else str(pathlib.Path(path).resolve()),
         "load_options": _with_divisor(load_options, scene),
+        "placement": {
+            "center": scene.placement.center.tolist(),
+            "scale": scene.placement.scale,
+            "offset": scene.placement.offset.tolist(),
+        },
         "data_sha256": hash_data(scene),
         "data_sha256_of": _HASHED,
     }
@@ -89,12 +94,13 @@ def identity_of(scene: Scene, preset: Preset, names: Mapping[str, str]) -> dict[
 def write_dataparser_transforms(folder: pathlib.Path, scene: Scene) -> None:
     """Write `dataparser_transforms.json`, nerfstudio's record of a run's change of coordinates.
 
-    Training and exports use the scene's world. `transform` and `scale` lead to it from the
+    Exports use the world of the capture's files. `transform` and `scale` lead to it from the
     capture's original world: they are the `applied_transform` and `applied_scale` of the capture's
-    `transforms.json`.
+    `transforms.json`, less the offset that exports leave out.
     """
     applied = scene.metadata.get("applied_transform")
     transform = np.eye(3, 4) if applied is None else applied
+    transform = transform - np.pad(scene.placement.offset[:, None], ((0, 0), (3, 0)))
     fields = {"transform": transform.tolist(), "scale": scene.metadata.get("applied_scale", 1.0)}
     write_json(folder / "dataparser_transforms.json", fields)
 

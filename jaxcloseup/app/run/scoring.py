@@ -81,7 +81,8 @@ class Scorer:
         programs, log = self._training.programs, self._training.log
         if render is None:
             render = functools.partial(programs.render, state)
-            programs.method.export(self._folder, stage, state.params, state.buffers)
+            placement = programs.scene.placement
+            programs.method.export(self._folder, stage, state.params, state.buffers, placement)
         targets, ladder = self.held_out.targets, self.held_out.ladder
         with timed(self._training.seconds, f"{stage}_evaluation"):
             scores: dict[str, Any] = {}

@@ -1,9 +1,10 @@
-"""Read cameras from files of nerfstudio, and map them to the world of a capture."""
+"""Read cameras from files of nerfstudio, and map them to the world of a scene."""
 
 import math
 import pathlib
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -24,7 +25,7 @@ _LARGEST = 2**31 - 1  # side of an image
 
 
 def read_camera_path(path: pathlib.Path) -> Shots:
-    """Read the cameras of nerfstudio's `camera_path.json`, in the file's own world.
+    """Read the cameras of nerfstudio's `camera_path.json`, in the file's own world, in float64.
 
     The function reads `render_height`, `render_width`, `fps` or `seconds`, and for each entry of
     `camera_path` its `camera_to_world` (16 numbers by rows, OpenGL) and `fov` (vertical, degrees;
@@ -67,7 +68,8 @@ def read_camera_path(path: pathlib.Path) -> Shots:
     if fps is not None and not 0 < fps <= 1000:
         raise CameraError(f"{path}: fps and seconds must be positive and give at most 1000 fps")
     intrinsics = [[f, f, width / 2, height / 2] for f in focals]
-    return numbered_shots(poses, intrinsics, height, width, fps=fps)
+    shots = numbered_shots(poses, intrinsics, height, width, fps=fps)
+    return _with_poses(shots, np.stack(poses))
 
 
 def read_camera_transform(path: pathlib.Path) -> tuple[np.ndarray, float]:
@@ -82,10 +84,10 @@ def read_camera_transform(path: pathlib.Path) -> tuple[np.ndarray, float]:
 
 
 def to_capture(shots: Shots, transform: np.ndarray, scale: float, scene: Scene) -> Shots:
-    """Map cameras from nerfstudio's world to the scene's world.
+    """Map cameras from nerfstudio's world to that of the capture's files, in float64.
 
     nerfstudio maps a point x of the capture's original world to scale * transform (x, 1). The
-    original world is the scene's world before the `applied_transform` of its `transforms.json`.
+    original world is that of the files before the `applied_transform` of its `transforms.json`.
     The recorded scale includes the `applied_scale`, but nerfstudio's cameras do not.
 
     Args:
@@ -104,9 +106,17 @@ def to_capture(shots: Shots, transform: np.ndarray, scale: float, scene: Scene) 
     back = rigid_transform(scene.name, "applied_transform after --camera_transform", back)
     scale /= scene.metadata.get("applied_scale", 1.0)
     poses = np.asarray(shots.cameras.camtoworld, np.float64) / [1, 1, 1, scale]
-    poses = back[:, :3] @ poses + back[:, 3:] * [0, 0, 0, 1]
-    camtoworld = jnp.asarray(poses, jnp.float32)
-    return shots._replace(cameras=shots.cameras.replace(camtoworld=camtoworld))
+    return _with_poses(shots, back[:, :3] @ poses + back[:, 3:] * [0, 0, 0, 1])
+
+
+def to_scene(shots: Shots, scene: Scene) -> Shots:
+    """Map cameras from the world of a capture's files to the scene's, which float32 holds."""
+    poses = scene.placement.poses_to_scene(np.asarray(shots.cameras.camtoworld))
+    return _with_poses(shots, jnp.asarray(poses, jnp.float32))
+
+
+def _with_poses(shots: Shots, poses: np.ndarray | jax.Array) -> Shots:
+    return shots._replace(cameras=shots.cameras.replace(camtoworld=poses))
 
 
 def _pose(label: str, entry: dict[str, Any]) -> np.ndarray:

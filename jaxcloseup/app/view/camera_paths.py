@@ -1,7 +1,6 @@
 """Cameras to render: the views of a split, an orbit, or a dolly towards a surface.
 
-Poses are camera-to-world in the scene's own world; for a capture, that is the world of its
-`transforms*.json`.
+Poses are camera-to-world in the scene's own world.
 """
 
 import pathlib

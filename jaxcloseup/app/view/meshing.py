@@ -3,6 +3,7 @@
 import math
 import pathlib
 import time
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from jaxcloseup.app.view import surface
 from jaxcloseup.artifacts.mesh_files import write_mesh
 from jaxcloseup.io.files import write_json
 from jaxcloseup.io.memory import installed_memory
+from jaxcloseup.io.placement import Placement
 from jaxcloseup.photos.scene import Scene
 
 
@@ -38,8 +40,9 @@ def write_run_mesh(
       record: the run.
       scene: its scene.
       stage: whose depth is fused; None: the exact depth of a built-in scene.
-      region: `[2, 3]` smallest and largest coordinates of the mesh; None: of what the views see.
-      voxel: side of a voxel in world units; None: by `resolution`.
+      region: `[2, 3]` smallest and largest coordinates of the mesh, in the capture's world; None:
+        of what the views see.
+      voxel: side of a voxel in the capture's unit; None: by `resolution`.
       resolution: voxels along the longest side of the region.
       min_views: training views that must see the surface at a pixel.
 
@@ -48,6 +51,8 @@ def write_run_mesh(
     """
     if stage is None and scene.surface is None:
         raise MeshError("--exact needs a built-in scene, whose surface is known: leave it out")
+    placement = scene.placement
+    region = None if region is None else placement.to_scene(region)
     finer = surface.finer_by(scene, renders_pixels=False)
     if stage is None:
         see = surface.exact_view(scene)
@@ -64,13 +69,13 @@ def write_run_mesh(
                 "--min_views"
             )
         region = surface.box_around(points)
-    grid = surface.make_grid(region, voxel or np.ptp(region, axis=0).max() / resolution)
-    mesh = _fuse(maps, grid)
-    write_mesh(output_dir / "mesh.ply", mesh)
+    longest = np.ptp(region, axis=0).max()
+    grid = surface.make_grid(region, voxel * placement.scale if voxel else longest / resolution)
+    mesh = _fuse(maps, grid, placement.scale)
+    write_mesh(output_dir / "mesh.ply", mesh, placement)
     about = {
         "stage": stage,
-        "voxel": grid.voxel,
-        "region": np.asarray(region).tolist(),
+        **_in_capture(grid.voxel, region, placement),
         "min_views": min_views,
         "vertices": len(mesh.vertices),
         "triangles": len(mesh.faces),
@@ -80,10 +85,18 @@ def write_run_mesh(
     print(f"mesh: {output_dir / 'mesh.ply'}, {len(mesh.faces)} triangles")
 
 
-def _fuse(maps: surface.Maps, grid: surface.Grid) -> surface.Mesh:
+def _in_capture(voxel: float, region: np.ndarray, placement: Placement) -> dict[str, Any]:
+    """Return a voxel's side, a region and what `mesh.ply` leaves out, as the capture has them."""
+    box = placement.to_capture(region)
+    offset = placement.offset
+    return {"voxel": voxel / placement.scale, "region": box.tolist(), "offset": offset.tolist()}
+
+
+def _fuse(maps: surface.Maps, grid: surface.Grid, unit: float) -> surface.Mesh:
+    """Return the mesh of a grid; `unit` is the capture's."""
     _check_memory(grid)
     counts = " x ".join(map(str, grid.shape))
-    what = f"{len(maps.depths)} depth maps into {counts} voxels of {grid.voxel:.3g}"
+    what = f"{len(maps.depths)} depth maps into {counts} voxels of {grid.voxel / unit:.3g}"
     began = time.perf_counter()
     with progress.saying(f"fusing {what}"):
         mesh = surface.fuse_mesh(maps, grid)

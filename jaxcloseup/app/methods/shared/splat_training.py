@@ -27,6 +27,7 @@ from jaxcloseup.fields.splats.splat_field import SurfelBuffers, camera_extent, s
 from jaxcloseup.fields.splats.splat_optimizer import surfel_optimizer
 from jaxcloseup.fields.splats.surfels import Surfels, pad_rows
 from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.io.placement import Placement
 from jaxcloseup.labels.rules import label_depth
 from jaxcloseup.native import library
 from jaxcloseup.photos.pyramids import Pyramid
@@ -104,10 +105,13 @@ def extent(scene: Scene) -> float:
     return reach if reach > 1e-4 * scene.far else 0.5 * scene.far
 
 
-def export(folder: pathlib.Path, stage: str, surfels: Surfels, buffers: SurfelBuffers) -> None:
-    """Write `splats/<stage>.ply`, for viewers of Gaussian splats."""
+def export(
+    folder: pathlib.Path, stage: str, surfels: Surfels, buffers: SurfelBuffers, placement: Placement
+) -> None:
+    """Write `splats/<stage>.ply`, for viewers of Gaussian splats, in the capture's coordinates."""
     surfels = smoothed(surfels, buffers.interval)
-    write_surfels(folder / "splats" / f"{stage}.ply", surfels, buffers.alive)
+    file = folder / "splats" / f"{stage}.ply"
+    write_surfels(file, surfels, buffers.alive, placement=placement)
 
 
 def viewer_gaussians(surfels: Surfels, buffers: SurfelBuffers, position: np.ndarray) -> Gaussians:
