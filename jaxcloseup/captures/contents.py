@@ -32,12 +32,12 @@ _FILES = {
 
 
 class Listed(NamedTuple):
-    """All photographs of a capture, and its points."""
+    """All photographs of a capture, and its points, in the coordinates of its files."""
 
     format: str  # one of `FORMATS`
     folder: pathlib.Path  # folder of the capture
     frames: list[Frame]  # photographs of all splits, in the order of their files
-    points: np.ndarray  # `[P, 3]` float32 world points; P may be 0
+    points: np.ndarray  # `[P, 3]` float64 world points; P may be 0
     rgb: np.ndarray  # `[P, 3]` float32 colors of the points in [0, 1]
 
 
@@ -61,14 +61,14 @@ def list_photographs(
     Raises:
       SceneError: the folder holds no known format, or one of its files is wrong.
     """
-    detected, content, _ = read_content(path, format, corrections)
+    detected, content = read_content(path, format, corrections)
     frames = attach_masks(detected.folder, {"all": content.frames})["all"]
     return Listed(detected.format, detected.folder, frames, *content.points)
 
 
 def read_content(
     path: pathlib.Path, format: str | None, corrections: Sequence[str] = ()
-) -> tuple[Detected, Content, Placement]:
+) -> tuple[Detected, Content]:
     """Read what a folder holds of a format, and find the photographs that its files list.
 
     Args:
@@ -77,7 +77,7 @@ def read_content(
       corrections: corrections of known mistakes.
 
     Returns:
-      What is read, its content in the coordinates of the scene, and where these lie.
+      What is read, and its content in the coordinates of its files.
 
     Raises:
       SceneError: the folder holds no known format, or one of its files is wrong.
@@ -88,7 +88,7 @@ def read_content(
     content = _corrected(content, corrections, opengl=detected.format == "transforms")
     scene = detected.folder.resolve().name
     notes = tuple(f"{scene}: {note}" for note in (detected.note, *content.notes))
-    return detected, *_placed(content._replace(notes=notes))
+    return detected, content._replace(notes=notes)
 
 
 def _corrected(content: Content, corrections: Sequence[str], *, opengl: bool) -> Content:
@@ -182,8 +182,12 @@ def _read_ply(
     return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), ()
 
 
-def _placed(content: Content) -> tuple[Content, Placement]:
-    """Return what was read, in the coordinates of the scene, and where this lies."""
+def placed(content: Content) -> tuple[Content, Placement]:
+    """Return what was read, in the coordinates of the scene, and where this lies.
+
+    Raises:
+      SceneError: a camera lies too far away.
+    """
     frames, (points, rgb) = content.frames, content.points
     check_positions(frames, UNMOVED)
     placement = find_placement(np.stack([frame.camtoworld[:, 3] for frame in frames]), points)
@@ -192,5 +196,3 @@ def _placed(content: Content) -> tuple[Content, Placement]:
     points = placement.to_scene(points).astype(np.float32)
     frames = place(frames, placement)
     return content._replace(frames=frames, given=given, points=(points, rgb)), placement
-
-

@@ -86,7 +86,7 @@ def load_capture(
     for note in listing.notes:
         _log.info(note)
     scene = _load(listing, reading._replace(downscale=listing.downscale, masks=masks))
-    scene.metadata.update(path=path, split=split)
+    scene.metadata.update(path=path, split=split, corrections=tuple(corrections))
     return scene
 
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxcloseup.captures.contents import read_content
+from jaxcloseup.captures.contents import placed, read_content
 from jaxcloseup.captures.leftovers import unused_note
 from jaxcloseup.captures.photo_files import size_of_image
 from jaxcloseup.captures.photo_masks import attach_masks
@@ -55,7 +55,8 @@ def read_listing(
     Raises:
       SceneError: the folder holds no known format, or one of its files is wrong.
     """
-    detected, content, placement = read_content(path, format, corrections)
+    detected, content = read_content(path, format, corrections)
+    content, placement = placed(content)
     folder, scene = detected.folder, detected.folder.resolve().name
     given = content.given
     if split == "given" and not given:

@@ -139,9 +139,7 @@ def _judge_points(
         return "", ()
     found = fit_points(points, evidence.gray, evidence.cameras)
     figures |= {"points_share": found.share, "points_moved": found.moved}
-    if not found.known:
-        return f"; {len(points):,} points are not checked", ()
-    if found.fits and found.textured >= _SHOWN * found.tried:
+    if found.known and found.fits and found.textured >= _SHOWN * found.tried:
         return f"; {len(points):,} points fit", ()
     axes = find_points_mistake(points, evidence.gray, evidence.cameras)
     if axes:
@@ -149,6 +147,8 @@ def _judge_points(
             f"; {len(points):,} points lie in another world than the cameras, turned to ({axes})",
             (f"points={axes}",),
         )
+    if not found.known:
+        return f"; {len(points):,} points are not checked: photographs show too few of them", ()
     if found.fits:
         return f"; {len(points):,} points fit", ()
     return (

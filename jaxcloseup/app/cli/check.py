@@ -21,6 +21,7 @@ from jaxcloseup.app.cli.topics import share
 
 
 FLAGS = flags.FLAGS
+OPERANDS = 1  # the capture's folder
 share(CAPTURE, OUTPUT)
 
 
@@ -29,25 +30,23 @@ def main(arguments: list[str]) -> None:
     with loading():
         from jaxcloseup.app import progress
         from jaxcloseup.app.report.check_page import write_check
-        from jaxcloseup.app.run.capture_check import check_scene, said_of
+        from jaxcloseup.app.run.capture_check import check_scene, reading_of, said_of
         from jaxcloseup.captures.contents import list_photographs
-        from jaxcloseup.captures.photo import Reading
         from jaxcloseup.checks.judge import MISFIT
         from jaxcloseup.photos.scene import SceneError
     set_up()
     if len(arguments) != 2:
         sys.exit(f"{program_name('check')}: name one folder, as in {program_name('check')} capture")
     path = pathlib.Path(arguments[1])
-    options = {name: FLAGS[name].value for name in ("format", "invert_masks", "alpha_mode")}
-    options["half_pixel"] = FLAGS.half_pixel
+    options = {name: FLAGS[name].value for name in CAPTURE}
     with in_one_sentence("check", SceneError, OSError):
         folder = check_unused(
             FLAGS.output_dir or dated(pathlib.Path("outputs", path.resolve().name, "check"))
         )
         with progress.showing():
-            found = check_scene(path, options)
+            found = check_scene(str(path), options)
         listed = list_photographs(path, format=FLAGS.format)
-        page = write_check(folder, path.resolve().name, found, listed, Reading())
+        page = write_check(folder, path.resolve().name, found, listed, reading_of(options))
     print("\n".join(said_of(found)))
     print(f"page: {page}")
     if found.verdict == MISFIT:

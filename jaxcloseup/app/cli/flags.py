@@ -101,6 +101,14 @@ with topic("The capture") as _PIXELS:
     flags.DEFINE_bool(
         "half_pixel", False, "the capture has pixel centers at integers: add 0.5 to cx, cy"
     )
+with topic("The capture") as CHECK:
+    flags.DEFINE_bool(
+        "check", True, "check first whether poses, lenses and points fit the photographs"
+    )
+    flags.DEFINE_bool(
+        "fix", False, "correct a known mistake that the check finds, such as inverse matrices"
+    )
+    flags.DEFINE_bool("allow_misfit", False, "train although poses do not fit the photographs")
 with topic("The run") as _RUN:
     flags.DEFINE_string("run", None, "folder of a run")
     flags.DEFINE_string(
@@ -136,7 +144,8 @@ with topic("Computers") as COMPUTERS:
         "default: $JAXCLOSEUP_LPIPS, or PyTorch's cache",
     )
 # Groups for `share`: of programs that train, and of those that load a stored run.
-TRAINING = [*_TRAINED, *_SET, *_CAPTURE, *_PIXELS, *OUTPUT, *_RESULTS, *COMPUTERS]
+TRAINING = [*_TRAINED, *_SET, *_CAPTURE, *_PIXELS, *CHECK, *OUTPUT, *_RESULTS, *COMPUTERS]
+CAPTURE = ["format", "half_pixel", "invert_masks", "alpha_mode"]  # how photographs are read
 STORED_RUN = [*_RUN, *_SET]
 
 
@@ -181,6 +190,21 @@ def load_options_from_flags(preset: Preset) -> dict[str, Any]:
     if preset.downscale is None:
         sized["pixels"] = preset.step_pixels
     return {**sized, **options, **_changed_capture_flags()}
+
+
+def checked_from_flags(
+    scene: str, options: dict[str, Any]
+) -> "tuple[dict[str, Any], dict[str, Any] | None]":
+    """Check a capture as the flags say; return its options with corrections, and what was found.
+
+    Raises:
+      SceneError: the capture cannot be read, or its poses do not fit.
+    """
+    from jaxcloseup.app.run.capture_check import fitting_options
+
+    if not FLAGS.check:
+        return options, None
+    return fitting_options(scene, options, fix=FLAGS.fix, allow_misfit=FLAGS.allow_misfit)
 
 
 def _changed_capture_flags() -> dict[str, Any]:

@@ -21,6 +21,7 @@ PROGRAMS = {
     "view": "look at a run in a browser, and choose close-ups there",
     "compare": "compare several finished runs on one scene",
     "evaluate": "score a folder of images against another",
+    "check": "check whether a capture's poses, lenses and points fit its photographs",
     "process": "make a capture with poses from photographs or a video",
 }
 

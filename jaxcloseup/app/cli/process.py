@@ -61,6 +61,7 @@ def main(_: list[str]) -> None:
         from jaxcloseup.app.process.capture_summary import summary_lines
         from jaxcloseup.app.process.pipeline import PICTURE, make_capture
         from jaxcloseup.app.process.solver_process import ProcessingError
+        from jaxcloseup.app.run.capture_check import check_scene, said_of
         from jaxcloseup.photos.scene import SceneError
     set_up()
     with in_one_sentence("process", ProcessingError, SceneError, OSError):
@@ -72,7 +73,8 @@ def main(_: list[str]) -> None:
         _prepare_to_stop(folder)
         with lock_output_dir(folder), progress.showing():
             summary = make_capture(request, folder, stages)
-    print("\n".join(summary_lines(summary)))
+            found = check_scene(str(folder), {})
+    print("\n".join([*summary_lines(summary), *said_of(found)]))
     print(f"cameras and points from above: {folder / PICTURE}")
     run = " ".join(program_command("run"))
     print(f"to train on it: {run} --scene={shlex.quote(str(folder))}")

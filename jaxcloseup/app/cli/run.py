@@ -14,6 +14,7 @@ from absl import flags
 
 from jaxcloseup.app.cli.flags import (
     TRAINING,
+    checked_from_flags,
     load_options_from_flags,
     names_from_flags,
     preset_from_flags,
@@ -75,8 +76,11 @@ def main(_: list[str]) -> None:
         )
         prepare_to_stop(output_dir, "run")
         load_options = load_options_from_flags(preset)
-        with progress.showing(), progress.saying(f"loading {FLAGS.scene}"):
-            scene = load(FLAGS.scene, load_options)
+        with progress.showing():
+            load_options, found = checked_from_flags(FLAGS.scene, load_options)
+            with progress.saying(f"loading {FLAGS.scene}"):
+                scene = load(FLAGS.scene, load_options)
+        scene.metadata["check"] = found
         if FLAGS.minutes is not None:
             preset = _fitted(preset, scene)
         perceptual = find_perceptual(FLAGS.lpips_weights)

@@ -28,7 +28,10 @@ _COMPILED_FOR_SPEED = (
 
 
 def start(program: types.ModuleType) -> None:
-    """Run a program's module; `--help` prints its flags, and a wrong flag is one sentence."""
+    """Run a program's module; `--help` prints its flags, and a wrong flag is one sentence.
+
+    A module with `OPERANDS`, the number of words that are no flags, gets these words in `main`.
+    """
     if {"-h", "--help"} & set(sys.argv[1:]):
         with contextlib.suppress(BrokenPipeError):  # `--help | head`
             print(_describe_program(program), flush=True)
@@ -42,9 +45,9 @@ def start(program: types.ModuleType) -> None:
         except flags.Error as error:
             reason = _explain(error)
         else:
-            if len(rest) == 1:
+            if len(rest) <= 1 + getattr(program, "OPERANDS", 0):
                 return rest
-            reason = f"{rest[1]} is not a flag: flags begin with --"
+            reason = f"{rest[-1]} is not a flag: flags begin with --"
         sys.exit(f"{program_name(pathlib.Path(program.__file__ or '').stem)}: {reason}")
 
     app.run(program.main, flags_parser=parse)

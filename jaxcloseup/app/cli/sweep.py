@@ -19,6 +19,7 @@ from absl import flags
 
 from jaxcloseup.app.cli.flags import (
     TRAINING,
+    checked_from_flags,
     load_options_from_flags,
     names_from_flags,
     preset_from_flags,
@@ -106,7 +107,10 @@ def _sweep() -> None:
         prepare_to_stop(output_dir, "sweep")
         perceptual = find_perceptual(FLAGS.lpips_weights)
         load_options = load_options_from_flags(preset)
-        scenes = [load(name, load_options) for name in FLAGS.scenes]
+        checked = [checked_from_flags(name, load_options) for name in FLAGS.scenes]
+        scenes = [
+            load(name, options) for name, (options, _) in zip(FLAGS.scenes, checked, strict=True)
+        ]
         _check_scenes(scenes, output_dir)
         lock = lock_output_dir(output_dir) if first else contextlib.nullcontext()
     if hosts is not None:

@@ -8,14 +8,19 @@ import shutil
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from jaxcloseup.app.process.capture_stages import Stages
-from jaxcloseup.app.process.capture_summary import draw_from_above, other_models, why_left_out
+from jaxcloseup.app.process.capture_summary import other_models, why_left_out
+from jaxcloseup.app.process.from_above import draw_cameras
 from jaxcloseup.app.process.options import LENSES
 from jaxcloseup.app.process.pairs import choose_pairing
 from jaxcloseup.app.process.photo_folder import Copied, copy_photographs, list_files
 from jaxcloseup.app.process.solver_process import ProcessingError, run_job
 from jaxcloseup.app.process.video_frames import extract_frames
 from jaxcloseup.app.progress import saying
+from jaxcloseup.captures.contents import list_photographs
+from jaxcloseup.io.files import write_file
 from jaxcloseup.version import __version__
 
 
@@ -119,7 +124,9 @@ def make_capture(request: Request, folder: pathlib.Path, stages: Stages) -> dict
     }
     stages.keep("summary", summary)
     with saying("drawing cameras and points from above"):
-        draw_from_above(folder / MODEL, folder / PICTURE)
+        listed = list_photographs(folder)
+        poses = np.stack([frame.camtoworld for frame in listed.frames])
+        write_file(folder / PICTURE, draw_cameras(poses, listed.points, listed.rgb))
     return summary
 
 

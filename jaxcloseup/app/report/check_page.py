@@ -4,6 +4,7 @@ import pathlib
 from collections.abc import Sequence
 
 import cv2
+import imageio.v3 as imageio
 import numpy as np
 
 from jaxcloseup.app.process.from_above import draw_cameras
@@ -53,7 +54,7 @@ def write_check(
         corrections=[*found.corrections, *found.points],
         notes=found.notes,
         figures=Table("What was measured", ["", ""], figures),
-        above=cv2.cvtColor(cv2.imdecode(np.frombuffer(above, np.uint8), cv2.IMREAD_COLOR), 4),
+        above=imageio.imread(above)[..., :3],
         sheet=_contact_sheet(pictures) if pictures else None,
         worst=[f"{photo}: {100 * share:.0f} %" for photo, share in worst],
     )

@@ -79,6 +79,7 @@ def report_run(
         **about,
         "resolution": [size.width, size.height],
         "scored_at": _size(targets),
+        "check": scene.metadata.get("check"),
         "stages": outcome.scores,
         **outcome.evidence,
         "seconds": training.seconds,

@@ -1,7 +1,6 @@
-"""Check captures before they are trained on: print what was found, and refuse those that misfit."""
+"""Check captures before they are trained on: say what was found, and refuse those that misfit."""
 
 import dataclasses
-import shlex
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,38 +14,41 @@ from jaxcloseup.photos.scene import SceneError
 
 # Options of `load_scene` that photographs are checked with.
 _READING = ("half_pixel", "invert_masks", "alpha_mode")
+_SHOWN = 60  # characters of corrections in a sentence
 
 
-def check_scene(name: str, options: Mapping[str, Any]) -> Checked | None:
-    """Check a capture, and show progress; return None for a built-in scene.
+def check_scene(name: str, options: Mapping[str, Any]) -> Checked:
+    """Check a capture, and show progress.
 
     Args:
-      name: scene or folder, as of `load_scene`.
+      name: folder of the capture.
       options: options of `load_scene`.
 
     Raises:
       SceneError: the capture cannot be read.
     """
-    if is_drawn(name):
-        return None
-    reading = Reading(**{key: options[key] for key in _READING if key in options})
     with progress.saying("checking photographs") as say:
         return check_capture(
             name,
             format=options.get("format"),
-            reading=reading,
+            reading=reading_of(options),
             corrections=options.get("corrections", ()),
             report=lambda done, total: say(f"checking photographs: {done} of {total}"),
         )
 
 
+def reading_of(options: Mapping[str, Any]) -> Reading:
+    """Return how photographs are read, from options of `load_scene`."""
+    return Reading(**{key: options[key] for key in _READING if key in options})
+
+
 def fitting_options(
     name: str, options: Mapping[str, Any], *, fix: bool, allow_misfit: bool
 ) -> tuple[dict[str, Any], dict[str, Any] | None]:
-    """Check a capture before training; print what was found.
+    """Check a capture before training, and print what was found.
 
-    Points that do not lie on surfaces are replaced by triangulated ones. Poses and lenses change
-    only with `fix`.
+    Points that do not lie on surfaces are left out, so that triangulated ones are used. Poses,
+    lenses and the world of points change only with `fix`.
 
     Args:
       name: scene or folder, as of `load_scene`.
@@ -60,36 +62,34 @@ def fitting_options(
     Raises:
       SceneError: the capture cannot be read, or its poses do not fit.
     """
-    found = check_scene(name, options)
-    if found is None:
+    if is_drawn(name):
         return dict(options), None
-    applied = list(options.get("corrections", ()))
-    if found.verdict == MISFIT and found.corrections and fix:
-        applied += found.corrections
-        print(f"{name}: {found.sentence}; corrected by {', '.join(found.corrections)}")
-    elif found.verdict == MISFIT and not allow_misfit:
-        raise SceneError(f"{name}: {found.sentence}: {advice(found)}.")
-    else:
-        print(f"{name}: {found.sentence}")
-    turned = found.points and found.points != ("points=none",)
+    found = check_scene(name, options)
+    first, *others = said_of(found)
+    if found.verdict == MISFIT and not allow_misfit and not (fix and found.corrections):
+        raise SceneError(f"{name}: {first}, or give --allow_misfit to train all the same.")
+    for line in (first, *others):
+        print(f"{name}: {line}")
+    applied = [*options.get("corrections", ()), *(found.corrections if fix else ())]
     if found.points:
-        # Without the user's word a turn is not applied, but wrong points are not used either.
-        applied += found.points if fix else ("points=none",)
-        instead = f"turned by {found.points[0]}" if fix and turned else "not used"
-        print(
-            f"{name}: points are {instead}" + ("; --fix turns them" if turned and not fix else "")
-        )
-    for note in found.notes:
-        print(f"{name}: {note}")
+        applied += found.points if fix else ["points=none"]
     changed = {**options, "corrections": applied} if applied else dict(options)
     return changed, dataclasses.asdict(found)
 
 
-def advice(found: Checked) -> str:
-    """Return what to do about poses that do not fit."""
-    if not found.corrections:
-        return "correct the poses, or give --allow_misfit to train all the same"
-    return (
-        "correct the file, or give --fix, which applies "
-        f"{shlex.quote(' '.join(found.corrections)):.60} to what is read"
-    )
+def said_of(found: Checked) -> list[str]:
+    """Return the sentences of a check: the result with what to do about it, then notes."""
+    lines = [found.sentence]
+    if found.verdict == MISFIT:
+        text = " ".join(found.corrections)
+        short = text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
+        lines[0] += f": correct the file, or give --fix to read it with {short}" * bool(text)
+        lines[0] += ": correct the poses or lenses" * (not text)
+    if found.points == ("points=none",):
+        lines.append("its points are not used, but points that are triangulated from photographs")
+    elif found.points:
+        lines.append(
+            f"give --fix to read points with {found.points[0]}; without it, points are "
+            "triangulated from photographs"
+        )
+    return [*lines, *found.notes]

@@ -58,6 +58,7 @@ def about_scene(scene: Scene, load_options: Mapping[str, Any]) -> dict[str, Any]
     return {
         "scene": scene.name if path is None else str(pathlib.Path(path).resolve()),
         "load_options": _with_divisor(load_options, scene),
+        "check": scene.metadata.get("check"),
         "placement": {
             "center": scene.placement.center.tolist(),
             "scale": scene.placement.scale,
@@ -69,8 +70,10 @@ def about_scene(scene: Scene, load_options: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _with_divisor(load_options: Mapping[str, Any], scene: Scene) -> dict[str, Any]:
-    """Return options that load the scene again, with the divisor that was chosen, if it was."""
+    """Return options that load the scene again: with the chosen divisor, and corrections."""
     options = {name: value for name, value in load_options.items() if name != "pixels"}
+    if corrections := scene.metadata.get("corrections"):
+        options["corrections"] = list(corrections)
     return options | {"downscale": scene.metadata.get("downscale", 1)}
 
 
