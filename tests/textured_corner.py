@@ -3,6 +3,7 @@
 Ray casting in NumPy, so nothing of the package draws what the package checks.
 """
 
+import functools
 import json
 
 import cv2
@@ -18,6 +19,7 @@ OFFSETS = np.array([0.0, -0.3, -0.1])
 LENS = np.array([FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2])
 
 
+@functools.cache
 def texture(seed, size=1024):
     """Gray and colored blobs of several sizes, `[S, S, 3]` uint8."""
     rng = np.random.default_rng(seed)

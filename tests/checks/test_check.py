@@ -13,6 +13,7 @@ from jaxcloseup.captures.contents import list_photographs
 from jaxcloseup.captures.corrections import correct_frames
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.captures.photo import Reading
+from jaxcloseup.captures.world_frames import frame_intrinsics
 from jaxcloseup.checks.check import check_capture
 from jaxcloseup.checks.epipolar import Cameras, epipolar_errors, fit
 from jaxcloseup.checks.evidence import gather
@@ -35,6 +36,23 @@ def corner(tmp_path_factory):
 @pytest.fixture(scope="session")
 def evidence(corner):
     return gather(list_photographs(corner).frames, Reading())
+
+
+@pytest.fixture(scope="session")
+def judged(evidence):
+    """A function that judges a folder with the same photographs, which are not matched anew."""
+
+    def check(folder, corrections=()):
+        listed = list_photographs(folder, corrections=corrections)
+        lenses = [frame_intrinsics(frame, WIDTH, HEIGHT) for frame in listed.frames]
+        scales = [WIDTH / (frame.size or (WIDTH,))[0] for frame in listed.frames]
+        cameras = evidence.cameras._replace(
+            camtoworld=np.stack([frame.camtoworld for frame in listed.frames]),
+            intrinsics=np.stack(lenses) * np.array(scales)[:, None],
+        )
+        return judge(evidence._replace(cameras=cameras), listed.points, opengl=True)
+
+    return check
 
 
 @pytest.fixture
@@ -80,7 +98,7 @@ def project(points, cameras, view):
 
 
 def test_epipolar_errors_are_distances_from_what_any_depth_shows():
-    """The witness projects every depth of the first camera's ray into the second, and conversely."""
+    """The witness projects all depths of one camera's ray into the other, and conversely."""
     matches, cameras = seen_together()
     assert epipolar_errors(matches, cameras).max() < 1e-6
     rng = np.random.default_rng(2)
@@ -122,12 +140,15 @@ def test_a_right_capture_fits(evidence, corner):
     assert check_capture(corner) == check_capture(corner) == dataclasses.replace(found)
 
 
+KEYS = ("fl_x", "fl_y", "cx", "cy")
 MISTAKES = {
     "axes": (each_matrix(lambda matrix: matrix @ FLIP), ("axes",)),
     "inverse": (each_matrix(np.linalg.inv), ("inverse",)),
     "opencv w2c": (each_matrix(lambda matrix: np.linalg.inv(matrix @ FLIP)), ("inverse", "axes")),
     "size": (
-        lambda fields: fields.update({key: 2 * fields[key] for key in ("fl_x", "fl_y", "cx", "cy")}),
+        lambda fields: fields.update(
+            {key: 2 * fields[key] for key in ("fl_x", "fl_y", "cx", "cy")}
+        ),
         ("size=2",),
     ),
     "reverse": (
@@ -146,9 +167,9 @@ MISTAKES = {
 
 @pytest.mark.filterwarnings("ignore::jaxcloseup.photos.scene.ImageSizeWarning")
 @pytest.mark.parametrize(("edit", "corrections"), MISTAKES.values(), ids=MISTAKES)
-def test_known_mistakes_are_named_and_corrected(copy, corner, edit, corrections):
+def test_known_mistakes_are_named_and_corrected(copy, corner, judged, edit, corrections):
     folder = copy(edit)
-    found = check_capture(folder)
+    found = judged(folder)
     assert (found.verdict, found.corrections) == ("misfit", corrections)
     mended, right = (
         list_photographs(path, corrections=fixes).frames
@@ -156,7 +177,7 @@ def test_known_mistakes_are_named_and_corrected(copy, corner, edit, corrections)
     )
     for a, b in zip(mended, right, strict=True):
         np.testing.assert_allclose(a.camtoworld, b.camtoworld, atol=1e-9)
-    assert check_capture(folder, corrections=corrections).verdict == "fits"
+    assert judged(folder, corrections).verdict == "fits"
     scene = load_scene(folder, corrections=corrections)
     expected = load_scene(corner).train.cameras
     np.testing.assert_allclose(scene.train.cameras.intrinsics, expected.intrinsics, rtol=1e-5)
@@ -215,11 +236,11 @@ def test_exchanged_photographs_are_named(evidence):
         (lambda points: np.random.default_rng(0).uniform(0, 3, points.shape), ("points=none",)),
     ],
 )
-def test_points_in_another_world_are_found(copy, corner, change, instead):
+def test_points_in_another_world_are_found(copy, corner, judged, change, instead):
     folder = copy(lambda fields: None)
     points = list_photographs(corner).points
     write_points(folder, change(points))
-    found = check_capture(folder)
+    found = judged(folder)
     assert found.verdict == "fits"
     if instead is None:
         mended = list_photographs(folder, corrections=found.points).points
