@@ -1,6 +1,6 @@
 """Write the tables of flags, methods and settings into docs/programs.md.
 
-python -m experiments.studies.program_tables [--check]
+python -m experiments.studies.program_tables [--compare]
 """
 
 import importlib
@@ -21,7 +21,9 @@ from jaxcloseup.app.report.record_table import Table, markdown
 
 DOCUMENT = pathlib.Path(__file__).parents[2] / "docs" / "programs.md"
 _TOLD_BELOW = ("method", "preset")
-_CHECK = flags.DEFINE_bool("check", False, "fail if the document's tables are not those of today")
+_COMPARE = flags.DEFINE_bool(
+    "compare", False, "fail if the document's tables are not those of today"
+)
 
 
 def tables() -> dict[str, str]:
@@ -74,8 +76,8 @@ def main(_: list[str]) -> None:
     for name, table in tables().items():
         pattern = re.compile(rf"(<!-- {name} -->\n).*?(<!-- end -->)", re.DOTALL)
         text = pattern.sub(lambda match, table=table: match[1] + table + match[2], text)
-    if _CHECK.value:
-        sys.exit(0 if text == before else f"{DOCUMENT} is not of today: run this without --check")
+    if _COMPARE.value:
+        sys.exit(0 if text == before else f"{DOCUMENT} is not of today: run this without --compare")
     DOCUMENT.write_text(text, encoding="utf-8")
 
 

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from jaxcloseup.captures.depth_range import SMALLEST
-from jaxcloseup.captures.features import find_features, match_features
+from jaxcloseup.captures.sift import find_features, match_features
 
 
 _NEIGHBORS = 4

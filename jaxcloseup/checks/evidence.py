@@ -8,8 +8,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from jaxcloseup.captures.features import Features, find_features
 from jaxcloseup.captures.photo import Photo, Reading
+from jaxcloseup.captures.sift import Features, find_features
 from jaxcloseup.captures.small_photos import read_small
 from jaxcloseup.captures.world_frames import Frame
 from jaxcloseup.checks.epipolar import Cameras

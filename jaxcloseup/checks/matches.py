@@ -6,7 +6,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from jaxcloseup.captures.features import Features, match_features, unit_descriptors
+from jaxcloseup.captures.sift import Features, match_features, unit_descriptors
 
 
 _STRONGEST = 160  # features of a photograph that look for similar photographs

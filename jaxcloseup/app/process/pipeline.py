@@ -123,11 +123,15 @@ def make_capture(request: Request, folder: pathlib.Path, stages: Stages) -> dict
         "left_out": {source[name]: why for name, why in reasons.items()} | gathered["left_out"],
     }
     stages.keep("summary", summary)
+    _draw_from_above(folder)
+    return summary
+
+
+def _draw_from_above(folder: pathlib.Path) -> None:
     with saying("drawing cameras and points from above"):
         listed = list_photographs(folder)
         poses = np.stack([frame.camtoworld for frame in listed.frames])
         write_file(folder / PICTURE, draw_cameras(poses, listed.points, listed.rgb))
-    return summary
 
 
 def _gather(request: Request, folder: pathlib.Path) -> dict[str, Any]:
