@@ -11,7 +11,7 @@ from jaxcloseup.checks.evidence import SIDE, Evidence
 from jaxcloseup.checks.looks import describe_looks, exposures
 from jaxcloseup.checks.mistakes import find_mistake
 from jaxcloseup.checks.order import find_order
-from jaxcloseup.checks.points import find_points_mistake, fit_points
+from jaxcloseup.checks.point_patches import find_points_mistake, fit_points
 
 
 FITS, LOOSE, MISFIT, UNKNOWN = "fits", "loose", "misfit", "unknown"
