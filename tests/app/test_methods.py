@@ -60,7 +60,8 @@ def test_cameras_in_one_place_have_the_size_of_what_they_see(scene):
     for place in np.random.default_rng(0).uniform(-3, 3, (8, 3)):
         here = moved(scene, lambda old, place=place: jnp.broadcast_to(place, old.shape))
         assert extent(here) == pytest.approx(0.5 * scene.far)
-    assert extent(scene) == pytest.approx(1.1 * np.hypot(1, 0.1), rel=1e-3)
+    own = 1.1 * np.hypot(1, 0.1)
+    assert extent(scene) == pytest.approx(own * scene.placement.scale, rel=1e-3)
 
 
 def test_the_near_plane_is_small_in_a_small_scene(scene, monkeypatch):
