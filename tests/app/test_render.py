@@ -20,9 +20,7 @@ from jaxcloseup.app.run.labels import LabelStart
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.store.stored_config import preset_from_config
 from jaxcloseup.app.store.stored_run import RunError, change_settings, load_run_scene, read_run
-from jaxcloseup.app.view.meshing import write_run_mesh
 from jaxcloseup.captures.load import load_scene
-from jaxcloseup.io.ply import read_vertices
 
 
 @pytest.fixture
@@ -239,23 +237,3 @@ def test_settings_change_what_is_fine_tuned(kept):
     assert changed.trained == KEPT
     with pytest.raises(RunError, match=r"--set=sharpness=3: .* no setting sharpness"):
         change_settings(read_run(kept), ["sharpness=3"])
-
-
-def test_a_mesh_is_in_the_coordinates_of_the_capture(kept, tmp_path):
-    """So are the region and the voxels that are asked for: the plane lies at z = 0."""
-    pytest.importorskip("skimage")
-    record, region = read_run(kept), np.array([[-1, -0.8, -0.3], [0.9, 1, 0.3]])
-    scene = load_run_scene(record)
-    assert scene.placement.scale != 1
-    size = {"region": region, "voxel": 0.1, "resolution": 8}
-    with jax.numpy_dtype_promotion("standard"):
-        write_run_mesh(tmp_path, record, scene, "closeup", **size, min_views=2)
-    about = json.loads((tmp_path / "mesh.json").read_text())
-    np.testing.assert_allclose(about["voxel"], 0.1)
-    np.testing.assert_allclose(about["region"], region)
-    rows = read_vertices(tmp_path / "mesh.ply")
-    assert len(rows) > 200 and np.abs(rows["z"]).max() < 0.03
-    for axis, low, high in zip("xy", *region[:, :2], strict=True):
-        # The grid has a margin of four voxels, and the surfels end.
-        first, last = rows[axis].min(), rows[axis].max()
-        assert low - 0.51 < first < low + 0.2 and high - 0.2 < last < high + 0.51
