@@ -204,7 +204,7 @@ def run(kept, tmp_path):
 def plane_surface(placement, camera):
     """The exact plane, as a built-in scene would give it; the camera is in the scene's world."""
     origins, directions = pixels_to_rays(camera, pixel_grid(camera.height, camera.width))
-    origins = origins / placement.scale + placement.center.astype("f")
+    origins = origins / placement.scale + placement.center.astype("f")[None, None]
     depth = -placement.scale * origins[..., 2] / directions[..., 2]
     points = origins + depth[..., None] / placement.scale * directions
     on_it = (jnp.abs(points[..., :2]) < HALF).all(-1)
