@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 
-_ROUNDING = 1e-5  # of a scene's unit, up to which float32 may round the coordinates in a file
+_ROUNDING = 3e-5  # in a scene, up to which float32 may round the coordinates in a file
 
 
 class Placement(NamedTuple):

@@ -34,6 +34,7 @@ from jaxcloseup.fields.splats.adaptive import with_image_offset
 from jaxcloseup.fields.splats.filters import SMOOTHING_VARIANCE, sampling_intervals, smoothed
 from jaxcloseup.fields.splats.spherical_harmonics import sh_to_rgb
 from jaxcloseup.geometry.cameras import points_to_pixels
+from jaxcloseup.io.placement import UNMOVED
 from jaxcloseup.photos.pyramids import scene_pyramid
 from jaxcloseup.photos.views import camera_at
 from jaxcloseup.training.state import TrainState
@@ -60,7 +61,8 @@ def test_cameras_in_one_place_have_the_size_of_what_they_see(scene):
     for place in np.random.default_rng(0).uniform(-3, 3, (8, 3)):
         here = moved(scene, lambda old, place=place: jnp.broadcast_to(place, old.shape))
         assert extent(here) == pytest.approx(0.5 * scene.far)
-    assert extent(scene) == pytest.approx(1.1 * np.hypot(1, 0.1), rel=1e-3)
+    own = 1.1 * np.hypot(1, 0.1)
+    assert extent(scene) == pytest.approx(own * scene.placement.scale, rel=1e-3)
 
 
 def test_the_near_plane_is_small_in_a_small_scene(scene, monkeypatch):
@@ -99,9 +101,9 @@ def test_refinement_and_exports_keep_the_shapes_that_the_filter_made(capture_fol
     config = dataclasses.replace(TINY_MIP.field, smoothed_at=1, capacity=600)
     coarse = dataclasses.replace(config, smoothed_at=2, capacity=100)
     points = np.random.default_rng(0).uniform([-1, -1, -0.1], [1, 1, 0.1], (100, 3))
-    points = jnp.asarray(points, jnp.float32)
+    points = jnp.asarray(scene.placement.to_scene(points), jnp.float32)
     params, buffers = make_field(coarse, scene, 1).init(jax.random.key(0), points, points)
-    depth = jnp.full((plane.HEIGHT, plane.WIDTH), 4.0)
+    depth = jnp.full((plane.HEIGHT, plane.WIDTH), 4.0 * scene.placement.scale)
     gray = Rendering(jnp.full((*depth.shape, 3), 0.5), depth, jnp.ones_like(depth))
     pyramid, _ = scene_pyramid(scene)
 
@@ -118,7 +120,7 @@ def test_refinement_and_exports_keep_the_shapes_that_the_filter_made(capture_fol
     np.testing.assert_allclose(after[:100], before + added, rtol=1e-4)
     np.testing.assert_allclose(kept.interval[:100], buffers.interval / 2, rtol=1e-5)
     assert kept.alive.all() and finer.log_scales.shape == (600, 3)
-    METHODS["mip_gaussians"].export(tmp_path, "baseline", finer, kept)
+    METHODS["mip_gaussians"].export(tmp_path, "baseline", finer, kept, UNMOVED)
     found = read_surfels(tmp_path / "splats" / "baseline.ply", num_scales=3)
     expected = smoothed(finer, kept.interval)
     np.testing.assert_allclose(found.log_scales, expected.log_scales, rtol=1e-6)

@@ -179,6 +179,7 @@ def test_a_folder_that_holds_something_is_refused(render, tmp_path):
         ("manifest.json", lambda a: a | {"scene": "/nowhere"}, "/nowhere is not a folder"),
         ("manifest.json", lambda a: a | {"load_options": {"lens": 3}}, "options that this version"),
         ("manifest.json", lambda a: a | {"load_options": {"downscale": 2}}, "was trained with"),
+        ("manifest.json", lambda a: a.pop("placement") and a, "moves and scales: render it with"),
         ("checkpoints/run.json", lambda a: a | {"config": {}}, "whose configuration this version"),
         ("checkpoints/run.json", lambda a: a, "does not hold this run's state"),
     ],

@@ -17,7 +17,7 @@ from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.states import state_shapes
 from jaxcloseup.app.store.stored_config import preset_from_config
 from jaxcloseup.artifacts.checkpoints import Checkpoints
-from jaxcloseup.captures.load import load_scene
+from jaxcloseup.captures.load import DRAWN_SCENES, load_scene
 from jaxcloseup.io.files import read_object
 from jaxcloseup.io.messages import printable
 from jaxcloseup.photos.scene import Scene
@@ -130,6 +130,11 @@ def load_run_scene(run: StoredRun, moved_to: str | None = None) -> Scene:
     """
     about = run.manifest
     name = about["scene"] if moved_to is None else moved_to
+    if "placement" not in about and name not in DRAWN_SCENES:
+        raise RunError(
+            f"--run={run.folder} was trained in the coordinates of its capture's files, which this "
+            "version moves and scales: render it with the version that trained it, or train again"
+        )
     try:
         scene = load_scene(name, **about["load_options"])
     except TypeError as error:
