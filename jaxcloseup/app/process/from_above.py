@@ -27,8 +27,9 @@ def draw_cameras(poses: np.ndarray, points: np.ndarray, rgb: np.ndarray) -> byte
       rgb: `[P, 3]` their colors in [0, 1].
     """
     plane = _horizontal(poses[:, :, :3])
-    if len(points) > _MOST_POINTS:
-        some = np.linspace(0, len(points) - 1, _MOST_POINTS).astype(int)
+    count = len(points)
+    if count > _MOST_POINTS:
+        some = np.linspace(0, count - 1, _MOST_POINTS).astype(int)
         points, rgb = points[some], rgb[some]
     flat, cameras = points @ plane.T, poses[:, :, 3] @ plane.T
     forward = poses[:, :, 2] @ plane.T
@@ -54,7 +55,7 @@ def draw_cameras(poses: np.ndarray, points: np.ndarray, rgb: np.ndarray) -> byte
     axes.set_xlim(middle[0] - 0.56 * side, middle[0] + 0.56 * side)
     axes.set_ylim(middle[1] - 0.56 * side, middle[1] + 0.56 * side)
     axes.set_aspect("equal")
-    axes.set_title(f"{len(poses)} cameras and {len(points):,} points from above")
+    axes.set_title(f"{len(poses)} cameras and {count:,} points from above")
     axes.set_xlabel("units of the capture")
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=110, metadata={"Software": None})

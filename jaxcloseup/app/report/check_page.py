@@ -10,15 +10,27 @@ import numpy as np
 from jaxcloseup.app.process.from_above import draw_cameras
 from jaxcloseup.app.report.page import fill_page
 from jaxcloseup.app.report.record_table import Table
+from jaxcloseup.app.run.capture_check import said_of
 from jaxcloseup.captures.contents import Listed
 from jaxcloseup.captures.photo import Reading
 from jaxcloseup.captures.small_photos import read_small
-from jaxcloseup.checks.judge import MISFIT, Checked
+from jaxcloseup.checks.judge import Checked
 from jaxcloseup.io.files import write_file
 
 
 NAME = "check.html"
 _SIDE, _COLUMNS = 320, 4  # pixels of a photograph on the contact sheet, and photographs in a row
+_FIGURES = {
+    "photographs": ("photographs", ","),
+    "without_matches": ("photographs that share no features with others", ","),
+    "neighbor_degrees": ("degrees between similar photographs, median", ".1f"),
+    "matches": ("features that match between photographs", ","),
+    "share": ("of these within 2 pixels of the poses", ".1%"),
+    "median": ("their median error in pixels", ".2f"),
+    "points": ("points", ","),
+    "points_share": ("points that look alike in two photographs", ".1%"),
+    "points_moved": ("the same, if they are moved off their place", ".1%"),
+}
 _ALL_FIT = 0.9  # share of a photograph's matches from which it is not shown
 
 
@@ -43,16 +55,14 @@ def write_check(
     by_name = {frame.file.name: frame for frame in listed.frames}
     pictures = [read_small(by_name[photo], reading, _SIDE).rgb for photo, _ in worst]
     figures = [
-        (key.replace("_", " "), f"{value:,.4g}" if isinstance(value, float) else f"{value:,}")
-        for key, value in found.figures.items()
+        (text, f"{found.figures[key]:{form}}")
+        for key, (text, form) in _FIGURES.items()
+        if key in found.figures
     ]
     page = fill_page(
         "check.html",
         title=f"Check of {name}",
-        sentence=found.sentence,
-        refused=found.verdict == MISFIT,
-        corrections=[*found.corrections, *found.points],
-        notes=found.notes,
+        said=said_of(found),
         figures=Table("What was measured", ["", ""], figures),
         above=imageio.imread(above)[..., :3],
         sheet=_contact_sheet(pictures) if pictures else None,
