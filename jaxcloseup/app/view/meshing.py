@@ -40,8 +40,7 @@ def write_run_mesh(
       record: the run.
       scene: its scene.
       stage: whose depth is fused; None: the exact depth of a built-in scene.
-      region: `[2, 3]` smallest and largest coordinates of the mesh, in the capture's world; None:
-        of what the views see.
+      region: `[2, 3]` smallest and largest coordinates, the capture's; None: of what views see.
       voxel: side of a voxel in the capture's unit; None: by `resolution`.
       resolution: voxels along the longest side of the region.
       min_views: training views that must see the surface at a pixel.
