@@ -69,12 +69,11 @@ def write_run_mesh(
     else:
         region = scene.placement.to_scene(region)
     side = scene.placement.scale * voxel if voxel else np.ptp(region, axis=0).max() / resolution
-    grid = surface.make_grid(region, side)
-    mesh = _fuse(maps, grid, scene.placement.scale)
+    mesh = _fuse(maps, surface.make_grid(region, side), scene.placement.scale)
     write_mesh(output_dir / "mesh.ply", mesh, scene.placement)
     about = {
         "stage": stage,
-        **_in_capture(grid.voxel, region, scene.placement),
+        **_in_capture(side, region, scene.placement),
         "min_views": min_views,
         "vertices": len(mesh.vertices),
         "triangles": len(mesh.faces),
