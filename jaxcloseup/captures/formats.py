@@ -68,6 +68,7 @@ class _Content(NamedTuple):
     given: dict[str, list[Frame]] | None
     points: tuple[np.ndarray, np.ndarray]
     errors: np.ndarray | None = None
+    placement: Placement = UNMOVED
 
 
 def read_listing(
@@ -87,7 +88,6 @@ def read_listing(
       SceneError: the folder holds no known format, or one of its files is wrong.
     """
     kind, folder, content, note = _read_content(path, format)
-    content, placement = _placed(content)
     scene = folder.resolve().name
     given = content.given
     if split == "given" and not given:
@@ -108,7 +108,7 @@ def read_listing(
     keep = np.ones(len(points), bool)
     if fewer or len(frames) > 1:
         keep = _seen_in_training(frames["train"], len(points))
-    notes = [note, *division.notes, *masked, *reduced, *describe_offset(scene, placement)]
+    notes = [note, *division.notes, *masked, *reduced, *describe_offset(scene, content.placement)]
     if fewer:
         notes.append(f"{scene}: learns from {len(chosen)} of {len(train)} training photographs")
     if not keep.all():
@@ -128,12 +128,12 @@ def read_listing(
         times_nearer=division.times_nearer,
         errors=None if content.errors is None else content.errors[keep],
         downscale=downscale,
-        placement=placement,
+        placement=content.placement,
     )
 
 
-def _placed(content: _Content) -> tuple[_Content, Placement]:
-    """Return what was read, in the coordinates of the scene, and where this lies."""
+def _placed(content: _Content) -> _Content:
+    """Return what was read, in the coordinates of the scene."""
     frames, (points, rgb) = content.frames, content.points
     check_positions(frames, UNMOVED)
     placement = find_placement(np.stack([frame.camtoworld[:, 3] for frame in frames]), points)
@@ -141,7 +141,7 @@ def _placed(content: _Content) -> tuple[_Content, Placement]:
     given = content.given and {k: place(part, placement) for k, part in content.given.items()}
     points = placement.to_scene(points).astype(np.float32)
     frames = place(frames, placement)
-    return content._replace(frames=frames, given=given, points=(points, rgb)), placement
+    return content._replace(frames=frames, given=given, points=(points, rgb), placement=placement)
 
 
 def fitting_divisor(sizes: Iterable[tuple[int, int]], pixels: int) -> int:
@@ -165,7 +165,7 @@ def _read_content(
     (kind, name), *others = found
     folder = _folder_of_model(path) if name == "." else path
     readers = {"transforms": _read_transforms, "colmap": _read_model, "llff": _read_llff}
-    content = readers[kind](folder, path / name)
+    content = _placed(readers[kind](folder, path / name))
     rejected = " or ".join(_describe(*other, path) for other in others)
     note = f"{folder.resolve().name}: reading {_describe(kind, name, path)}"
     return kind, folder, content, note + (f" and not {rejected}" if rejected else "")
