@@ -65,12 +65,10 @@ def load_scene(
       corrections: corrections of known mistakes, as `captures.corrections` lists them.
 
     Returns:
-      The scene, float32. That of a folder has its middle at 0 and one size, in any unit and with
-      any origin of its files: `placement.to_capture` maps points back to their coordinates, in
-      float64. Drawn scenes keep theirs. For a folder, `metadata` holds path, downscale, format,
-      split; files and sizes (width, height) by split; applied_transform `[3, 4]` and applied_scale;
-      up `[3]` or None; notes, sentences on what was read; for `closest` and `zoom` times_nearer of
-      each `test` view; for `zoom` the crops' corners.
+      The scene, float32, in coordinates of its own, which `placement` maps to those of a folder's
+      files. For a folder, `metadata` holds path, downscale, format, split; files and sizes (width,
+      height) by split; applied_transform `[3, 4]`, applied_scale; up `[3]` or None; notes on what
+      was read; for `closest`, `zoom` times_nearer of each `test` view; for `zoom` crops' corners.
 
     Raises:
       SceneError: one sentence that names the file and the field and says what to do.

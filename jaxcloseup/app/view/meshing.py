@@ -40,8 +40,7 @@ def write_run_mesh(
       record: the run.
       scene: its scene.
       stage: whose depth is fused; None: the exact depth of a built-in scene.
-      region: `[2, 3]` smallest and largest coordinates of the mesh, in the capture's world; None:
-        of what the views see.
+      region: `[2, 3]` smallest and largest coordinates, the capture's; None: of what views see.
       voxel: side of a voxel in the capture's unit; None: by `resolution`.
       resolution: voxels along the longest side of the region.
       min_views: training views that must see the surface at a pixel.
@@ -51,8 +50,6 @@ def write_run_mesh(
     """
     if stage is None and scene.surface is None:
         raise MeshError("--exact needs a built-in scene, whose surface is known: leave it out")
-    placement = scene.placement
-    region = None if region is None else placement.to_scene(region)
     finer = surface.finer_by(scene, renders_pixels=False)
     if stage is None:
         see = surface.exact_view(scene)
@@ -69,13 +66,14 @@ def write_run_mesh(
                 "--min_views"
             )
         region = surface.box_around(points)
-    longest = np.ptp(region, axis=0).max()
-    grid = surface.make_grid(region, voxel * placement.scale if voxel else longest / resolution)
-    mesh = _fuse(maps, grid, placement.scale)
-    write_mesh(output_dir / "mesh.ply", mesh, placement)
+    else:
+        region = scene.placement.to_scene(region)
+    side = scene.placement.scale * voxel if voxel else np.ptp(region, axis=0).max() / resolution
+    mesh = _fuse(maps, surface.make_grid(region, side), scene.placement.scale)
+    write_mesh(output_dir / "mesh.ply", mesh, scene.placement)
     about = {
         "stage": stage,
-        **_in_capture(grid.voxel, region, placement),
+        **_in_capture(side, region, scene.placement),
         "min_views": min_views,
         "vertices": len(mesh.vertices),
         "triangles": len(mesh.faces),
