@@ -82,11 +82,7 @@ def read_listing(
     notes += [*unused_note(folder, used), *describe_offset(scene, placement)]
     if fewer:
         notes.append(f"{scene}: learns from {len(chosen)} of {len(train)} training photographs")
-    if not keep.all():
-        notes.append(
-            f"{scene}: dropped {np.sum(~keep)} of {len(keep)} points, which fewer than two "
-            "training photographs see"
-        )
+    notes += _describe_dropped(scene, keep)
     return Listing(
         format=detected.format,
         folder=folder,
@@ -101,6 +97,16 @@ def read_listing(
         downscale=downscale,
         placement=placement,
     )
+
+
+def _describe_dropped(scene: str, keep: np.ndarray) -> list[str]:
+    """Return a note on points that are not kept, if there are any."""
+    if keep.all():
+        return []
+    return [
+        f"{scene}: dropped {np.sum(~keep)} of {len(keep)} points, which fewer than two training "
+        "photographs see"
+    ]
 
 
 def fitting_divisor(sizes: Iterable[tuple[int, int]], pixels: int) -> int:
