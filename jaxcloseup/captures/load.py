@@ -80,21 +80,18 @@ def load_scene(
     if is_drawn(name_or_path):
         _check_drawn(path.name, format, split, invert_masks, alpha_mode)
         return _draw(path.name, downscale, pixels, photographs)
-    if len(path.parts) == 1 and str(name_or_path) == path.name and not path.exists():
+    _check_exists(path)
+    reading = Reading(downscale or 1, zoom, background, half_pixel, alpha_mode, invert_masks)
+    chosen = {"format": format, "split": split, "photographs": photographs}
+    return load_capture(path, reading, pixels=wanted, corrections=corrections, **chosen)
+
+
+def _check_exists(path: pathlib.Path) -> None:
+    if len(path.parts) == 1 and not path.exists():
         raise SceneError(
             f"{path} is neither a folder nor a built-in scene: choose one of "
             f"{', '.join(DRAWN_SCENES)}, or give the path of a capture."
         )
-    reading = Reading(downscale or 1, zoom, background, half_pixel, alpha_mode, invert_masks)
-    return load_capture(
-        path,
-        reading,
-        format=format,
-        split=split,
-        photographs=photographs,
-        pixels=wanted,
-        corrections=corrections,
-    )
 
 
 def is_drawn(name_or_path: str | pathlib.Path) -> bool:
