@@ -109,7 +109,7 @@ def read_listing(
     if fewer or len(frames) > 1:
         keep = _seen_in_training(frames["train"], len(points))
     used = [*content.frames, *(frame for part in frames.values() for frame in part)]
-    notes = [*content.notes, *division.notes, *masked, *reduced, *unused_note(folder, used)]
+    notes = [*content.notes, *division.notes, *unused_note(folder, used), *masked, *reduced]
     if fewer:
         notes.append(f"{scene}: learns from {len(chosen)} of {len(train)} training photographs")
     if not keep.all():

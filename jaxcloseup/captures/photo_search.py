@@ -72,7 +72,10 @@ def locate(
         if hits:
             found[name] = how, hits[0]
     # One photograph is not two that are listed under different names.
-    owners = collections.Counter([*files.values(), *(file for _, file in found.values())])
+    every = files | {name: file for name, (_, file) in found.items()}
+    owners = collections.Counter(
+        file for _, file in {(tuple(_parts(name)), file) for name, file in every.items()}
+    )
     found = {name: pair for name, pair in found.items() if owners[pair[1]] == 1}
     files |= {name: file for name, (_, file) in found.items()}
     placed = [(frame, files[frame.listed]) for frame in frames]
