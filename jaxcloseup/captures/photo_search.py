@@ -58,7 +58,10 @@ def locate(
     Raises:
       SceneError: a name fits several files.
     """
-    files = {name: find_exact(folders[0], name) for name in {frame.listed for frame in frames}}
+    files = {
+        name: find_exact(folders[0], name)
+        for name in dict.fromkeys(frame.listed for frame in frames)
+    }
     others, found = [name for name, file in files.items() if file is None], {}
     index = functools.cache(_index)
     for name in others:
