@@ -150,7 +150,9 @@ def _check_text(name: str, path: pathlib.Path, data: bytes, count_parameters: _C
             raise SceneError(f"{label} ends after {len(words)} fields: export it again.")
         try:
             if name == "images":
-                _check_pose(f"{path}: image {words[0]} ({words[9]})", [*map(float, words[1:8])])
+                _check_pose(
+                    f"{path}: image {int(words[0])} ({words[9]})", [*map(float, words[1:8])]
+                )
             elif name == "points3D":
                 _check_finite(label, [*map(float, words[:8])])
             else:

@@ -1,5 +1,6 @@
 """Detect the format of a capture folder."""
 
+import os
 import pathlib
 import shlex
 from typing import NamedTuple
@@ -69,6 +70,6 @@ def _folder_of_model(model: pathlib.Path) -> pathlib.Path:
     That is the nearest one with a folder of photographs.
     """
     around = model.resolve()
-    candidates = (around, *around.parents)[:4]
+    candidates = [at for at in (around, *around.parents)[:4] if os.access(at, os.R_OK)]
     with_images = (folder for folder in candidates if photograph_folders(folder)[0] != folder)
     return model if list_pictures(model) else next(with_images, model)

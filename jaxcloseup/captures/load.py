@@ -5,8 +5,8 @@ The first of these that a folder holds is read:
 - `transforms_train.json`, with optional `transforms_test.json` (split `test`) and
   `transforms_test_far.json` or Blender's `transforms_val.json` (split `test_far`);
 - `transforms.json` from Instant-NGP or nerfstudio, with its lists of file names by split;
-- a COLMAP model, binary or text, in `sparse/0`, `sparse` or `colmap/sparse/0`, with photographs in
-  `images`; the path may also name the model's own folder;
+- a COLMAP model, binary or text, the largest in `sparse/0`, `sparse/1`, ..., or in `sparse` or
+  `colmap/sparse/0`, with photographs in `images`; the path may also name the model's own folder;
 - LLFF's `poses_bounds.npy`, with photographs in `images`.
 
 Lenses are undistorted to pinhole cameras of the same size; photographs of different sizes are

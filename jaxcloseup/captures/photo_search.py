@@ -59,7 +59,10 @@ def locate(
     Raises:
       SceneError: a name fits several files.
     """
-    files = {name: find_exact(folders[0], name) for name in {frame.listed for frame in frames}}
+    files = {
+        name: find_exact(folders[0], name)
+        for name in dict.fromkeys(frame.listed for frame in frames)
+    }
     others, found = [name for name, file in files.items() if file is None], {}
     index = functools.cache(_index)
     for name in others:
@@ -73,7 +76,10 @@ def locate(
         if hits:
             found[name] = how, hits[0]
     # One photograph is not two that are listed under different names.
-    owners = collections.Counter([*files.values(), *(file for _, file in found.values())])
+    every = files | {name: file for name, (_, file) in found.items()}
+    owners = collections.Counter(
+        file for _, file in {(tuple(_parts(name)), file) for name, file in every.items()}
+    )
     found = {name: pair for name, pair in found.items() if owners[pair[1]] == 1}
     files |= {name: file for name, (_, file) in found.items()}
     placed = [(frame, files[frame.listed]) for frame in frames]

@@ -228,7 +228,7 @@ def test_names_are_unique(tmp_path):
     for name in listed:
         write_image(tmp_path / name)
     write_json(tmp_path / "transforms_train.json", [frame(name) for name in [*listed, listed[0]]])
-    with pytest.warns(DuplicateFileWarning, match=r"lists c0/x\.png in more than one"):
+    with pytest.warns(DuplicateFileWarning, match=r"lists c0/x\.png in more than one frame: the"):
         names = load_scene(tmp_path).names["train"]
     assert names == ["c0_x", "c1_x", "c1_x_2", "c1_x_3"]
 

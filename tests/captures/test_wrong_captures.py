@@ -220,6 +220,7 @@ CASES = {
         (model(images=[image_line(1, "000.png", "1 0 0 0 inf 0 0"), ""]), "000.png.*not finite"),
         (model(images=[image_line(1, "000.png", "0 0 0 0 1 0 0"), ""]), "rotation is 0, 0, 0, 0"),
         (model(images=[image_line(1, "000.png", "x 0 0 0 1 0 0"), ""]), "line 2 holds text"),
+        (model(images=[image_line("a", "000.png"), ""]), "line 2 holds text"),
         (model(images=["1 1 0 0 0"]), r"images\.txt: line 2 ends after 5 fields"),
         (model(images=[*IMAGES[:1], "4 3"]), r"images\.txt: line 3 holds 2 numbers"),
         (model(images=[*IMAGES, image_line(3, "001.png"), ""]), r"'001\.png' more than once"),
