@@ -194,11 +194,7 @@ def make_photo(
     if frame.distortion:
         intrinsics = resized_intrinsics(frame, stored, stored, reading.half_pixel)
         remap = find_remap(frame.distortion, tuple(intrinsics.tolist()), width, height)
-        if not remap.inside.any():
-            raise SceneError(
-                f"{frame.label}: undistortion leaves nothing of the photograph: correct the "
-                "distortion coefficients."
-            )
+        _check_remap(frame, remap)
         whole = np.full((height, width), 255, np.uint8) if mask is None else mask
         rgb, mask = undistort(rgb, whole, remap)
     rgb = downscale_image(rgb, downscale)
@@ -209,6 +205,14 @@ def make_photo(
     photo = Photo(frame, rgb, mask, stored, (rgb.shape[1], rgb.shape[0]), flaw=flaw)
     photos = _zoomed(photo, reading.zoom, closeup) if reading.zoom > 1 else [photo]
     return [_without_alpha(photo) for photo in photos] if rgb.shape[-1] == 4 else photos
+
+
+def _check_remap(frame: Frame, remap: Remap) -> None:
+    if not remap.inside.any():
+        raise SceneError(
+            f"{frame.label}: undistortion leaves nothing of the photograph: correct the distortion "
+            "coefficients."
+        )
 
 
 def _flaw(image: np.ndarray) -> str:
@@ -227,6 +231,7 @@ def _read_mask(
     assert frame.mask is not None
     dynamic = is_dynamic(frame)
     mask = read_mask(frame.mask, MaskValues(white=1) if dynamic else reading.masks, data=data)
+    mask = np.rot90(mask, frame.turns)
     mask = 255 - mask if dynamic or reading.invert_masks else mask
     if mask.shape[::-1] == frame.size != size:
         mask = cv2.resize(mask, size, interpolation=cv2.INTER_AREA)
