@@ -11,6 +11,7 @@ from jaxcloseup.captures.colmap import read_colmap
 from jaxcloseup.captures.colmap_files import find_model_files
 from jaxcloseup.captures.corrections import correct_frames, correct_points
 from jaxcloseup.captures.detection import SEPARATE, SINGLE, Detected, detect
+from jaxcloseup.captures.leftovers import unused_note
 from jaxcloseup.captures.llff import read_llff
 from jaxcloseup.captures.photo_masks import attach_masks
 from jaxcloseup.captures.photo_search import check_missing, list_first, locate, photograph_folders
@@ -39,6 +40,7 @@ class Listed(NamedTuple):
     frames: list[Frame]  # photographs of all splits, in the order of their files
     points: np.ndarray  # `[P, 3]` float64 world points; P may be 0
     rgb: np.ndarray  # `[P, 3]` float32 colors of the points in [0, 1]
+    notes: tuple[str, ...]  # sentences on what was read, and what was not
 
 
 class Content(NamedTuple):
@@ -63,7 +65,8 @@ def list_photographs(
     """
     detected, content = read_content(path, format, corrections)
     frames = attach_masks(detected.folder, {"all": content.frames})["all"]
-    return Listed(detected.format, detected.folder, frames, *content.points)
+    notes = (*content.notes, *unused_note(detected.folder, frames))
+    return Listed(detected.format, detected.folder, frames, *content.points, notes)
 
 
 def read_content(

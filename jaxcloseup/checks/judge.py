@@ -11,7 +11,7 @@ from jaxcloseup.checks.evidence import SIDE, Evidence
 from jaxcloseup.checks.looks import describe_looks, exposures
 from jaxcloseup.checks.mistakes import find_mistake
 from jaxcloseup.checks.order import find_order
-from jaxcloseup.checks.point_patches import find_points_mistake, fit_points
+from jaxcloseup.checks.point_patches import coverage, find_points_mistake, fit_points
 
 
 FITS, LOOSE, MISFIT, UNKNOWN = "fits", "loose", "misfit", "unknown"
@@ -19,6 +19,7 @@ _FEWEST = 60  # matches, below which nothing is said of poses
 _MOST_WRONG = 0.5  # share of matches that do not fit, from which the capture is refused
 _BLURRED = 1.0  # pixels of median error from which close-ups are blurred
 _SHOWN = 0.3  # share of points with texture in two photographs, below which a turn may show more
+_FEW_VIEWS = 3  # of photographs that depth needs; most that see a point may be hidden from it
 _BAD = 0.3  # share of a photograph's fitting matches below which its pose is wrong
 
 
@@ -64,7 +65,8 @@ def judge(evidence: Evidence, points: np.ndarray, *, opengl: bool, ordered: bool
         )
     about, instead = _judge_points(evidence, points, figures, trusted=verdict in (FITS, LOOSE))
     notes = [*describe_looks(evidence.looks, names), *exposures(matches, names)]
-    notes += _coverage(evidence, points, figures) if verdict in (FITS, LOOSE) else []
+    if verdict in (FITS, LOOSE):
+        notes += _coverage(evidence, points, figures)
     worst = sorted(
         (float(share), name)
         for share, name in zip(found.by_view if found else (), names, strict=False)
@@ -88,17 +90,9 @@ def _judge_poses(
     count = len(evidence.matches.views)
     bad = [name for name, share in zip(names, found.by_view, strict=True) if share < _BAD]
     fits = f"{len(names)} photographs, poses fit: {found.median:.1f} px"
-    if found.share >= 1 - _MOST_WRONG and not bad:
-        if found.median <= _BLURRED:
-            return FITS, fits, ()
-        return (
-            LOOSE,
-            (
-                f"{len(names)} photographs, poses are off by {found.median:.1f} px of {SIDE} in "
-                "the median: close-ups will be blurred by as much"
-            ),
-            (),
-        )
+    most = found.share >= 1 - _MOST_WRONG
+    if most and not bad and found.median <= _BLURRED:
+        return FITS, fits, ()
     said = (
         f"{round(found.share * count):,} of {count:,} features that match between photographs fit "
         f"their poses (median error {found.median:.0f} px of {SIDE})"
@@ -110,7 +104,13 @@ def _judge_poses(
     if order is not None:
         corrections = ("order=" + ",".join(map(str, order)),) if ordered else ()
         return MISFIT, f"{said}: {_describe_order(order, names)}", corrections
-    if found.share >= 1 - _MOST_WRONG:
+    if most and not bad:
+        off = (
+            f"{len(names)} photographs, poses are off by {found.median:.1f} px of {SIDE} in the "
+            "median: close-ups will be blurred by as much"
+        )
+        return LOOSE, off, ()
+    if most:
         first = ", ".join(bad[:3])
         return LOOSE, f"{fits}, but not those of {len(bad)} photographs, such as {first}", ()
     return MISFIT, f"{said}, and no known mistake explains it", ()
@@ -158,7 +158,7 @@ def _judge_points(
 
 
 def _coverage(evidence: Evidence, points: np.ndarray, figures: dict[str, Any]) -> list[str]:
-    """Say from how many directions surfaces are seen."""
+    """Measure from how many directions and how near surfaces are seen; note what is poor."""
     cameras, views = evidence.cameras, evidence.matches.views
     pairs = np.unique(views, axis=0)
     alone = len(cameras.intrinsics) - len(np.unique(views))
@@ -169,4 +169,9 @@ def _coverage(evidence: Evidence, points: np.ndarray, figures: dict[str, Any]) -
     notes = []
     if alone:
         notes.append(f"{alone} of {len(axes)} photographs share no features with others")
+    if len(points):
+        count, degrees, nearest = coverage(points, cameras)
+        figures |= {"views": count, "degrees": degrees, "nearest": nearest}
+        if count < _FEW_VIEWS:
+            notes.append(f"half of the points lie in the views of at most {count:.0f} photographs")
     return notes

@@ -87,6 +87,34 @@ def find_points_mistake(
     return axes if best >= _LEAST and best - second >= _GAIN and axes != "x,y,z" else None
 
 
+def coverage(points: np.ndarray, cameras: Cameras) -> tuple[float, float, float]:
+    """Measure how photographs cover points, without asking what hides them.
+
+    Args:
+      points: `[P, 3]` world points, at least one.
+      cameras: cameras of the photographs.
+
+    Returns:
+      Medians over points: number of photographs that have it in view; widest angle between their
+      rays, in degrees; distance of the nearest as a share of the median distance.
+    """
+    some = points[:: max(1, len(points) // _TRIED)][:_TRIED].astype(np.float64)
+    inside, _ = _in_view(some, cameras, margin=0.0)
+    rays = cameras.camtoworld[None, :, :, 3] - some[:, None]
+    away = np.linalg.norm(rays, axis=-1)
+    rays /= np.maximum(away, 1e-300)[..., None]
+    cosines = np.einsum("pvi,pwi->pvw", rays, rays)
+    both = inside[:, :, None] & inside[:, None]
+    widest = np.arccos(np.clip(np.where(both, cosines, 1).min((1, 2)), -1, 1))
+    nearest = np.where(inside, away, np.inf).min(1)
+    usual = np.median(away[inside]) if inside.any() else np.inf
+    return (
+        float(np.median(inside.sum(1))),
+        float(np.degrees(np.median(widest))),
+        float(np.median(nearest[np.isfinite(nearest)]) / usual) if inside.any() else 0.0,
+    )
+
+
 def _turns() -> Iterator[str]:
     """Yield the 23 rotations that permute axes, as texts."""
     for names in itertools.permutations("xyz"):
@@ -127,19 +155,13 @@ def _alike(points: np.ndarray, gray: Sequence[np.ndarray], cameras: Cameras) -> 
 
 def _views(points: np.ndarray, cameras: Cameras) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return pairs of photographs `[N]`, `[N]` that may show points, and the points' rows `[N]`."""
-    count, views = len(points), len(cameras.intrinsics)
-    rows, view = (x.ravel() for x in np.meshgrid(np.arange(count), np.arange(views), indexing="ij"))
-    pixels, depth = _project(points[rows], cameras, view)
-    margin = _SPACING * _RADIUS
-    inside = (
-        (depth > 0) & (pixels > margin).all(-1) & (pixels < cameras.sizes[view] - margin).all(-1)
-    )
-    depth = np.where(inside, depth, np.inf).reshape(count, views)
+    inside, depth = _in_view(points, cameras, margin=_SPACING * _RADIUS)
+    depth = np.where(inside, depth, np.inf)
     rays = cameras.camtoworld[None, :, :, 3] - points[:, None]
     rays /= np.maximum(np.linalg.norm(rays, axis=-1, keepdims=True), 1e-300)
     nearest = np.argsort(depth, axis=1, kind="stable")
     found = []
-    for point in range(count):
+    for point in range(len(points)):
         seen = nearest[point][np.isfinite(depth[point, nearest[point]])]
         seen = seen[:8]
         pairs = [
@@ -149,6 +171,18 @@ def _views(points: np.ndarray, cameras: Cameras) -> tuple[np.ndarray, np.ndarray
         ]
         found += pairs[:_PAIRS]
     return tuple(np.array(found, int).reshape(-1, 3).T)  # type: ignore[return-value]
+
+
+def _in_view(
+    points: np.ndarray, cameras: Cameras, *, margin: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return which views have points inside of their image, `[P, V]`, and z-depths `[P, V]`."""
+    shape = len(points), len(cameras.intrinsics)
+    rows, view = (x.ravel() for x in np.indices(shape))
+    pixels, depth = _project(points[rows], cameras, view)
+    inside = (depth > 0) & (pixels > margin).all(-1)
+    inside &= (pixels < cameras.sizes[view] - margin).all(-1)
+    return inside.reshape(shape), depth.reshape(shape)
 
 
 def _project(

@@ -47,7 +47,7 @@ def main(arguments: list[str]) -> None:
             found = check_scene(str(path), options)
         listed = list_photographs(path, format=FLAGS.format)
         page = write_check(folder, path.resolve().name, found, listed, reading_of(options))
-    print("\n".join(said_of(found)))
+    print("\n".join([*listed.notes, *said_of(found)]))
     print(f"page: {page}")
     if found.verdict == MISFIT:
         sys.exit(1)

@@ -24,6 +24,9 @@ _FIGURES = {
     "photographs": ("photographs", ","),
     "without_matches": ("photographs that share no features with others", ","),
     "neighbor_degrees": ("degrees between similar photographs, median", ".1f"),
+    "views": ("photographs that have a point in view, median", ".0f"),
+    "degrees": ("widest angle between them in degrees, median", ".0f"),
+    "nearest": ("distance of the nearest, as a share of the usual one", ".2f"),
     "matches": ("features that match between photographs", ","),
     "share": ("of these within 2 pixels of the poses", ".1%"),
     "median": ("their median error in pixels", ".2f"),
@@ -62,7 +65,7 @@ def write_check(
     page = fill_page(
         "check.html",
         title=f"Check of {name}",
-        said=said_of(found),
+        said=[*said_of(found), *listed.notes],
         figures=Table("What was measured", ["", ""], figures),
         above=imageio.imread(above)[..., :3],
         sheet=_contact_sheet(pictures) if pictures else None,
