@@ -133,10 +133,10 @@ def _judge_points(
     evidence: Evidence, points: np.ndarray, figures: dict[str, Any], *, trusted: bool
 ) -> tuple[str, tuple[str, ...]]:
     """Return what is said of points, and what to read instead of them."""
-    if not len(points):
-        return "; no points", ()
     if not trusted:
         return "", ()
+    if not len(points):
+        return "; no points", ()
     found = fit_points(points, evidence.gray, evidence.cameras)
     figures |= {"points_share": found.share, "points_moved": found.moved}
     if found.known and found.fits and found.textured >= _SHOWN * found.tried:

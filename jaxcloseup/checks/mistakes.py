@@ -1,6 +1,5 @@
 """Known mistakes of poses and lenses: try each, and name the one that makes matches fit."""
 
-import fractions
 import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -104,9 +103,12 @@ def _lens(matches: Matches, cameras: Cameras) -> tuple[tuple[str, ...], str, Cam
     if np.abs(moved).max() < _SAME and abs(zoom - 1) < _SAME:
         return (), "", best
     if np.abs(moved - (zoom - 1) * given).max() < _SAME and abs(zoom - 1) > _SAME:
-        size = _rounded(1 / zoom)
+        size = _simple(1 / zoom)
+        simple = _with_lens(cameras, 1 / size, (1 / size - 1) * given)
+        if fit(matches, simple).share < fit(matches, best).share - _SAME:
+            size, simple = 1 / zoom, best
         sentence = f"the intrinsics are of photographs {size:.3g} times as large"
-        return (f"size={size:.6g}",), sentence, best
+        return (f"size={size:.6g}",), sentence, simple
     corrections, parts = [], []
     if abs(zoom - 1) > _SAME:
         corrections.append(f"focal={zoom:.6g}")
@@ -120,10 +122,11 @@ def _lens(matches: Matches, cameras: Cameras) -> tuple[tuple[str, ...], str, Cam
     return tuple(corrections), " and ".join(parts), best
 
 
-def _rounded(factor: float) -> float:
-    """Return the fraction of small numbers that a factor of sizes nearly is, or the factor."""
-    fraction = fractions.Fraction(factor).limit_denominator(8)
-    return float(fraction) if fraction and abs(fraction / factor - 1) < _SAME / 4 else factor
+def _simple(factor: float) -> float:
+    """Return the fraction of small numbers next to a factor of sizes, or the factor."""
+    small = [a / b for a in range(1, 9) for b in range(1, 9)]
+    nearest = min(small, key=lambda ratio: abs(ratio / factor - 1))
+    return nearest if abs(nearest / factor - 1) < 2 * _SAME else factor
 
 
 def _with_lens(cameras: Cameras, zoom: float, moved: np.ndarray) -> Cameras:
