@@ -38,7 +38,7 @@ class Detail(struct.PyTreeNode):
     """What photographs show beyond a model's renders.
 
     Attributes:
-      shown: `[V, P, 6]` photograph minus render, then the photograph's colors c as 2 c - 1, in the
+      shown: `[P, 6]` photograph minus render, then the photograph's colors c as 2 c - 1, in the
         exposure of its render.
       sources: the model's depth maps of the photographs.
       weights: networks that predict how far to trust what is gathered.

@@ -29,7 +29,7 @@ from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.photos.pyramids import Pyramid, photograph_pyramid, scene_pyramid
 from jaxcloseup.photos.scene import Scene, SceneError
-from jaxcloseup.photos.views import Views
+from jaxcloseup.photos.views import Views, unpadded
 from jaxcloseup.photos.windows import Windows, in_quarters, photograph_windows
 from jaxcloseup.training.arms import arm_specs, run_arms
 from jaxcloseup.training.parallel import in_a_loop, in_threads, over_devices
@@ -144,7 +144,7 @@ class Programs:
         views, sizes = self.scene.train, self.scene.sizes("train")
         if len(set(sizes)) == 1:
             return views
-        pyramid = photograph_pyramid(views, extents=[sizes])
+        pyramid = photograph_pyramid(unpadded(views, sizes))
         return photograph_windows(views.cameras, pyramid, whole_share=1.0)
 
     def make_room(self, growth: int) -> None:
