@@ -127,15 +127,22 @@ def render_residuals(
             levels.append(np.asarray(_subtract(photograph, rgb, colors)).reshape(-1, 6))
         return levels, depth
 
-    depths = np.zeros((len(rows), *pyramid.sizes[depth_level]), np.float32)
-    images = iter(np.split(values, extents.prod(-1).cumsum()[:-1]))
-    for padded, (levels, depth) in zip(depths, each(compare, rows.tolist()), strict=True):
+    depths, images = [], iter(np.split(values, extents.prod(-1).cumsum()[:-1]))
+    for levels, depth in each(compare, rows.tolist()):
         for image in levels[::-1]:
             next(images)[:] = image
-        padded[: depth.shape[0], : depth.shape[1]] = depth
+        depths.append(depth)
     shown = Pyramid(jnp.asarray(values), pyramid.intrinsics[rows], jnp.asarray(extents))
     cameras = pyramid.cameras(jax.tree.map(lambda leaf: leaf[rows], cameras), depth_level)
-    return Residuals(shown, cameras, jnp.asarray(depths))
+    return Residuals(shown, cameras, _stack(depths, pyramid.sizes[depth_level]))
+
+
+def _stack(images: Sequence[Any], size: tuple[int, int]) -> jax.Array:
+    """Stack images of at most height and width `size`; padding is 0."""
+    stack = np.zeros((len(images), *size), np.float32)
+    for padded, image in zip(stack, images, strict=True):
+        padded[: image.shape[0], : image.shape[1]] = image
+    return jnp.asarray(stack)
 
 
 def reproduced(shown: Pyramid, *, blur: Callable[[Any, float], Any] = blur_images) -> jax.Array:
@@ -153,11 +160,8 @@ def reproduced(shown: Pyramid, *, blur: Callable[[Any, float], Any] = blur_image
         residual = np.asarray(shown.image(view, last)[..., :3], np.float32)
         errors.append(np.asarray(blur(np.abs(residual).mean(-1)[None], _BLUR))[0])
     typical = max(float(np.median(np.concatenate([error.ravel() for error in errors]))), 1e-6)
-    found = np.zeros((len(shown), *shown.sizes[last]), np.float32)
-    for image, error in zip(found, errors, strict=True):
-        height, width = error.shape
-        image[:height, :width] = 1 / (1 + (error / (MISFIT * typical)) ** 4) ** 2
-    return jnp.asarray(found)
+    trust = [1 / (1 + (error / (MISFIT * typical)) ** 4) ** 2 for error in errors]
+    return _stack(trust, shown.sizes[last])
 
 
 @jax.jit

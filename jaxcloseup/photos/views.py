@@ -1,7 +1,7 @@
 """Photographs with their cameras, and random draws of their pixels for training."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -72,7 +72,10 @@ class Batch(NamedTuple):
     weight: jax.Array
 
 
-def to_float(rgb: jax.Array) -> jax.Array:
+_Array = TypeVar("_Array", jax.Array, np.ndarray)
+
+
+def to_float(rgb: _Array) -> _Array:
     """Convert colors to float32: uint8 to [0, 1], int8 to [-1, 1]; floats stay."""
     if rgb.dtype in (jnp.uint8, jnp.int8):
         return rgb.astype(jnp.float32) / jnp.iinfo(rgb.dtype).max

@@ -41,7 +41,9 @@ def make_capture(kind=np.int8, channels=6, count=5):
     values = values if integers else rng.normal(0, 1, shape)
     scales = jnp.array([2.0, 1.0, 0.4])
     intrinsics = views.cameras.intrinsics[:, None] * scales[None, :, None]
-    return sources, Pyramid(jnp.asarray(values.astype(kind)), intrinsics, jnp.array([SIZES] * count))
+    return sources, Pyramid(
+        jnp.asarray(values.astype(kind)), intrinsics, jnp.array([SIZES] * count)
+    )
 
 
 def make_view(height=plane.HEIGHT, width=plane.WIDTH):
