@@ -132,7 +132,7 @@ def render_residuals(
         for image in levels[::-1]:
             next(images)[:] = image
         depths.append(depth)
-    shown = Pyramid(jnp.asarray(values), pyramid.intrinsics[rows], jnp.asarray(extents))
+    shown = Pyramid(jax.device_put(values), pyramid.intrinsics[rows], jnp.asarray(extents))
     cameras = pyramid.cameras(jax.tree.map(lambda leaf: leaf[rows], cameras), depth_level)
     return Residuals(shown, cameras, _stack(depths, pyramid.sizes[depth_level]))
 

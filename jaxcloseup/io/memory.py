@@ -21,7 +21,7 @@ _ALIGNED = 64  # bytes, as XLA wants its buffers
 
 
 def empty_for_jax(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-    """Return an array without values that `jax.numpy.asarray` does not copy on a CPU.
+    """Return an array without values that `jax.device_put` does not copy on a CPU.
 
     Nothing may be written to it from then on.
     """

@@ -138,7 +138,7 @@ def photograph_pyramid(
     intrinsics = _intrinsics(finest)[:, None] * powers[:, None]
     if last:
         intrinsics = np.concatenate([intrinsics, _intrinsics(last)[:, None]], axis=1)
-    return Pyramid(jnp.asarray(values), jnp.asarray(intrinsics), jnp.asarray(extents))
+    return Pyramid(jax.device_put(values), jnp.asarray(intrinsics), jnp.asarray(extents))
 
 
 def _holds(sizes: np.ndarray, smallest: tuple[float, float]) -> bool:

@@ -58,7 +58,7 @@ def comparisons(
             seen = {stage: to_float(images[stage, split][target.name]) for stage in stages}
             name = f"{split}_{target.name}" if target.name in written else target.name
             written.add(name)
-            truth = np.asarray(target.rgb)
+            truth = np.asarray(to_float(target.rgb))
             write_png(folder / f"{name}.png", _comparison(truth, seen))
             brief = {stage: seen[stage] for stage in stages if stage in (in_report or stages)}
             section = SPLIT_TITLES[split]

@@ -27,6 +27,7 @@ from jaxcloseup.app.run.photograph_sizes import describe_photographs, finest_rea
 from jaxcloseup.app.run.step_data import ArmsData, StepData
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.io.memory import give_back_memory
 from jaxcloseup.photos.pyramids import Pyramid, photograph_pyramid, scene_pyramid
 from jaxcloseup.photos.scene import Scene, SceneError
 from jaxcloseup.photos.views import Views, unpadded
@@ -115,6 +116,7 @@ class Programs:
                     print(f"only the photographs reduced for training are read: {error}")
                     read = scene_pyramid(dataclasses.replace(scene, photographs_at=None))
             self._pyramids[finest] = read
+            give_back_memory()  # of the photographs
         return self._pyramids[finest]
 
     @functools.cached_property

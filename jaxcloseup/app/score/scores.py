@@ -23,6 +23,7 @@ from jaxcloseup.metrics.perceptual import (
 )
 from jaxcloseup.metrics.resolution import SMALLEST as SMALLEST_RINGS
 from jaxcloseup.metrics.resolution import resolved_period, ring_correlation
+from jaxcloseup.photos.views import to_float
 
 
 Metrics = dict[str, jax.Array | float]
@@ -77,7 +78,10 @@ def score(rendering: Rendering, target: Target, perceptual: Perceptual = NO_PERC
     def crop(array: Any) -> Any:
         return array[rows, columns]
 
-    image, truth, weight = map(crop, (rendering.rgb, target.rgb, target.weight))
+    image, truth, weight = (
+        crop(rendering.rgb),
+        *(jnp.asarray(to_float(crop(array))) for array in (target.rgb, target.weight)),
+    )
     image, truth = _as_8_bits(image, truth)
     seen = crop(target.seen)
     values: Metrics = {}

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.photos.scene import Scene, SceneError, Surface
 from jaxcloseup.photos.support import find_support
-from jaxcloseup.photos.views import Photograph, camera_at, to_float, unpadded
+from jaxcloseup.photos.views import Photograph, camera_at, unpadded
 
 
 _SCREEN = 1920  # longest side in pixels of views that are scored at the photographs' own size
@@ -27,8 +27,8 @@ class Target(NamedTuple):
 
     name: str  # name of its photograph
     camera: Camera  # its camera
-    rgb: jax.Array  # `[H, W, 3]` the photograph, float in [0, 1]
-    weight: jax.Array  # `[H, W]` weights
+    rgb: Any  # `[H, W, 3]` the photograph, uint8 or float in [0, 1]
+    weight: Any  # `[H, W]` weights, uint8 (255 means 1) or float in [0, 1]
     seen: jax.Array  # `[H, W]` number of training photographs that saw the surface at each pixel
     surface: Surface | None = None  # the exact surface, or None where it is unknown
     # visible points of the capture, or None where the exact surface is known
@@ -91,7 +91,6 @@ def make_targets(
         # A period takes two pixels, of the photograph or of the view.
         held = max(2.0, 2 * float(np.median(footprint[seen > 0])) / own) if seen.any() else None
         name, counts = scene.names[split][i], jnp.asarray(seen)
-        rgb, weight = (jnp.asarray(to_float(array)) for array in (rgb, weight))
         return Target(name, camera, rgb, weight, counts, exact, landmarks, held)
 
     return list(progress.each(make, range(len(photographs)), f"truth of {split}"))
