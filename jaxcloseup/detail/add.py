@@ -110,6 +110,7 @@ def add_detail(
     gathered = gather_parts(camera, pixels, depth, detail.sources, detail.shown, SETTINGS)
     sharper = _add(detail.weights, detail.finer, gathered, rgb, alpha, depth)
     seen = gathered[0].weight > 0
+    del gathered  # 70 bytes for each pixel
     filled = _fill(camera, pixels, sharper.rgb, alpha, seen, detail.sources)
     return sharper._replace(rgb=filled)
 

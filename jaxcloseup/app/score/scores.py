@@ -203,7 +203,8 @@ def evaluate(
         return score(seen, target, perceptual), seen._replace(normal=None)
 
     names = [target.name for target in targets]
-    found = progress.each(scored, targets, "rendering and scoring views")
+    pixels = max((target.weight.size for target in targets), default=1)
+    found = progress.each(scored, targets, "rendering and scoring views", pixels=pixels)
     views = dict(zip(names, found, strict=True))
     scores = {name: values for name, (values, _) in views.items()}
     return summarize(scores), {name: seen for name, (_, seen) in views.items()}

@@ -93,7 +93,8 @@ def make_targets(
         name, counts = scene.names[split][i], jnp.asarray(seen)
         return Target(name, camera, rgb, weight, counts, exact, landmarks, held)
 
-    return list(progress.each(make, range(len(photographs)), f"truth of {split}"))
+    pixels = max(photograph.weight.size for photograph in photographs)
+    return list(progress.each(make, range(len(photographs)), f"truth of {split}", pixels=pixels))
 
 
 def targets_by_split(
