@@ -30,7 +30,7 @@ from jaxcloseup.detail.weights import (
 from jaxcloseup.geometry.cameras import pixel_grid
 from jaxcloseup.labels.rules import label_depth
 from jaxcloseup.photos.scene import Scene
-from jaxcloseup.photos.views import Views, camera_at, to_float
+from jaxcloseup.photos.views import Photograph, to_float, unpadded
 
 
 FOLDER, STAGE = pathlib.Path("outputs/teach"), "baseline"
@@ -60,29 +60,31 @@ def run_evidence(folder: pathlib.Path) -> tuple[str, list[Evidence]]:
     scene, programs, state = trained.scene, trained.programs, trained.state
     detail = trained.detail()
 
-    def evidence(views, index):
-        camera = camera_at(views.cameras, index)
+    def evidence(photograph, count, index):
+        camera = photograph.camera
         seen = programs.render(state, camera)
         depth = label_depth(seen, near=0, far=scene.far)
         pixels = pixel_grid(camera.height, camera.width)
         found = find_candidates(detail, camera, pixels, seen.rgb, seen.alpha, depth)
-        own = to_float(views.rgb[index]) - jnp.clip(seen.rgb, 0, 1)
-        told = make_evidence(found, own, jnp.asarray(views.weight[index]))
-        return sample_evidence(told, PIXELS // len(views), seed=index)
+        own = to_float(jnp.asarray(photograph.rgb)) - jnp.clip(seen.rgb, 0, 1)
+        told = make_evidence(found, own, to_float(jnp.asarray(photograph.weight)))
+        return sample_evidence(told, PIXELS // count, seed=index)
 
     kinds = _held_out(scene)
-    return scene.name, [evidence(views, i) for views in kinds for i in range(len(views))]
+    return scene.name, [
+        evidence(photograph, len(views), i) for views in kinds for i, photograph in enumerate(views)
+    ]
 
 
 _FINER = 4, 1  # divisors of the photographs' size of the finer views among those that teach
 
 
-def _held_out(scene: Scene) -> Iterator[Views]:
+def _held_out(scene: Scene) -> Iterator[Sequence[Photograph]]:
     for split in ("test", "test_far"):
         if getattr(scene, split) is not None:
-            yield getattr(scene, split)
+            yield unpadded(getattr(scene, split), scene.sizes(split))
             if scene.photographs_at:
-                yield from (scene.photographs_at(divisor, split)[0] for divisor in _FINER)
+                yield from (scene.photographs_at(divisor, split) for divisor in _FINER)
 
 
 def _describe(weights: DetailWeights, views: Sequence[Evidence]) -> str:

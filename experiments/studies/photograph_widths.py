@@ -196,10 +196,8 @@ def _closeups(scene: Scene) -> Iterator[tuple[Camera, np.ndarray]]:
         return
     assert scene.photographs_at is not None
     divisor = score_divisor(scene, _SHOWN)
-    views, sizes = scene.photographs_at(divisor or scene.metadata["downscale"], "test")
-    for i, (width, height) in enumerate(sizes):
-        camera = camera_at(views.cameras, i).replace(width=width, height=height)
-        yield camera, np.asarray(to_float(views.rgb[i, :height, :width]))
+    for photograph in scene.photographs_at(divisor or scene.metadata["downscale"], "test"):
+        yield photograph.camera, np.asarray(to_float(photograph.rgb))
 
 
 def _score(folder: pathlib.Path, closeups: Iterator[tuple[Camera, np.ndarray]]) -> list[str]:

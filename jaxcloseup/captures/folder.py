@@ -30,7 +30,7 @@ from jaxcloseup.captures.world_frames import Frame
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.io.messages import printable
 from jaxcloseup.photos.scene import NearFarWarning, Scene, SceneError
-from jaxcloseup.photos.views import Views
+from jaxcloseup.photos.views import Photograph, Views
 
 
 _UP = (0.0, 0.0, 1.0)
@@ -176,14 +176,21 @@ def _is_oriented(listing: Listing) -> bool:
 
 def _read_at(
     listing: Listing, reading: Reading, factor: int, split: str = "train"
-) -> tuple[Views, list[tuple[int, int]]]:
+) -> list[Photograph]:
     """Read the photographs of a split again, at 1 / `factor` of their own size."""
     frames = [frame._replace(reduced=None) for frame in listing.frames[split]]
     photos = read_photos({split: frames}, reading._replace(downscale=factor))[split]
-    intrinsics = np.stack([photo.intrinsics(reading.half_pixel) for photo in photos])
-    sizes = [photo.size for photo in photos]
-    width, height = np.array(sizes).max(0).tolist()
-    return _padded(photos, intrinsics, height, width), sizes
+    return [Photograph(_camera(photo, reading), photo.rgb, photo.mask) for photo in photos]
+
+
+def _camera(photo: Photo, reading: Reading) -> Camera:
+    width, height = photo.size
+    return Camera(
+        camtoworld=jnp.asarray(photo.frame.camtoworld, jnp.float32),
+        intrinsics=jnp.asarray(photo.intrinsics(reading.half_pixel), jnp.float32),
+        height=height,
+        width=width,
+    )
 
 
 def _padded(photos: Sequence[Photo], intrinsics: np.ndarray, height: int, width: int) -> Views:

@@ -38,7 +38,7 @@ class Detail(struct.PyTreeNode):
     """What photographs show beyond a model's renders.
 
     Attributes:
-      shown: `[V, P, 6]` photograph minus render, then the photograph's colors c as 2 c - 1, in the
+      shown: `[P, 6]` photograph minus render, then the photograph's colors c as 2 c - 1, in the
         exposure of its render.
       sources: the model's depth maps of the photographs.
       weights: networks that predict how far to trust what is gathered.
@@ -110,6 +110,7 @@ def add_detail(
     gathered = gather_parts(camera, pixels, depth, detail.sources, detail.shown, SETTINGS)
     sharper = _add(detail.weights, detail.finer, gathered, rgb, alpha, depth)
     seen = gathered[0].weight > 0
+    del gathered  # 70 bytes for each pixel
     filled = _fill(camera, pixels, sharper.rgb, alpha, seen, detail.sources)
     return sharper._replace(rgb=filled)
 

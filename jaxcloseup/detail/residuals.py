@@ -11,9 +11,9 @@ from jaxcloseup.detail.add import Detail
 from jaxcloseup.detail.features import blur_images
 from jaxcloseup.detail.weights import DetailWeights
 from jaxcloseup.fields.contract import Rendering
-from jaxcloseup.fields.padding import render_unpadded
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.geometry.numerics import matmul
+from jaxcloseup.io.memory import empty_for_jax
 from jaxcloseup.labels.rules import label_depth
 from jaxcloseup.metrics.image_metrics import change_colors, fit_colors
 from jaxcloseup.photos.depth_maps import GatherSources, gather_sources
@@ -33,7 +33,7 @@ class Residuals(NamedTuple):
     """What V photographs show beyond a model.
 
     Attributes:
-      shown: int8 `[V, P, 6]`, see `Detail`.
+      shown: int8 `[P, 6]`, see `Detail`.
       cameras: stacked cameras of the depths.
       depths: `[V, H, W]` rendered z-depths, 0 where undefined.
     """
@@ -102,8 +102,9 @@ def render_residuals(
       each: like `map`; may show progress.
     """
     last = len(pyramid.sizes) - 1
-    rows = np.arange(pyramid.values.shape[0]) if chosen is None else np.asarray(chosen)
-    values = np.empty((len(rows), pyramid.values.shape[1], 6), np.int8)
+    rows = np.arange(len(pyramid)) if chosen is None else np.asarray(chosen)
+    extents = np.asarray(pyramid.extents)[rows]
+    values = empty_for_jax((int(extents.prod(-1).sum()), 6), np.int8)
     depth_level = max(rendered, pyramid.level_near(FINER_DEPTHS * cameras.width))
 
     def compare(view: int) -> tuple[list[np.ndarray], jax.Array]:
@@ -113,7 +114,7 @@ def render_residuals(
             camera = pyramid.camera(camera_at(cameras, view), view, level)
             photograph = pyramid.image(view, level)
             if level >= rendered:
-                rendering = render_unpadded(render, camera, pyramid.size_of(view, level))
+                rendering = render(camera)
                 rgb, shown_by = rendering.rgb, camera
             else:
                 assert enlarge is not None, "levels that are not rendered need `enlarge`"
@@ -126,17 +127,26 @@ def render_residuals(
             levels.append(np.asarray(_subtract(photograph, rgb, colors)).reshape(-1, 6))
         return levels, depth
 
-    depths = []
-    for row, (levels, depth) in zip(values, each(compare, rows.tolist()), strict=True):
-        row[:] = np.concatenate(levels[::-1])
+    depths, images = [], iter(np.split(values, extents.prod(-1).cumsum()[:-1]))
+    for levels, depth in each(compare, rows.tolist()):
+        for image in levels[::-1]:
+            next(images)[:] = image
         depths.append(depth)
-    shown = Pyramid(jnp.asarray(values), pyramid.intrinsics[rows], pyramid.sizes)
-    cameras = shown.camera(jax.tree.map(lambda leaf: leaf[rows], cameras), slice(None), depth_level)
-    return Residuals(shown, cameras, jnp.stack(depths))
+    shown = Pyramid(jax.device_put(values), pyramid.intrinsics[rows], jnp.asarray(extents))
+    cameras = pyramid.cameras(jax.tree.map(lambda leaf: leaf[rows], cameras), depth_level)
+    return Residuals(shown, cameras, _stack(depths, pyramid.sizes[depth_level]))
+
+
+def _stack(images: Sequence[Any], size: tuple[int, int]) -> jax.Array:
+    """Stack images of at most height and width `size`; padding is 0."""
+    stack = np.zeros((len(images), *size), np.float32)
+    for padded, image in zip(stack, images, strict=True):
+        padded[: image.shape[0], : image.shape[1]] = image
+    return jnp.asarray(stack)
 
 
 def reproduced(shown: Pyramid, *, blur: Callable[[Any, float], Any] = blur_images) -> jax.Array:
-    """Return how far the model reproduces each photograph, `[V, H, W]` in [0, 1].
+    """Return how far the model reproduces each photograph, `[V, H, W]` in [0, 1]; 0 in padding.
 
     Where it fails at the size that it learned from, its depth is not to be trusted either: a
     floater in front of one camera would otherwise spoil every view that it appears in.
@@ -145,11 +155,13 @@ def reproduced(shown: Pyramid, *, blur: Callable[[Any, float], Any] = blur_image
       shown: residuals of V photographs.
       blur: `(images[V, H, W], deviation) -> [V, H, W]`, a Gaussian blur.
     """
-    coarsest = shown.level(len(shown.sizes) - 1)[..., :3]
-    error = np.abs(np.asarray(coarsest, np.float32)).mean(-1)
-    error = np.asarray(blur(error, _BLUR))
-    typical = max(float(np.median(error)), 1e-6)
-    return jnp.asarray(1 / (1 + (error / (MISFIT * typical)) ** 4) ** 2, jnp.float32)
+    last, errors = len(shown.sizes) - 1, []
+    for view in range(len(shown)):
+        residual = np.asarray(shown.image(view, last)[..., :3], np.float32)
+        errors.append(np.asarray(blur(np.abs(residual).mean(-1)[None], _BLUR))[0])
+    typical = max(float(np.median(np.concatenate([error.ravel() for error in errors]))), 1e-6)
+    trust = [1 / (1 + (error / (MISFIT * typical)) ** 4) ** 2 for error in errors]
+    return _stack(trust, shown.sizes[last])
 
 
 @jax.jit

@@ -33,7 +33,7 @@ from jaxcloseup.drawn_scenes.threaded_map import map_in_threads
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.io.cache import Stored, cache_path, cached, hash_files
 from jaxcloseup.photos.scene import Scene, Surface
-from jaxcloseup.photos.views import Views, camera_at
+from jaxcloseup.photos.views import Photograph, Views, camera_at, unpadded
 
 
 DRAWN_SCENES: tuple[str, ...] = tuple(SCENES)
@@ -70,9 +70,8 @@ def draw_scene(name: str, *, downscale: int = 1) -> Scene:
     def surface(camera: Camera) -> Surface:
         return _render_surface(_world(name), camera)
 
-    def photographs_at(factor: int, split: str = "train") -> tuple[Views, list[tuple[int, int]]]:
-        finer = draw_scene(name, downscale=factor)
-        return getattr(finer, split), finer.sizes(split)
+    def photographs_at(factor: int, split: str = "train") -> list[Photograph]:
+        return unpadded(getattr(draw_scene(name, downscale=factor), split))
 
     return Scene(
         name=name,

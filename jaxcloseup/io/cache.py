@@ -5,16 +5,15 @@ entry, `about.json`. The hash finds damage that the checksums inside of the arch
 """
 
 import hashlib
-import io
 import json
 import pathlib
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, BinaryIO, NamedTuple, TypeVar
 
 import numpy as np
 
-from jaxcloseup.io.files import cache_folder, read_bytes, write_file
+from jaxcloseup.io.files import cache_folder, check_file, writing
 
 
 LARGEST = 2**32  # bytes of a file, also unpacked
@@ -76,18 +75,21 @@ def save(path: str | pathlib.Path, key: str, stored: Stored, *, level: int = 0) 
     Raises:
       OSError: one sentence that names the path and the reason.
     """
-    file = io.BytesIO()
     method = zipfile.ZIP_DEFLATED if level else zipfile.ZIP_STORED
-    with zipfile.ZipFile(file, "w", method, compresslevel=level or None) as archive:
-        # Unlike `writestr`, `open` writes no time, so equal values make equal files.
-        with archive.open(_ABOUT, "w") as entry:
-            entry.write(json.dumps({"key": key, "record": stored.record}).encode())
-        for name, array in stored.arrays.items():
-            # The size is unknown before writing, and may exceed what a plain zip entry can hold.
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
-                np.lib.format.write_array(entry, np.asarray(array), allow_pickle=False)
-    content = file.getbuffer()
-    write_file(path, b"".join([hashlib.sha256(content).digest(), content]))
+    with writing(path) as file:
+        file.write(bytes(_DIGEST))
+        with zipfile.ZipFile(file, "w", method, compresslevel=level or None) as archive:
+            # Unlike `writestr`, `open` writes no time, so equal values make equal files.
+            with archive.open(_ABOUT, "w") as entry:
+                entry.write(json.dumps({"key": key, "record": stored.record}).encode())
+            for name, array in stored.arrays.items():
+                # The size is unknown before, and may exceed what a plain zip entry can hold.
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                    np.lib.format.write_array(entry, np.asarray(array), allow_pickle=False)
+        file.seek(_DIGEST)
+        digest = hashlib.file_digest(file, "sha256").digest()
+        file.seek(0)
+        file.write(digest)
 
 
 def load(path: str | pathlib.Path, key: str, *, most: int = LARGEST) -> Stored | None:
@@ -97,13 +99,19 @@ def load(path: str | pathlib.Path, key: str, *, most: int = LARGEST) -> Stored |
       Exception: the file is damaged, foreign, or has more than `most` bytes.
     """
     try:
-        data = read_bytes(path, most=most)
+        check_file(path, most=most)
     except (FileNotFoundError, NotADirectoryError):
         return None
-    if hashlib.sha256(memoryview(data)[_DIGEST:]).digest() != data[:_DIGEST]:
-        raise ValueError("the hash of the file is another one")
-    # An archive may stand behind other bytes, so the file is not copied without the hash.
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+    with open(path, "rb") as file:
+        digest = file.read(_DIGEST)
+        if hashlib.file_digest(file, "sha256").digest() != digest:
+            raise ValueError("the hash of the file is another one")
+        return _read_archive(file, key, most)
+
+
+def _read_archive(file: BinaryIO, key: str, most: int) -> Stored | None:
+    # An archive may stand behind other bytes.
+    with zipfile.ZipFile(file) as archive:
         if sum(entry.file_size for entry in archive.infolist()) > most:
             raise ValueError(f"unpacked, the file has more than {most} bytes")
         about = json.loads(archive.read(_ABOUT))

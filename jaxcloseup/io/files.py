@@ -4,13 +4,15 @@ Files and strict JSON are written atomically. Files of others are read only if t
 ones of a stated size: a pipe or a device may never end, and a sparse file may claim terabytes.
 """
 
+import contextlib
 import errno
+import io
 import json
 import math
 import os
 import pathlib
 import stat
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 
@@ -71,12 +73,23 @@ def write_file(path: str | pathlib.Path, data: bytes) -> None:
     Raises:
       OSError: one sentence that names the path and the reason.
     """
+    with writing(path) as file:
+        file.write(data)
+
+
+@contextlib.contextmanager
+def writing(path: str | pathlib.Path) -> Iterator[io.BufferedRandom]:
+    """Yield an open file, which may be read and sought too, that becomes `path` in the end.
+
+    As `write_file`, for what should not be in memory as a whole.
+    """
     path = pathlib.Path(path)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            part.write_bytes(data)
+            with part.open("w+b") as file:
+                yield file
             part.replace(path)
         finally:
             part.unlink(missing_ok=True)

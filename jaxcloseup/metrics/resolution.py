@@ -6,6 +6,8 @@ correlation, noise and blur do not raise it, and where it falls below a half, wh
 is no longer mostly what is there.
 """
 
+import functools
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -48,7 +50,25 @@ def ring_correlation(
             f"ring correlation needs {SMALLEST} pixels a side: the image is {height, width}."
         )
     window = jnp.asarray(np.outer(np.hanning(height), np.hanning(width)), image.dtype)
-    window = window if weight is None else window * weight
+    weight = jnp.ones_like(window) if weight is None else weight
+    rings, which, times = _rings(height, width)
+    found = _correlate(image, truth, window, weight, which, times, rings=rings)
+    return jnp.interp(frequencies(), frequencies(rings), found)
+
+
+@functools.partial(jax.jit, static_argnames="rings")
+def _correlate(
+    image: jax.Array,
+    truth: jax.Array,
+    window: jax.Array,
+    weight: jax.Array,
+    which: jax.Array,
+    times: jax.Array,
+    *,
+    rings: int,
+) -> jax.Array:
+    """Correlate over rings; what is as large as the image is an argument, not kept in a program."""
+    window = window * weight
     luma = jnp.asarray(_LUMA, image.dtype)
 
     def spectrum(colors: jax.Array) -> jax.Array:
@@ -56,16 +76,13 @@ def ring_correlation(
         mean = safe_divide(jnp.sum(window * gray), jnp.sum(window))
         return jnp.fft.rfft2((gray - mean) * window)
 
-    rings, which, times = _rings(height, width)
-
     def over_rings(values: jax.Array) -> jax.Array:
         return jax.ops.segment_sum((values * times).reshape(-1), which, num_segments=rings)
 
     ours, theirs = spectrum(image), spectrum(truth)
     power = over_rings(jnp.abs(ours) ** 2), over_rings(jnp.abs(theirs) ** 2)
     both = over_rings((ours * jnp.conj(theirs)).real)
-    found = safe_divide(both, jnp.sqrt(power[0]) * jnp.sqrt(power[1]))
-    return jnp.interp(frequencies(), frequencies(rings), found)
+    return safe_divide(both, jnp.sqrt(power[0]) * jnp.sqrt(power[1]))
 
 
 def _rings(height: int, width: int) -> tuple[int, np.ndarray, np.ndarray]:

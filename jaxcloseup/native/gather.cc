@@ -50,10 +50,11 @@ Photograph describe(const float* pose, const float* intrinsics, const float* of_
   return to;
 }
 
-LevelPair pair_levels(const float* of_levels, const int64_t* sizes, const std::vector<int32_t>& starts, int level) {
+// `sizes` are (height, width) of a photograph's levels, and `starts` their first pixels.
+LevelPair pair_levels(const float* of_levels, const int32_t* sizes, const int32_t* starts, int levels, int level) {
   LevelPair pair;
   for (int i = 0; i < 2; i++) {
-    const int own = std::min<int>(level + i, starts.size() - 1);
+    const int own = std::min(level + i, levels - 1);
     for (int axis = 0; axis < 2; axis++) {
       pair.focal[2 * i + axis] = of_levels[4 * own + axis];
       pair.center[2 * i + axis] = of_levels[4 * own + 2 + axis];
@@ -165,29 +166,31 @@ void write_block(const Job& job, const Scratch& scratch, bool gathered, const Fi
 
 // Checks the shapes that memory accesses rely on, and describes the photographs.
 ffi::Error prepare(ffi::ThreadPool& pool, Floats& poses, Floats& intrinsics, Floats& maps,
-                   ffi::AnyBuffer& values, Floats& of_levels, ffi::Span<const int64_t>& sizes,
+                   ffi::AnyBuffer& values, Floats& of_levels, Integers& sizes,
                    ffi::Span<const float>& settings, int finest, Job& job, std::vector<Photograph>& photographs,
                    std::vector<LevelPair>& pairs) {
   const auto map = maps.dimensions(), shape = values.dimensions();
-  if (map.size() != 4 || map[3] != 2 || shape.size() != 3)
-    return ffi::Error::InvalidArgument("maps must be [V, H + 2, W + 2, 2] and values [V, P, C]");
-  const int64_t count = map[0], levels = sizes.size() / 2, parts = settings.size() / 4;
+  const auto extents = sizes.dimensions();
+  if (map.size() != 4 || map[3] != 2 || shape.size() != 2 || extents.size() != 3 || extents[2] != 2)
+    return ffi::Error::InvalidArgument("maps must be [V, H + 2, W + 2, 2], values [P, C] and sizes [V, L, 2]");
+  const int64_t count = map[0], levels = extents[1], parts = settings.size() / 4;
   const bool fit = count <= INT32_MAX && map[1] > 2 && map[2] > 2 && map[1] < 32768 && map[2] < 32768;
-  if (!fit || shape[0] != count || poses.element_count() != size_t(12 * count) || intrinsics.element_count() != size_t(4 * count) ||
+  if (!fit || extents[0] != count || poses.element_count() != size_t(12 * count) || intrinsics.element_count() != size_t(4 * count) ||
       of_levels.element_count() != size_t(4 * count * levels))
     return ffi::Error::InvalidArgument("photographs have different numbers, or maps a wrong size");
-  if (levels < 1 || levels > MOST_LEVELS || parts < 1 || parts > MOST_PARTS || shape[2] > MOST_CHANNELS ||
-      shape[2] < parts || shape[2] % parts)
+  if (levels < 1 || levels > MOST_LEVELS || parts < 1 || parts > MOST_PARTS || shape[1] > MOST_CHANNELS ||
+      shape[1] < parts || shape[1] % parts)
     return ffi::Error::InvalidArgument("too many levels, parts or channels, or too few");
   std::vector<int32_t> starts;
   int64_t pixels = 0;
-  for (int64_t level = 0; level < levels; level++) {
+  for (int64_t i = 0; i < count * levels; i++) {
+    const int64_t height = sizes.typed_data()[2 * i], width = sizes.typed_data()[2 * i + 1];
     starts.push_back(static_cast<int32_t>(pixels));
-    if (sizes[2 * level] < 1 || sizes[2 * level + 1] < 1) return ffi::Error::InvalidArgument("a level is empty");
-    pixels += sizes[2 * level] * sizes[2 * level + 1];
-    if (pixels > INT32_MAX) return ffi::Error::InvalidArgument("a photograph is too large");
+    if (height < 1 || width < 1) return ffi::Error::InvalidArgument("a level is empty");
+    pixels += height * width;
+    if (pixels > INT32_MAX) return ffi::Error::InvalidArgument("photographs are too large");
   }
-  if (pixels != shape[1]) return ffi::Error::InvalidArgument("levels have another number of pixels");
+  if (pixels != shape[0]) return ffi::Error::InvalidArgument("levels have another number of pixels");
   switch (values.element_type()) {
     case ffi::S8: job.kind = Kind::INT8; break;
     case ffi::U8: job.kind = Kind::UINT8; break;
@@ -201,7 +204,7 @@ ffi::Error prepare(ffi::ThreadPool& pool, Floats& poses, Floats& intrinsics, Flo
   job.finest = std::clamp(finest, 0, job.levels - 1);
   job.values = values.untyped_data();
   job.pixels = pixels;
-  job.channels = static_cast<int>(shape[2]);
+  job.channels = static_cast<int>(shape[1]);
   job.parts = static_cast<int>(parts);
   std::memcpy(job.settings, settings.begin(), settings.size() * sizeof(float));
   photographs.resize(count);
@@ -210,7 +213,8 @@ ffi::Error prepare(ffi::ThreadPool& pool, Floats& poses, Floats& intrinsics, Flo
     const float* own = of_levels.typed_data() + 4 * levels * i;
     photographs[i] = describe(poses.typed_data() + 12 * i, intrinsics.typed_data() + 4 * i, own, job);
     for (int level = 0; level < job.levels; level++)
-      pairs[i * levels + level] = pair_levels(own, sizes.begin(), starts, level);
+      pairs[i * levels + level] =
+          pair_levels(own, sizes.typed_data() + 2 * levels * i, starts.data() + levels * i, job.levels, level);
   });
   job.photograph = photographs.data();
   job.pairs = pairs.data();
@@ -220,7 +224,7 @@ ffi::Error prepare(ffi::ThreadPool& pool, Floats& poses, Floats& intrinsics, Flo
 
 ffi::Error gather(ffi::ThreadPool pool, Floats pose, Floats intrinsics, Floats pixels, Floats depth, Floats poses,
                   Floats of_maps, Floats maps, ffi::AnyBuffer values, Floats of_levels,
-                  Integers finest, Integers exclude, ffi::RemainingRets results, ffi::Span<const int64_t> sizes,
+                  Integers sizes, Integers finest, Integers exclude, ffi::RemainingRets results,
                   ffi::Span<const float> settings) {
   Job job;
   std::vector<Photograph> photographs;
@@ -278,8 +282,8 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(gather, jaxcloseup::gather,
                                   .Arg<jaxcloseup::Floats>()
                                   .Arg<jaxcloseup::Integers>()
                                   .Arg<jaxcloseup::Integers>()
+                                  .Arg<jaxcloseup::Integers>()
                                   .RemainingRets()
-                                  .Attr<xla::ffi::Span<const int64_t>>("sizes")
                                   .Attr<xla::ffi::Span<const float>>("settings"));
 
 #pragma GCC visibility pop

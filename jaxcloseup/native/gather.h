@@ -30,7 +30,7 @@ struct Settings {
 // Two neighboring levels of a pyramid, the finer one first: (x, y) of each.
 struct LevelPair {
   float focal[4], center[4], most[4];  // `most` is the last pixel
-  int32_t start[2], width[2];
+  int32_t start[2], width[2];  // in pixels of all photographs
 };
 
 struct Photograph {
@@ -50,8 +50,8 @@ struct Job {
   int levels, finest;
   const LevelPair* pairs;  // [photographs, levels]
   Kind kind;
-  const void* values;  // [photographs, pixels, channels]
-  int64_t pixels;
+  const void* values;  // [pixels, channels]
+  int64_t pixels;      // of all photographs
   int channels, parts;
   Settings settings[MOST_PARTS];
 

@@ -175,7 +175,7 @@ inline Channels add_product(Channels a, Channels b, Channels c) {
 #endif
 }
 
-// A photograph's values, and where reading must end: vectors may reach beyond a pixel.
+// Values, and where reading must end: vectors may reach beyond a pixel.
 template <typename T>
 struct Values {
   const T *first, *end;
@@ -308,14 +308,12 @@ inline void weigh_again(const Job& job, const Group& group, const Workspace& wor
 
 // Reads what a photograph shows and adds it by its weights; `again` for robust parts alone.
 template <typename T, int VECTORS>
-void add_photograph(const Job& job, const Points& points, Workspace& work, const Group& group, const Values<T>& all,
+void add_photograph(const Job& job, const Points& points, Workspace& work, const Group& group, const Values<T>& values,
                     const Taps& taps, bool again) {
   constexpr int MOST = VECTORS ? VECTORS : MOST_CHANNELS / LANES;
   const int vectors = VECTORS ? VECTORS : job.vectors(), each = job.part_channels(), parts = job.parts;
   float *sums = again ? work.robust : work.values, *squares = work.squares;
   const Record& record = *taps.record;
-  Values<T> values = all;
-  values.first += record.photograph * job.pixels * job.channels;
   Channels lanes[MOST_PARTS][MOST];  // 1 in the channels of a part
   for (int k = 0; k < parts; k++)
     for (int c = 0; c < vectors * LANES; c++) lanes[k][c / LANES][c % LANES] = group.own[k] && c / each == k;
@@ -352,8 +350,7 @@ void add_photograph(const Job& job, const Points& points, Workspace& work, const
 template <typename T, int VECTORS>
 void add_values(const Job& job, const Points& points, Workspace& work, int records, bool again) {
   const T* first = static_cast<const T*>(job.values);
-  const int64_t size = job.pixels * job.channels;
-  const Values<T> values = {first, first + job.photographs * size, job.channels};
+  const Values<T> values = {first, first + job.pixels * job.channels, job.channels};
   for (int head = 0; head < job.parts; head++) {
     // Parts that are read alike are read together, with the first of them.
     Group group;
@@ -374,7 +371,7 @@ void add_values(const Job& job, const Points& points, Workspace& work, int recor
       bool next = false;
       if (i < records) {
         const Record& record = work.records[i];
-        const char* from = reinterpret_cast<const char*>(first + record.photograph * size);
+        const char* from = reinterpret_cast<const char*>(first);
         next = find_taps(job, points, work, group, record, job.channels * sizeof(T), from, taps[1 - now]);
         if (!next) continue;
       }

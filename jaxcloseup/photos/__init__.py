@@ -6,7 +6,7 @@ from jaxcloseup.lazy import lazy_names
 __all__, __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "views": "Views Batch to_float camera_at sample_pixels sample_image",
+        "views": "Views Photograph Batch unpadded to_float camera_at sample_pixels sample_image",
         "scene": (
             "SceneError SceneWarning UnknownKeyWarning ImageSizeWarning NearFarWarning "
             "DuplicateFileWarning PointsWarning Surface Scene keep_photographs"

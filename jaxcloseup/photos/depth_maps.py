@@ -54,8 +54,12 @@ class GatherSources:
 
 def join_maps(cameras: Camera, inverse_depth: jax.Array, trust: jax.Array) -> GatherSources:
     """Return depth maps `[V, H, W]` of stacked cameras, with their trust, for `gather`."""
+    return GatherSources(cameras, jax.vmap(_join)(inverse_depth, trust))
+
+
+def _join(inverse_depth: jax.Array, trust: jax.Array) -> jax.Array:
     maps = jnp.stack([inverse_depth, trust], axis=-1)
-    return GatherSources(cameras, jnp.pad(maps, ((0, 0), (1, 1), (1, 1), (0, 0)), mode="edge"))
+    return jnp.pad(maps, ((1, 1), (1, 1), (0, 0)), mode="edge")
 
 
 @struct.dataclass
@@ -101,21 +105,27 @@ def gather_sources(
         trust.
     """
     chex.assert_equal_shape([depths, weight])
-    inverse = safe_divide(jnp.ones_like(depths), depths)
-    bend = jnp.zeros_like(inverse)
-    for axis in (1, 2):
-        size = inverse.shape[axis]
-        if size > 2:
-            before, here, after = (
-                jax.lax.slice_in_dim(inverse, start, start + size - 2, axis=axis)
-                for start in (0, 1, 2)
-            )
-            inner = tuple(slice(1, -1) if i == axis else slice(None) for i in range(3))
-            bend = bend.at[inner].max(jnp.abs(before + after - 2 * here))
-    trust = weight / (1 + (safe_divide(bend, inverse) / edge) ** 2) ** 2
-    trust = jnp.where(depths > 0, trust, 0)
-    trust = jax.lax.reduce_window(trust, jnp.inf, jax.lax.min, (1, 3, 3), (1, 1, 1), "SAME")
-    return join_maps(cameras, inverse, trust)
+
+    def prepare(of_view: tuple[jax.Array, jax.Array]) -> jax.Array:
+        depth, weight = of_view
+        inverse = safe_divide(jnp.ones_like(depth), depth)
+        bend = jnp.zeros_like(inverse)
+        for axis in (0, 1):
+            size = inverse.shape[axis]
+            if size > 2:
+                before, here, after = (
+                    jax.lax.slice_in_dim(inverse, start, start + size - 2, axis=axis)
+                    for start in (0, 1, 2)
+                )
+                inner = tuple(slice(1, -1) if i == axis else slice(None) for i in range(2))
+                bend = bend.at[inner].max(jnp.abs(before + after - 2 * here))
+        trust = weight / (1 + (safe_divide(bend, inverse) / edge) ** 2) ** 2
+        trust = jnp.where(depth > 0, trust, 0)
+        trust = jax.lax.reduce_window(trust, jnp.inf, jax.lax.min, (3, 3), (1, 1), "SAME")
+        return _join(inverse, trust)
+
+    # One after the other: what comes between takes several times as much memory as the result.
+    return GatherSources(cameras, jax.lax.map(prepare, (depths, weight)))
 
 
 def prepare_depth_maps(cameras: Camera, depths: jax.Array, weight: jax.Array) -> DepthMaps:

@@ -37,13 +37,13 @@ def can_gather(
         library.available()
         and all(array.dtype == jnp.float32 for array in floats)
         and values.dtype in (jnp.int8, jnp.uint8, jnp.float32)
-        and values.shape[0] == maps.shape[0] > 0
+        and len(pyramid) == maps.shape[0] > 0
         and min(maps.shape[1:3]) > 2
         and max(maps.shape[1:3]) < _MOST_SIDE
-        and 0 < values.shape[1] < 2**31
-        and parts <= min(_MOST_PARTS, values.shape[2])
-        and values.shape[2] <= _MOST_CHANNELS
-        and len(pyramid.sizes) <= _MOST_LEVELS
+        and 0 < values.shape[0] < 2**31
+        and parts <= min(_MOST_PARTS, values.shape[1])
+        and values.shape[1] <= _MOST_CHANNELS
+        and pyramid.extents.shape[1] <= _MOST_LEVELS
         and maps.shape[1:3] == (sources.cameras.height + 2, sources.cameras.width + 2)
     )
 
@@ -79,8 +79,7 @@ def gather_image(
     results = function(
         *(camera.camtoworld, camera.intrinsics, pixels, depth),
         *(sources.cameras.camtoworld, sources.cameras.intrinsics),
-        *(sources.maps, pyramid.values, pyramid.intrinsics, finest, exclude),
-        sizes=np.asarray(pyramid.sizes, np.int64).reshape(-1),
+        *(sources.maps, pyramid.values, pyramid.intrinsics, pyramid.extents, finest, exclude),
         settings=np.asarray(settings, np.float32).reshape(-1),
     )
     fields = len(Gathered._fields)

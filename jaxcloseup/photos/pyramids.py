@@ -10,8 +10,9 @@ import numpy as np
 from flax import struct
 
 from jaxcloseup.geometry.cameras import Camera, mean_focal
+from jaxcloseup.io.memory import empty_for_jax
 from jaxcloseup.photos.scene import Scene
-from jaxcloseup.photos.views import Views, to_float
+from jaxcloseup.photos.views import Photograph, Views, to_float, unpadded
 
 
 BUDGET = 5 * 2**28  # bytes that the photographs of a scene may take
@@ -22,66 +23,62 @@ _BYTES_PER_PIXEL = 4 * 4 / 3  # colors and weight of the finest level, and of al
 class Pyramid:
     """Images of V views at L sizes, from the finest level to the coarsest; P pixels in all.
 
+    Views may differ in size, and none is padded.
+
     Attributes:
-      values: `[V, P, C]` the levels one after the other, each row by row: uint8 (255 means 1),
-        int8 (127 means 1) or float.
+      values: `[P, C]` the views one after the other, of each the levels one after the other, row by
+        row: uint8 (255 means 1), int8 (127 means 1) or float.
       intrinsics: `[V, L, 4]` fx, fy, cx, cy of each level, in its own pixels.
-      sizes: (height, width) of each level, static.
-      extents: `[V, L, 2]` int32 height and width of each image without its padding at the right and
-        the bottom; None: no image is padded.
+      extents: `[V, L, 2]` int32 height and width of each image.
     """
 
     values: jax.Array
     intrinsics: jax.Array
-    sizes: tuple[tuple[int, int], ...] = struct.field(pytree_node=False)
-    extents: jax.Array | None = None
+    extents: jax.Array
+
+    def __len__(self) -> int:
+        """Return the number of views."""
+        return self.extents.shape[0]
+
+    @property
+    def sizes(self) -> tuple[tuple[int, int], ...]:
+        """Return the largest height and width of each level."""
+        return tuple((height, width) for height, width in np.asarray(self.extents).max(0).tolist())
+
+    @property
+    def starts(self) -> jax.Array:
+        """Return the index of each image's first pixel, among the P, int32 `[V, L]`."""
+        counts = self.extents.prod(-1)
+        ends = counts.reshape(-1).cumsum(dtype=jnp.int32)
+        return ends.reshape(counts.shape) - counts
 
     def coarseness(self, view: int | jax.Array) -> jax.Array:
         """Return log2 of how much larger each level's pixels are than the finest ones, `[L]`."""
         focal = mean_focal(self.intrinsics[view])
         return jnp.log2(focal[0] / focal)
 
-    @property
-    def starts(self) -> tuple[int, ...]:
-        """Return the index of each level's first pixel, among the P."""
-        counts = [height * width for height, width in self.sizes]
-        return tuple(itertools.accumulate(counts[:-1], initial=0))
-
-    def pixels_of(self, index: int) -> slice:
-        """Return the pixels of one level, among the P."""
-        start, (height, width) = self.starts[index], self.sizes[index]
-        return slice(start, start + height * width)
-
     def level_near(self, width: float) -> int:
         """Return the finest level that is not 1.5 times as wide as `width`; there must be one."""
         return [finer < 1.5 * width for _, finer in self.sizes].index(True)
 
-    def level(self, index: int) -> jax.Array:
-        """Return the images `[V, H, W, C]` of one level."""
-        flat = self.values[:, self.pixels_of(index)]
-        return flat.reshape(flat.shape[0], *self.sizes[index], flat.shape[-1])
-
     def image(self, view: int, index: int) -> jax.Array:
         """Return the image `[H, W, C]` of one view at one level."""
-        flat = self.values[view, self.pixels_of(index)]
-        return flat.reshape(*self.sizes[index], flat.shape[-1])
+        height, width = np.asarray(self.extents)[view, index].tolist()
+        start = np.asarray(self.starts)[view, index]
+        # One program serves all images of a size.
+        flat = jax.lax.dynamic_slice_in_dim(self.values, start, height * width)
+        return flat.reshape(height, width, flat.shape[-1])
 
-    def size_of(self, view: int, index: int) -> tuple[int, int]:
-        """Return width and height of one view's image at one level, without its padding."""
-        extent = (
-            self.sizes[index] if self.extents is None else np.asarray(self.extents)[view, index]
-        )
-        height, width = map(int, extent)
-        return width, height
-
-    def camera(self, camera: Camera, view: int | slice, index: int) -> Camera:
-        """Return the camera of one view's image at one level, given any camera with its pose.
-
-        Also stacked cameras of several views.
-        """
-        height, width = self.sizes[index]
+    def camera(self, camera: Camera, view: int, index: int) -> Camera:
+        """Return the camera of one view's image at one level, given any camera with its pose."""
+        height, width = np.asarray(self.extents)[view, index].tolist()
         intrinsics = self.intrinsics[view, index]
         return camera.replace(intrinsics=intrinsics, height=height, width=width)
+
+    def cameras(self, cameras: Camera, index: int) -> Camera:
+        """Return the stacked cameras of all views at one level, as large as the largest image."""
+        height, width = self.sizes[index]
+        return cameras.replace(intrinsics=self.intrinsics[:, index], height=height, width=width)
 
 
 def scene_pyramid(scene: Scene, *, finest: int = 1, budget: int = BUDGET) -> tuple[Pyramid, int]:
@@ -95,85 +92,76 @@ def scene_pyramid(scene: Scene, *, finest: int = 1, budget: int = BUDGET) -> tup
     Returns:
       The pyramid, as `photograph_pyramid`, and the divisor of its finest level.
     """
-    train, coarse = scene.train, scene.metadata.get("downscale", 1)
-    pixels = train.weight.size * coarse**2
+    sizes, coarse = scene.sizes("train"), scene.metadata.get("downscale", 1)
+    train = unpadded(scene.train, sizes)
+    pixels = sum(width * height for width, height in sizes) * coarse**2
     factor = max(finest, math.ceil(math.sqrt(pixels * _BYTES_PER_PIXEL / budget)))
-    own = scene.sizes("train")
     if scene.photographs_at is None or factor >= coarse:
-        return photograph_pyramid(train, extents=[own]), coarse
-    finer, sizes = scene.photographs_at(factor)
-    return photograph_pyramid(finer, train, extents=[sizes, own]), factor
+        return photograph_pyramid(train), coarse
+    return photograph_pyramid(scene.photographs_at(factor), train), factor
 
 
 def photograph_pyramid(
-    views: Views,
-    coarsest: Views | None = None,
+    photographs: Views | Sequence[Photograph],
+    coarsest: Views | Sequence[Photograph] | None = None,
     *,
     least: tuple[int, int] | None = None,
-    extents: Sequence[Sequence[tuple[int, int]]] = (),
 ) -> Pyramid:
     """Make a pyramid of photographs, halves of them, and the photographs as training reads them.
 
-    The values are `[V, P, 4]` uint8, colors and weight. A half averages 2 x 2 pixels by their
-    weights; a last odd row or column is dropped, so that the intrinsics halve exactly. Pixels
-    without weight are black.
+    The values are uint8, colors and weight. A half averages 2 x 2 pixels by their weights; a last
+    odd row or column is dropped, so that the intrinsics halve exactly. Pixels without weight are
+    black.
 
     Args:
-      views: photographs at the finest size.
+      photographs: photographs at the finest size.
       coarsest: the last level, after halves that are at least 1.5 times as wide.
       least: without `coarsest`, smallest height and width of a half; None makes only one level.
-      extents: width and height of each photograph without padding, at the finest size and, with
-        `coarsest`, at that; by default none is padded.
     """
-    height, width = views.rgb.shape[1:3]
-    sizes = [(height, width)]
-    smallest: tuple[float, float] | None = least
-    if coarsest is not None:
-        smallest = 1, 1.5 * coarsest.cameras.width
-    while smallest is not None and all(np.floor_divide(sizes[-1], 2) >= smallest):
-        sizes.append((sizes[-1][0] // 2, sizes[-1][1] // 2))
-    if coarsest is not None:
-        sizes.append((coarsest.cameras.height, coarsest.cameras.width))
-    images, weight = _bytes(views), np.asarray(views.weight)
-    values = np.empty((len(images), sum(h * w for h, w in sizes), 4), np.uint8)
-    halves = sizes if coarsest is None else sizes[:-1]
-    for row, image, shares in zip(values, images, weight, strict=True):
-        level = image.astype(np.float32), shares.astype(np.float32)
-        start = 0
-        for height, width in halves:
-            if level[1].shape != (height, width):
-                level = _halve(*level)
-            row[start : start + height * width] = _pixels(*level)
-            start += height * width
+    finest, last = map(_listed, (photographs, coarsest or ()))
+    halves = [np.array([image.weight.shape for image in finest], np.int32)]
+    ends = np.array([image.weight.shape for image in last], np.int32).reshape(-1, 2)
+    smallest = (1, 1.5 * ends[:, 1].max()) if len(last) else least
+    while smallest is not None and _holds(halves[-1] // 2, smallest):
+        halves.append(halves[-1] // 2)
+    extents = np.stack([*halves, *([ends] if len(last) else [])], axis=1)
+    values = empty_for_jax((int(extents.prod(-1).sum()), 4), np.uint8)
+    images = iter(np.split(values, extents.prod(-1).cumsum()[:-1]))
+    for i, photograph in enumerate(finest):
+        level = _as_floats(photograph)
+        for j in range(len(halves)):
+            level = _halve(*level) if j else level
+            next(images)[:] = _pixels(*level)
+        if last:
+            next(images)[:] = _pixels(*_as_floats(last[i]))
     powers = 2.0 ** -np.arange(len(halves), dtype=np.float32)
-    intrinsics = np.asarray(views.cameras.intrinsics)[:, None] * powers[:, None]
-    if coarsest is not None:
-        last = zip(_bytes(coarsest), np.asarray(coarsest.weight), strict=True)
-        values[:, start:] = [_pixels(*level) for level in last]
-        given = np.asarray(coarsest.cameras.intrinsics)[:, None]
-        intrinsics = np.concatenate([intrinsics, given], axis=1)
-    unpadded = _extents(extents, sizes, len(halves))
-    return Pyramid(jnp.asarray(values), jnp.asarray(intrinsics), tuple(sizes), unpadded)
+    intrinsics = _intrinsics(finest)[:, None] * powers[:, None]
+    if last:
+        intrinsics = np.concatenate([intrinsics, _intrinsics(last)[:, None]], axis=1)
+    return Pyramid(jax.device_put(values), jnp.asarray(intrinsics), jnp.asarray(extents))
 
 
-def _extents(
-    given: Sequence[Sequence[tuple[int, int]]], sizes: Sequence[tuple[int, int]], halves: int
-) -> jax.Array | None:
-    """Return `Pyramid.extents`, of which `given` has the finest level and the coarsest."""
-    if not given:
-        return None
-    finest = np.asarray(given[0], np.int32)[:, ::-1]
-    levels = [finest // 2**level for level in range(halves)]
-    levels += [np.asarray(given[-1], np.int32)[:, ::-1]] * (len(sizes) - halves)
-    found = np.maximum(np.stack(levels, axis=1), 1)
-    return None if (found == np.asarray(sizes)).all() else jnp.asarray(found)
+def _holds(sizes: np.ndarray, smallest: tuple[float, float]) -> bool:
+    """Return whether no image is empty, and the largest height and width reach the smallest."""
+    return bool(sizes.min() > 0 and (sizes.max(0) >= smallest).all())
 
 
-def _bytes(views: Views) -> np.ndarray:
-    images = np.asarray(views.rgb)
-    if images.dtype != np.uint8:
-        images = np.rint(np.clip(images, 0, 1) * 255).astype(np.uint8)
-    return images
+def _listed(photographs: Views | Sequence[Photograph]) -> Sequence[Photograph]:
+    return unpadded(photographs) if isinstance(photographs, Views) else photographs
+
+
+def _intrinsics(photographs: Sequence[Photograph]) -> np.ndarray:
+    return np.stack([photograph.camera.intrinsics for photograph in photographs])
+
+
+def _as_floats(photograph: Photograph) -> tuple[np.ndarray, np.ndarray]:
+    """Return colors from 0 to 255, as bytes have them, and weights in [0, 1]."""
+    rgb, weight = np.asarray(photograph.rgb), np.asarray(photograph.weight)
+    if rgb.dtype != np.uint8:
+        rgb = np.rint(np.clip(rgb, 0, 1) * 255)
+    if weight.dtype == np.uint8:
+        weight = weight / np.float32(255)
+    return rgb.astype(np.float32), weight.astype(np.float32)
 
 
 def _pixels(colors: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -222,12 +210,12 @@ def read_pyramid(
       ray: `[N, 2]` x / z and y / z in the view's frame.
       level: `[N]` fractional levels; 0 is the finest.
     """
-    sizes, starts = (jnp.asarray(x, jnp.int32) for x in (pyramid.sizes, pyramid.starts))
+    sizes, starts = pyramid.extents[view], pyramid.starts[view]
     finer = jnp.floor(jax.lax.stop_gradient(level)).astype(jnp.int32)
     share = (level - finer.astype(level.dtype))[:, None]
 
     def read(index: jax.Array) -> jax.Array:
-        index = jnp.minimum(index, len(pyramid.sizes) - 1)
+        index = jnp.minimum(index, len(sizes) - 1)
         height, width = sizes[index, 0], sizes[index, 1]
         intrinsics = pyramid.intrinsics[view][index]
         pixel = ray * intrinsics[:, :2] + intrinsics[:, 2:] - 0.5
@@ -237,7 +225,7 @@ def read_pyramid(
 
         def tap(dx: int, dy: int) -> jax.Array:
             row, column = jnp.clip(y + dy, 0, height - 1), jnp.clip(x + dx, 0, width - 1)
-            return to_float(pyramid.values[view, starts[index] + row * width + column])
+            return to_float(pyramid.values[starts[index] + row * width + column])
 
         top = (1 - wx)[:, None] * tap(0, 0) + wx[:, None] * tap(1, 0)
         bottom = (1 - wx)[:, None] * tap(0, 1) + wx[:, None] * tap(1, 1)

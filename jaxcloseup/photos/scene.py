@@ -11,7 +11,7 @@ import numpy as np
 from jaxcloseup.geometry.cameras import Camera, points_to_pixels
 from jaxcloseup.io.messages import printable
 from jaxcloseup.io.placement import UNMOVED, Placement
-from jaxcloseup.photos.views import Views, camera_at
+from jaxcloseup.photos.views import Photograph, Views, camera_at
 
 
 class SceneError(ValueError):
@@ -90,8 +90,7 @@ class Scene:
         reprojection errors `[P]` in pixels of the photographs' own size, where the files list them.
       surface: renders a `Camera` to its exact `Surface`; None for photographed scenes.
       photographs_at: reads the photographs of a split again at 1 / n of their own size, given n
-        and the split, "train" by default, and returns `Views` and what `sizes` says of these; None
-        where they have no finer size to be read at.
+        and the split, "train" by default; None where they have no finer size to be read at.
       placement: maps this world to that of the capture's files, which programs write and print.
     """
 
@@ -106,7 +105,7 @@ class Scene:
     names: dict[str, list[str]]
     metadata: dict[str, Any] = dataclasses.field(default_factory=dict)
     surface: Callable[[Camera], Surface] | None = None
-    photographs_at: Callable[..., tuple[Views, list[tuple[int, int]]]] | None = None
+    photographs_at: Callable[..., list[Photograph]] | None = None
     placement: Placement = UNMOVED
 
     def sizes(self, split: str) -> list[tuple[int, int]]:
@@ -146,10 +145,10 @@ def keep_photographs(scene: Scene, chosen: Sequence[int]) -> Scene:
     def take(views: Views) -> Views:
         return jax.tree.map(lambda leaf: leaf[rows], views)
 
-    def photographs_at(factor: int, split: str = "train") -> tuple[Views, list[tuple[int, int]]]:
+    def photographs_at(factor: int, split: str = "train") -> list[Photograph]:
         assert scene.photographs_at is not None
-        views, sizes = scene.photographs_at(factor, split)
-        return (take(views), [sizes[i] for i in chosen]) if split == "train" else (views, sizes)
+        found = scene.photographs_at(factor, split)
+        return [found[i] for i in chosen] if split == "train" else found
 
     train = take(scene.train)
     size = np.array([train.cameras.width, train.cameras.height], np.float32)

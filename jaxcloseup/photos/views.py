@@ -1,9 +1,11 @@
 """Photographs with their cameras, and random draws of their pixels for training."""
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from jaxcloseup.geometry.cameras import Camera
@@ -27,6 +29,33 @@ class Views(struct.PyTreeNode):
         return self.rgb.shape[0]
 
 
+class Photograph(NamedTuple):
+    """One photograph at its own size, on the host.
+
+    Attributes:
+      camera: its camera.
+      rgb: `[H, W, 3]`, uint8 or float in [0, 1].
+      weight: `[H, W]`, uint8 (255 means 1) or float in [0, 1]; 0 marks masked pixels.
+    """
+
+    camera: Camera
+    rgb: Any
+    weight: Any
+
+
+def unpadded(views: Views, sizes: Sequence[tuple[int, int]] | None = None) -> list[Photograph]:
+    """Return the photographs of views, given width and height of each; by default none is padded.
+
+    They share the memory of the views where that is the host's.
+    """
+    rgb, weight = np.asarray(views.rgb), np.asarray(views.weight)
+    found = []
+    for i, (width, height) in enumerate(sizes or [rgb.shape[2:0:-1]] * len(rgb)):
+        camera = camera_at(views.cameras, i).replace(width=width, height=height)
+        found.append(Photograph(camera, rgb[i, :height, :width], weight[i, :height, :width]))
+    return found
+
+
 class Batch(NamedTuple):
     """Pixels to render and their true colors.
 
@@ -43,7 +72,10 @@ class Batch(NamedTuple):
     weight: jax.Array
 
 
-def to_float(rgb: jax.Array) -> jax.Array:
+_Array = TypeVar("_Array", jax.Array, np.ndarray)
+
+
+def to_float(rgb: _Array) -> _Array:
     """Convert colors to float32: uint8 to [0, 1], int8 to [-1, 1]; floats stay."""
     if rgb.dtype in (jnp.uint8, jnp.int8):
         return rgb.astype(jnp.float32) / jnp.iinfo(rgb.dtype).max

@@ -25,7 +25,7 @@ class Windows:
     Attributes:
       cameras: stacked cameras, with the size of all windows, which fit into every photograph at
         every level.
-      pyramid: `[V, P, 4]` colors and weights of the photographs.
+      pyramid: `[P, 4]` colors and weights of the photographs.
       shares: `[L]` probability of each level, finest first.
       places: `[K, 3]` centers of windows, of which each is drawn alike: a view, and x and y as
         shares of its width and height; None: windows lie anywhere.
@@ -38,7 +38,7 @@ class Windows:
 
     def __len__(self) -> int:
         """Return the number of photographs."""
-        return self.pyramid.values.shape[0]
+        return len(self.pyramid)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -54,16 +54,15 @@ def photograph_windows(cameras: Camera, pyramid: Pyramid, *, whole_share: float)
 
     Args:
       cameras: stacked cameras of the coarsest level.
-      pyramid: `[V, P, 4]` colors and weights.
+      pyramid: `[P, 4]` colors and weights.
       whole_share: in [0, 1].
     """
     finer = len(pyramid.sizes) - 1
     often = [4.0**-level for level in range(finer)]
     shares = [(1 - whole_share) * times / sum(often) for times in often]
     shares = [*shares, whole_share] if finer else [1.0]
-    if pyramid.extents is not None:
-        height, width = np.asarray(pyramid.extents)[:, -1].min(axis=0).tolist()
-        cameras = cameras.replace(height=height, width=width)
+    height, width = np.asarray(pyramid.extents)[:, -1].min(axis=0).tolist()
+    cameras = cameras.replace(height=height, width=width)
     return Windows(cameras, pyramid, jnp.array(shares, jnp.float32))
 
 
@@ -125,8 +124,11 @@ def windows_that_see(
     view = jax.random.categorical(key_view, jnp.log(seen + 1e-6), axis=0)
     chosen = view, jnp.arange(count)
     size = jnp.array([views.cameras.width, views.cameras.height], jnp.float32)
+    # Views of a photograph that is smaller than others are padded.
+    own = windows.pyramid.extents[:, -1, ::-1].astype(jnp.float32)
+    shares = landed[chosen] / size[None] * (own.max(0)[None] / own)[view]
     anywhere = jax.random.uniform(key_any, (count, 2))
-    place = jnp.where(seen[chosen][:, None] > 0, landed[chosen] / size[None], anywhere)
+    place = jnp.where(seen[chosen][:, None] > 0, shares, anywhere)
     places = jnp.concatenate([view[:, None].astype(place.dtype), place], 1)
     return dataclasses.replace(windows, places=places)
 
@@ -141,25 +143,17 @@ def sample_window(key: jax.Array, windows: Windows) -> Batch:
     size = jnp.array(windows.size, jnp.int32)
     if windows.places is None:
         view = jax.random.randint(key_view, (), 0, len(windows))
-        room = _extent(windows, view, level) - size + 1
+        room = windows.pyramid.extents[view, level] - size + 1
         corner = jnp.stack(
             [jax.random.randint(key_y, (), 0, room[0]), jax.random.randint(key_x, (), 0, room[1])]
         )
     else:
         view, center = _draw_place(key_view, windows.places, ())
-        room = _extent(windows, view, level) - size + 1
-        # Places are shares of the padded photograph.
-        extent = jnp.asarray(windows.pyramid.sizes, jnp.int32)[level].astype(center.dtype)
+        room = windows.pyramid.extents[view, level] - size + 1
+        extent = windows.pyramid.extents[view, level].astype(center.dtype)
         corner = jnp.floor(center * extent - size.astype(center.dtype) / 2).astype(jnp.int32)
         corner = jnp.clip(corner, 0, room - 1)
     return cut_window(windows, view, level, corner)
-
-
-def _extent(windows: Windows, view: jax.Array, level: jax.Array) -> jax.Array:
-    """Return height and width `[..., 2]` of photographs at their levels, without padding."""
-    if windows.pyramid.extents is not None:
-        return windows.pyramid.extents[view, level]
-    return jnp.asarray(windows.pyramid.sizes, jnp.int32)[level]
 
 
 def _draw_place(
@@ -179,20 +173,20 @@ def sample_window_pixels(key: jax.Array, windows: Windows, count: int) -> Batch:
     key_view, key_level, key_y, key_x = jax.random.split(key, 4)
     pyramid = windows.pyramid
     level = jax.random.categorical(key_level, jnp.log(windows.shares), shape=(count,))
-    sizes, starts = (jnp.asarray(x, jnp.int32) for x in (pyramid.sizes, pyramid.starts))
     if windows.places is None:
         view = jax.random.randint(key_view, (count,), 0, len(windows))
-        height, width = _extent(windows, view, level).T
+        height, width = pyramid.extents[view, level].T
         y = jax.random.randint(key_y, (count,), 0, height)
         x = jax.random.randint(key_x, (count,), 0, width)
     else:
         view, center = _draw_place(key_view, windows.places, (count,))
         within = jax.random.uniform(key_y, (count, 2)) - 0.5
-        extent = sizes[level].astype(center.dtype)
+        extent = pyramid.extents[view, level].astype(center.dtype)
         size = jnp.array(windows.size, center.dtype)
         pixel = jnp.floor(center * extent + within * size[None]).astype(jnp.int32)
-        y, x = jnp.clip(pixel, 0, _extent(windows, view, level) - 1).T
-    values = to_float(pyramid.values[view, starts[level] + y * sizes[level, 1] + x])
+        y, x = jnp.clip(pixel, 0, pyramid.extents[view, level] - 1).T
+    first, width = pyramid.starts[view, level], pyramid.extents[view, level, 1]
+    values = to_float(pyramid.values[first + y * width + x])
     return Batch(
         cameras=camera_at(windows.cameras, view).replace(
             intrinsics=pyramid.intrinsics[view, level]
@@ -209,10 +203,10 @@ def cut_window(
     """Cut the window of a view at a level whose first pixel is in row and column `corner[2]`."""
     pyramid = windows.pyramid
     height, width = windows.size
-    sizes, starts = (jnp.asarray(x, jnp.int32) for x in (pyramid.sizes, pyramid.starts))
+    start, across = pyramid.starts[view, level], pyramid.extents[view, level, 1]
     rows = corner[0] + jnp.arange(height)[:, None]
     columns = corner[1] + jnp.arange(width)[None]
-    values = to_float(pyramid.values[view, starts[level] + rows * sizes[level, 1] + columns])
+    values = to_float(pyramid.values[start + rows * across + columns])
     camera = camera_at(windows.cameras, view).replace(intrinsics=pyramid.intrinsics[view, level])
     camera = crop_camera(camera, corner[::-1], height=height, width=width)
     return Batch(camera, None, values[..., :3], values[..., 3])

@@ -217,9 +217,10 @@ def test_a_photograph_is_cut_out_where_it_shows_a_close_up():
     assert math.sqrt(np.linalg.det(place[:, :2])) == pytest.approx(160 / 2 / 60, rel=1e-4)
     image = wall(photograph, 96, 128)
     coarse = cv2.resize(image, (64, 48), interpolation=cv2.INTER_AREA)
-    values = np.concatenate([image.reshape(1, -1, 3), coarse.reshape(1, -1, 3)], axis=1)
+    values = np.concatenate([image.reshape(-1, 3), coarse.reshape(-1, 3)])
     intrinsics = jnp.stack([photograph.intrinsics, photograph.intrinsics / 2])[None]
-    pyramid = Pyramid(jnp.asarray(values * 255, jnp.uint8), intrinsics, ((96, 128), (48, 64)))
+    extents = jnp.array([[(96, 128), (48, 64)]])
+    pyramid = Pyramid(jnp.asarray(values * 255, jnp.uint8), intrinsics, extents)
     for focal in (60.0, 25.0):  # the second reads the coarser level
         view = near.replace(intrinsics=jnp.array([focal, focal, 24.0, 18.0]))
         found = cut_out(pyramid, 0, find_place(view, depth, photograph), view)

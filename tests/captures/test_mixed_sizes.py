@@ -21,6 +21,7 @@ from jaxcloseup.detail.residuals import render_residuals
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.labels.target_views import render_depths
 from jaxcloseup.photos.pyramids import scene_pyramid
+from jaxcloseup.photos.views import unpadded
 from jaxcloseup.photos.windows import photograph_windows, sample_window, sample_window_pixels
 
 
@@ -97,14 +98,17 @@ def test_an_orbit_has_the_size_of_the_first_photograph(scene):
 
 
 def test_nothing_is_computed_on_padding(scene, key):
-    """Depths, residuals and windows of the training photographs cost the sum of their pixels."""
+    """Depths, residuals and windows of the training photographs cost the sum of their pixels.
+
+    So does what is kept of them, but for the small depth maps.
+    """
     counted = []
 
     def count(camera, *_):
         counted.append(camera.height * camera.width)
         return render(camera)
 
-    own, finer = ALONG[0] * ALONG[1] + ACROSS[0] * ACROSS[1], scene.photographs_at(1)
+    own = ALONG[0] * ALONG[1] + ACROSS[0] * ACROSS[1]
     depths = render_depths(count, scene.train.cameras, far=9, sizes=scene.sizes("train"))
     assert sum(counted) == own
     np.testing.assert_array_equal(np.asarray(depths) > 0, np.asarray(scene.train.weight) > 0)
@@ -114,9 +118,12 @@ def test_nothing_is_computed_on_padding(scene, key):
     assert divisor == 1 and pyramid.sizes == ((64, 64), (32, 32))
     found = render_residuals(count, scene.train.cameras, pyramid, near=0.0, far=9.0)
     assert sum(counted) == 5 * own
-    for level, views in enumerate((finer[0], scene.train)):
-        padded = np.asarray(views.weight) == 0
-        assert padded.any() and not np.asarray(found.shown.level(level))[padded].any()
+    assert pyramid.values.nbytes == 4 * 5 * own and found.shown.values.nbytes == 6 * 5 * own
+    kept = scene.photographs_at(1), unpadded(scene.train, scene.sizes("train"))
+    for level, view in np.ndindex(2, 2):
+        photograph = kept[level][view].rgb
+        np.testing.assert_array_equal(pyramid.image(view, level)[..., :3], photograph)
+        assert found.shown.image(view, level).shape == (*photograph.shape[:2], 6)
 
     windows = photograph_windows(scene.train.cameras, pyramid, whole_share=0.5)
     assert windows.size == (24, 24)  # what both have in common

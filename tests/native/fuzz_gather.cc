@@ -22,12 +22,14 @@ void fuzz_values() {
   const int64_t height = any_of({1, 2, 7, 20}), width = any_of({1, 3, 8, 33});
   const int rarity = any_of({0, 200, 20, 2}), levels = any_of({1, 2, 4, 16});
   const bool sane_cameras = generator() % 4;
-  std::vector<int64_t> sizes;
+  Integers sizes({photographs, levels, 2});
   int64_t pixels = 0;
-  for (int level = 0; level < levels; level++) {
-    sizes.push_back(std::max<int64_t>(2 * height >> level, 1));
-    sizes.push_back(std::max<int64_t>(2 * width >> level, 1));
-    pixels += sizes[2 * level] * sizes[2 * level + 1];
+  for (int i = 0; i < photographs * levels; i++) {
+    // Every other photograph is turned.
+    const int64_t turned = i / levels % 2, level = i % levels, size[2] = {height, width};
+    for (int axis = 0; axis < 2; axis++)
+      sizes.data[2 * i + axis] = std::max<int64_t>(2 * size[axis ^ turned] >> level, 1);
+    pixels += int64_t(sizes.data[2 * i]) * sizes.data[2 * i + 1];
   }
   std::vector<float> settings;
   for (int k = 0; k < parts; k++) {
@@ -38,7 +40,7 @@ void fuzz_values() {
   Floats pose({3, 4}), intrinsics({4}), view(with(image, {2})), depth(image), poses({photographs, 3, 4});
   Floats of_maps({photographs, 4}), maps({photographs, height + 2, width + 2, 2});
   Floats of_levels({photographs, levels, 4});
-  Array<T> values({photographs, pixels, channels});
+  Array<T> values({pixels, channels});
   Integers finest({}), exclude({});
   const int odd_cameras = sane_cameras ? 0 : rarity;
   const auto draw_intrinsics = [&](size_t i) {
@@ -61,7 +63,7 @@ void fuzz_values() {
   for (int some = 0; some < 2; some++) {
     Call call;
     call.arg(pose).arg(intrinsics).arg(view).arg(depth).arg(poses).arg(of_maps).arg(maps).arg(values);
-    call.arg(of_levels).arg(finest).arg(exclude).attr("sizes", sizes).attr("settings", settings);
+    call.arg(of_levels).arg(sizes).arg(finest).arg(exclude).attr("settings", settings);
     for (int i = 0; i < 7 * parts; i++) {
       results[some].emplace_back(new Floats(i % 7 ? image : with(image, {channels / parts})));
       call.ret(*results[some].back());

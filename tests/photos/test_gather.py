@@ -46,10 +46,10 @@ def capture():
     weight = views.weight.at[1, :, :8].set(0)
     sources = gather_sources(views.cameras, with_edge(depths), weight)
     rng = np.random.default_rng(0)
-    values = rng.integers(-127, 128, (3, sum(h * w for h, w in SIZES), 3)).astype(np.int8)
+    values = rng.integers(-127, 128, (3 * sum(h * w for h, w in SIZES), 3)).astype(np.int8)
     scales = jnp.array([2.0, 1.0, 0.4])
     intrinsics = views.cameras.intrinsics[:, None] * scales[None, :, None]
-    return sources, Pyramid(jnp.asarray(values), intrinsics, SIZES)
+    return sources, Pyramid(jnp.asarray(values), intrinsics, jnp.array([SIZES] * 3))
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ def test_gather_against_an_oracle(capture, closeup, gathered, exclude, finest):
                     position,
                     *(np.asarray(a, np.float64) for a in (source.camtoworld, source.intrinsics)),
                     *(a[v] for a in maps),
-                    [np.asarray(pyramid.level(i)[v], np.float64) / 127 for i in range(3)],
+                    [np.asarray(pyramid.image(v, i), np.float64) / 127 for i in range(3)],
                     np.asarray(pyramid.intrinsics[v], np.float64),
                     SETTINGS,
                     finest,
@@ -184,14 +184,11 @@ def test_gathered_colors_are_the_area_filtered_truth():
     views, depths = plane.make_views(cameras)
     sources = gather_sources(views.cameras, depths, views.weight)
     scales = (2, 1)
-    levels = [
-        np.stack([filtered(camera, scale) for camera in cameras]).reshape(3, -1, 3)
-        for scale in scales
-    ]
-    values = jnp.asarray(np.concatenate(levels, axis=1), jnp.float32)
+    images = [filtered(camera, scale) for camera in cameras for scale in scales]
+    values = jnp.asarray(np.concatenate([image.reshape(-1, 3) for image in images]), jnp.float32)
     intrinsics = views.cameras.intrinsics[:, None] * jnp.array(scales, jnp.float32)[None, :, None]
-    sizes = tuple((scale * plane.HEIGHT, scale * plane.WIDTH) for scale in scales)
-    pyramid = Pyramid(values, intrinsics, sizes)
+    sizes = [(scale * plane.HEIGHT, scale * plane.WIDTH) for scale in scales]
+    pyramid = Pyramid(values, intrinsics, jnp.array([sizes] * 3))
     camera = plane.camera_above(0.0, 0.0, 2.5)
     depth = jnp.asarray(plane.photograph(camera)[1], jnp.float32)
     found = jax.jit(gather)(camera, GRID, depth, sources, pyramid)
@@ -235,11 +232,12 @@ def test_a_pyramid_halves_by_weight_and_ends_with_what_training_reads():
     assert photograph_pyramid(views).sizes == ((9, 13),)
     pyramid = photograph_pyramid(views, training)
     assert pyramid.sizes == ((9, 13), (4, 6), (3, 4))
-    np.testing.assert_array_equal(pyramid.level(2)[..., :3], coarse)
+    levels = [np.stack([pyramid.image(view, i) for view in range(2)]) for i in range(3)]
+    np.testing.assert_array_equal(levels[2][..., :3], coarse)
     np.testing.assert_array_equal(pyramid.intrinsics[:, 2], own)
     np.testing.assert_allclose(pyramid.coarseness(1), np.log2([1, 2, 8 / 2.5]), rtol=1e-6)
     np.testing.assert_allclose(pyramid.intrinsics[0, 1], [4, 4, 3.25, 2.25])
-    fine, half = np.asarray(pyramid.level(0), np.float64), np.asarray(pyramid.level(1))
+    fine, half = levels[0].astype(np.float64), levels[1]
     np.testing.assert_array_equal(fine[..., :3], rgb * (weight[..., None] > 0))
     for v, y, x in np.ndindex(2, 4, 6):
         block = np.s_[v, 2 * y : 2 * y + 2, 2 * x : 2 * x + 2]

@@ -35,13 +35,15 @@ def make_capture(kind=np.int8, channels=6, count=5):
     views, depths = plane.make_views(cameras)
     weight = views.weight.at[1, :, :8].set(0)
     sources = gather_sources(views.cameras, depths.at[0, 5:11, 8:16].multiply(0.8), weight)
-    shape = count, sum(h * w for h, w in SIZES), channels
+    shape = count * sum(h * w for h, w in SIZES), channels
     integers = kind != np.float32
     values = rng.integers(*(0, 128) if integers else (0, 2), shape)
     values = values if integers else rng.normal(0, 1, shape)
     scales = jnp.array([2.0, 1.0, 0.4])
     intrinsics = views.cameras.intrinsics[:, None] * scales[None, :, None]
-    return sources, Pyramid(jnp.asarray(values.astype(kind)), intrinsics, SIZES)
+    return sources, Pyramid(
+        jnp.asarray(values.astype(kind)), intrinsics, jnp.array([SIZES] * count)
+    )
 
 
 def make_view(height=plane.HEIGHT, width=plane.WIDTH):

@@ -120,7 +120,7 @@ def test_pixels_come_from_all_levels_with_the_stated_shares(windows, key):
     x, y = np.floor(batch.pixels).astype(int).T
     for index, (height, width) in enumerate(windows.pyramid.sizes):
         there = level == index
-        images = np.asarray(windows.pyramid.level(index)) / np.float32(255)
+        images = np.stack([windows.pyramid.image(v, index) for v in range(3)]) / np.float32(255)
         expected = images[view[there], y[there], x[there]]
         np.testing.assert_allclose(batch.rgb[there], expected[:, :3], rtol=1e-6)
         np.testing.assert_allclose(batch.weight[there], expected[:, 3], rtol=1e-6)

@@ -10,6 +10,8 @@ from jaxcloseup.app.progress.display import track
 
 
 _MOST = 4  # threads, each of which holds an image and its inputs
+# Pixels of images that are worked on at once: 300 bytes each. XLA uses all cores for larger images.
+_PIXELS = 2**22
 
 
 def workers() -> int:
@@ -19,7 +21,9 @@ def workers() -> int:
     return (os.cpu_count() or 1) if jax.default_backend() == "cpu" else 1
 
 
-def each(work: Callable[[Any], Any], values: Iterable[Any], what: str) -> Iterator[Any]:
+def each(
+    work: Callable[[Any], Any], values: Iterable[Any], what: str, *, pixels: int = 1
+) -> Iterator[Any]:
     """Yield `work(value)` for each value, in order, while threads work on the next ones.
 
     XLA uses several cores for large arrays only, so two renders at once take less time than one
@@ -30,9 +34,10 @@ def each(work: Callable[[Any], Any], values: Iterable[Any], what: str) -> Iterat
         compiles.
       values: the values.
       what: text for `track`.
+      pixels: number of pixels of the largest image, of which few are worked on at once.
     """
     values = list(values)
-    count = min(workers(), _MOST, len(values) - 1)
+    count = min(workers(), _MOST, len(values) - 1, _PIXELS // pixels)
     if count < 2:
         yield from map(work, track(values, what))
         return

@@ -21,6 +21,7 @@ from jaxcloseup.labels.make import (
     sample_virtual_camera,
 )
 from jaxcloseup.labels.target_views import best_source
+from jaxcloseup.photos.views import to_float
 
 
 SHOWN_LABELS = 6  # pictures of labels for each kind of camera
@@ -41,7 +42,7 @@ def comparisons(
     Args:
       folder: folder to write to.
       targets: held-out views by split.
-      images: rendered colors by (stage, split), then by the view's name.
+      images: rendered colors, uint8 or float in [0, 1], by (stage, split), then by the view's name.
       in_report: stages that the report shows; default: all.
 
     Returns:
@@ -54,10 +55,10 @@ def comparisons(
     for split, views in shown.items():
         stages = [stage for stage, rendered in images if rendered == split]
         for target in views if stages else ():
-            seen = {stage: images[stage, split][target.name] for stage in stages}
+            seen = {stage: to_float(images[stage, split][target.name]) for stage in stages}
             name = f"{split}_{target.name}" if target.name in written else target.name
             written.add(name)
-            truth = np.asarray(target.rgb)
+            truth = np.asarray(to_float(target.rgb))
             write_png(folder / f"{name}.png", _comparison(truth, seen))
             brief = {stage: seen[stage] for stage in stages if stage in (in_report or stages)}
             section = SPLIT_TITLES[split]

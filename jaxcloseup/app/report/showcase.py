@@ -57,7 +57,7 @@ def exhibits(
 
     Args:
       targets: held-out close-ups.
-      renders: their renders by name, float `[H, W, 3]`.
+      renders: their renders by name, uint8 or float `[H, W, 3]`.
       psnr: PSNR of the renders by name.
       render_depth: `camera -> [H, W]`, the model's z-depth.
       sources: the training photographs with their depths.

@@ -113,7 +113,8 @@ def _shares_at(detail: Detail, camera: Camera, depth: jax.Array) -> jax.Array:
     """Return each photograph's share in what a view gathers, `[V]`; the sum is at most 1."""
     count = len(detail.sources.maps)
     # Each photograph shows nothing but its own number, in as fine pixels as it has.
-    numbers = Pyramid(jnp.eye(count)[:, None], detail.shown.intrinsics[:, :1], ((1, 1),))
+    one = jnp.ones((count, 1, 2), jnp.int32)
+    numbers = Pyramid(jnp.eye(count), detail.shown.intrinsics[:, :1], one)
     every = max(1, round((depth.size / _PIXELS) ** 0.5))
     pixels = pixel_grid(camera.height, camera.width)[::every, ::every]
     gathered = gather(camera, pixels, depth[::every, ::every], detail.sources, numbers)

@@ -34,7 +34,7 @@ from jaxcloseup.photos.views import Views
 from jaxcloseup.training.state import TrainState
 
 
-_RECIPE = 11  # a change of how detail is made raises it, so that kept detail is made again
+_RECIPE = 12  # a change of how detail is made raises it, so that kept detail is made again
 
 
 def detailed(programs: Programs, detail: Detail, camera: Camera, rendering: Rendering) -> Detailed:
@@ -139,6 +139,7 @@ def _pack(made: tuple[Detail, dict[str, Any]]) -> Stored:
     arrays = {
         "values": detail.shown.values,
         "intrinsics": detail.shown.intrinsics,
+        "extents": detail.shown.extents,
         "inverse_depth": detail.sources.inverse_depth,
         "trust": detail.sources.trust,
         "finer": detail.finer,
@@ -153,25 +154,28 @@ def _unpack(scene: Scene, stored: Stored) -> tuple[Detail, dict[str, Any]]:
     _check(stored, sizes, cameras)
     level = sizes.index(stored.arrays["trust"].shape[1:])
     arrays = {name: jnp.asarray(array) for name, array in stored.arrays.items()}
-    shown = Pyramid(arrays["values"], arrays["intrinsics"], sizes)
-    cameras = shown.camera(cameras, slice(None), level)
+    shown = Pyramid(arrays["values"], arrays["intrinsics"], arrays["extents"])
+    cameras = shown.cameras(cameras, level)
     sources = join_maps(cameras, arrays["inverse_depth"], arrays["trust"])
     return Detail(shown, sources, _weights(scene), arrays["finer"]), about
 
 
 def _check(stored: Stored, sizes: tuple[tuple[int, int], ...], cameras: Camera) -> None:
     """Raise unless a file holds what `_pack` returns for these cameras."""
-    count, pixels = cameras.intrinsics.shape[0], sum(height * width for height, width in sizes)
+    count, extents = cameras.intrinsics.shape[0], stored.arrays["extents"]
     depths = (count, *stored.arrays["trust"].shape[1:])
     expected = {
-        "values": ((count, pixels, 6), np.dtype(np.int8)),
+        "values": ((int(extents.prod(-1).sum()), 6), np.dtype(np.int8)),
         "intrinsics": ((count, len(sizes), 4), np.dtype(np.float32)),
+        "extents": ((count, len(sizes), 2), np.dtype(np.int32)),
         "inverse_depth": (depths, np.dtype(np.float32)),
         "trust": (depths, np.dtype(np.float32)),
         "finer": ((), np.dtype(np.float32)),
     }
     if {name: (array.shape, array.dtype) for name, array in stored.arrays.items()} != expected:
         raise ValueError("other arrays")
+    if extents.min() < 1 or not np.array_equal(extents.max(0), sizes):
+        raise ValueError("images of other sizes")
     if depths[1:] not in sizes:
         raise ValueError("depth maps of another size")
     if set(stored.record) != {"divisor", "sizes"}:

@@ -27,9 +27,10 @@ from jaxcloseup.app.run.photograph_sizes import describe_photographs, finest_rea
 from jaxcloseup.app.run.step_data import ArmsData, StepData
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.io.memory import give_back_memory
 from jaxcloseup.photos.pyramids import Pyramid, photograph_pyramid, scene_pyramid
 from jaxcloseup.photos.scene import Scene, SceneError
-from jaxcloseup.photos.views import Views
+from jaxcloseup.photos.views import Views, unpadded
 from jaxcloseup.photos.windows import Windows, in_quarters, photograph_windows
 from jaxcloseup.training.arms import arm_specs, run_arms
 from jaxcloseup.training.parallel import in_a_loop, in_threads, over_devices
@@ -115,6 +116,7 @@ class Programs:
                     print(f"only the photographs reduced for training are read: {error}")
                     read = scene_pyramid(dataclasses.replace(scene, photographs_at=None))
             self._pyramids[finest] = read
+            give_back_memory()  # of the photographs
         return self._pyramids[finest]
 
     @functools.cached_property
@@ -144,7 +146,7 @@ class Programs:
         views, sizes = self.scene.train, self.scene.sizes("train")
         if len(set(sizes)) == 1:
             return views
-        pyramid = photograph_pyramid(views, extents=[sizes])
+        pyramid = photograph_pyramid(unpadded(views, sizes))
         return photograph_windows(views.cameras, pyramid, whole_share=1.0)
 
     def make_room(self, growth: int) -> None:

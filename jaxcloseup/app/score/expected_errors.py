@@ -10,6 +10,7 @@ from jaxcloseup.app.score.targets import Target
 from jaxcloseup.detail.add import Detailed
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.metrics.image_metrics import change_colors, fit_colors
+from jaxcloseup.photos.views import to_float
 
 
 TENTHS = 10
@@ -34,10 +35,11 @@ def compare_errors(
     def compare(target: Target) -> tuple[np.ndarray, ...]:
         detailed, (height, width) = render(target.camera), target.weight.shape
         rgb, error = detailed.rgb[:height, :width], detailed.error[:height, :width]
-        weight = jnp.where(jnp.isfinite(error), target.weight, 0)
-        change = fit_colors(rgb, target.rgb, jnp.where(weight > 0, weight / error**2, 0))
+        truth, weight = (jnp.asarray(to_float(array)) for array in (target.rgb, target.weight))
+        weight = jnp.where(jnp.isfinite(error), weight, 0)
+        change = fit_colors(rgb, truth, jnp.where(weight > 0, weight / error**2, 0))
         corrected = jnp.clip(change_colors(rgb, *change), 0, 1)
-        actual = jnp.mean(jnp.abs(corrected - target.rgb), axis=-1)
+        actual = jnp.mean(jnp.abs(corrected - truth), axis=-1)
         return tuple(np.asarray(values).ravel() for values in (error, actual, weight))
 
     views = list(progress.each(compare, targets, "expected errors"))

@@ -23,6 +23,7 @@ from jaxcloseup.metrics.perceptual import (
 )
 from jaxcloseup.metrics.resolution import SMALLEST as SMALLEST_RINGS
 from jaxcloseup.metrics.resolution import resolved_period, ring_correlation
+from jaxcloseup.photos.views import to_float
 
 
 Metrics = dict[str, jax.Array | float]
@@ -77,7 +78,10 @@ def score(rendering: Rendering, target: Target, perceptual: Perceptual = NO_PERC
     def crop(array: Any) -> Any:
         return array[rows, columns]
 
-    image, truth, weight = map(crop, (rendering.rgb, target.rgb, target.weight))
+    image, truth, weight = (
+        crop(rendering.rgb),
+        *(jnp.asarray(to_float(crop(array))) for array in (target.rgb, target.weight)),
+    )
     image, truth = _as_8_bits(image, truth)
     seen = crop(target.seen)
     values: Metrics = {}
@@ -122,7 +126,7 @@ def score_image(
     finite, side = bool(np.isfinite(image).all()), min(truth.shape[:2])
     result: View = {}
     if finite and side >= SMALLEST_RINGS:
-        curve = np.asarray(_ring_correlation(image, truth, weight))
+        curve = np.asarray(ring_correlation(image, truth, weight=weight))
         values["resolves"] = resolved_period(curve)
         result[CURVE] = curve.tolist()
     for key, value in values.items():
@@ -191,20 +195,19 @@ def evaluate(
 ) -> tuple[dict[str, Any], dict[str, Rendering]]:
     """Render and score every target; return the summary and the renderings by name.
 
-    Renderings have the size of their target, and no `aux`.
+    Renderings have the size of their target, and neither `aux` nor normals.
     """
 
-    def seen(target: Target) -> Rendering:
-        return jax.device_get(render(target.camera)._replace(aux=()))
+    def scored(target: Target) -> tuple[View, Rendering]:
+        seen = jax.device_get(render(target.camera)._replace(aux=()))
+        return score(seen, target, perceptual), seen._replace(normal=None)
 
     names = [target.name for target in targets]
-    renderings = dict(zip(names, progress.each(seen, targets, "rendering views"), strict=True))
-
-    def scored(target: Target) -> View:
-        return score(renderings[target.name], target, perceptual)
-
-    scores = dict(zip(names, progress.each(scored, targets, "scoring views"), strict=True))
-    return summarize(scores), renderings
+    pixels = max((target.weight.size for target in targets), default=1)
+    found = progress.each(scored, targets, "rendering and scoring views", pixels=pixels)
+    views = dict(zip(names, found, strict=True))
+    scores = {name: values for name, (values, _) in views.items()}
+    return summarize(scores), {name: seen for name, (_, seen) in views.items()}
 
 
 def _as_8_bits(image: jax.Array, truth: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -222,11 +225,6 @@ def _metrics(
         found[f"psnr{ending}"] = psnr(image, truth, weight=counted)
         found[f"ssim{ending}"] = _ssim(image, truth, weight=counted)
     return found
-
-
-@jax.jit
-def _ring_correlation(image: jax.Array, truth: jax.Array, weight: jax.Array) -> jax.Array:
-    return ring_correlation(image, truth, weight=weight)
 
 
 @jax.jit

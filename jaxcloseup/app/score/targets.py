@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.photos.scene import Scene, SceneError, Surface
 from jaxcloseup.photos.support import find_support
-from jaxcloseup.photos.views import Views, camera_at, to_float
+from jaxcloseup.photos.views import Photograph, camera_at, unpadded
 
 
 _SCREEN = 1920  # longest side in pixels of views that are scored at the photographs' own size
@@ -27,8 +27,8 @@ class Target(NamedTuple):
 
     name: str  # name of its photograph
     camera: Camera  # its camera
-    rgb: jax.Array  # `[H, W, 3]` the photograph, float in [0, 1]
-    weight: jax.Array  # `[H, W]` weights
+    rgb: Any  # `[H, W, 3]` the photograph, uint8 or float in [0, 1]
+    weight: Any  # `[H, W]` weights, uint8 (255 means 1) or float in [0, 1]
     seen: jax.Array  # `[H, W]` number of training photographs that saw the surface at each pixel
     surface: Surface | None = None  # the exact surface, or None where it is unknown
     # visible points of the capture, or None where the exact surface is known
@@ -61,7 +61,7 @@ def make_targets(
     split: str,
     train_depths: jax.Array,
     render: Callable[[Camera], Rendering],
-    photographs: tuple[Views, Sequence[tuple[int, int]]] | None = None,
+    photographs: Sequence[Photograph] | None = None,
 ) -> list[Target]:
     """Return the held-out views of a split, with the number of photographs that saw each pixel.
 
@@ -76,14 +76,12 @@ def make_targets(
       photographs: the split's photographs at another size, as `Scene.photographs_at` returns
         them; default: the scene's.
     """
-    views, sizes = photographs or (getattr(scene, split), scene.sizes(split))
+    photographs = photographs or unpadded(getattr(scene, split), scene.sizes(split))
     surface = _geometry(scene.surface) if scene.surface else None
     find, own = jax.jit(find_support), scene.metadata.get("downscale", 1)
-    rgb_of, weight_of = jax.device_get((views.rgb, views.weight))
 
     def make(i: int) -> Target:
-        width, height = sizes[i]  # without padding
-        camera = camera_at(views.cameras, i).replace(width=width, height=height)
+        camera, rgb, weight = photographs[i]
         exact = surface(camera) if surface else None
         landmarks = None if exact else find_landmarks(camera, scene.points)
         depth = exact.depth if exact else render(camera).depth
@@ -92,12 +90,11 @@ def make_targets(
         seen, footprint = map(np.asarray, support)
         # A period takes two pixels, of the photograph or of the view.
         held = max(2.0, 2 * float(np.median(footprint[seen > 0])) / own) if seen.any() else None
-        rgb = jnp.asarray(to_float(rgb_of[i, :height, :width]))
-        weight = jnp.asarray(weight_of[i, :height, :width])
         name, counts = scene.names[split][i], jnp.asarray(seen)
         return Target(name, camera, rgb, weight, counts, exact, landmarks, held)
 
-    return list(progress.each(make, range(len(sizes)), f"truth of {split}"))
+    pixels = max(photograph.weight.size for photograph in photographs)
+    return list(progress.each(make, range(len(photographs)), f"truth of {split}", pixels=pixels))
 
 
 def targets_by_split(

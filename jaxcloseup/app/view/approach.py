@@ -66,4 +66,4 @@ def approach(
         return to_uint8(render(camera).rgb)
 
     cameras = [camera for _, camera in named_cameras(shots)]
-    return list(progress.each(frame, cameras, "frames"))
+    return list(progress.each(frame, cameras, "frames", pixels=depth.size))

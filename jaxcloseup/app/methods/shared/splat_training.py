@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import math
 import pathlib
 from collections.abc import Callable
 from typing import Any
@@ -129,10 +128,11 @@ def refine(
     pyramid: Pyramid,
 ) -> tuple[Surfels, SurfelBuffers]:
     """Fill the rows that `config` has beyond `surfels` where photographs show more than these."""
-    views, cameras = pyramid.values.shape[0], scene.train.cameras
+    views, cameras = len(pyramid), scene.train.cameras
     level = pyramid.level_near(_REFINED_AT * cameras.width)
     free = config.capacity - int(buffers.alive.sum())
-    each = min(max(0, free) // views, math.prod(pyramid.sizes[level]))
+    smallest = int(np.asarray(pyramid.extents)[:, level].prod(-1).min())
+    each = min(max(0, free) // views, smallest)
     sample = _sampler(config, each)
     # With all rows, so that what is compiled here is what renders the field later.
     padded, padded_buffers = _with_rows((surfels, buffers), config.capacity)
