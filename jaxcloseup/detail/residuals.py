@@ -114,8 +114,7 @@ def render_residuals(
             camera = pyramid.camera(camera_at(cameras, view), view, level)
             photograph = pyramid.image(view, level)
             if level >= rendered:
-                rendering = render(camera)
-                rgb, shown_by = rendering.rgb, camera
+                rgb, shown_by = (rendering := render(camera)).rgb, camera
             else:
                 assert enlarge is not None, "levels that are not rendered need `enlarge`"
                 rgb, shown_by = enlarge(rgb, shown_by, camera), camera
