@@ -24,6 +24,9 @@ class Fit(NamedTuple):
     share: float  # share of matches with an error of at most `FITTING`
     median: float  # median error in pixels
     by_view: np.ndarray  # `[V]` share of each photograph's matches that fit; NaN without matches
+    # `[V]` the same of the best of the photographs that it matches; NaN if there are less than two,
+    # because a repeated pattern may match a photograph wrongly
+    by_best: np.ndarray
 
 
 def epipolar_errors(matches: Matches, cameras: Cameras) -> np.ndarray:
@@ -60,7 +63,13 @@ def fit(matches: Matches, cameras: Cameras) -> Fit:
     total = np.bincount(ends, minlength=count)
     right = np.bincount(ends, np.repeat(inside, 2), minlength=count)
     by_view = np.divide(right, total, out=np.full(count, np.nan), where=total > 0)
-    return Fit(float(inside.mean()), float(np.median(errors)), by_view)
+    pairs, place = np.unique(matches.views, axis=0, return_inverse=True)
+    shares = np.bincount(place, inside) / np.bincount(place)
+    by_best = np.full(count, -1.0)
+    for side in range(2):
+        np.maximum.at(by_best, pairs[:, side], shares)
+    by_best[np.bincount(pairs.ravel(), minlength=count) < 2] = np.nan
+    return Fit(float(inside.mean()), float(np.median(errors)), by_view, by_best)
 
 
 def _rays(matches: Matches, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:

@@ -88,7 +88,7 @@ def _judge_poses(
 ) -> tuple[str, str, tuple[str, ...]]:
     """Return verdict, sentence and corrections for poses and lenses."""
     count = len(evidence.matches.views)
-    bad = [name for name, share in zip(names, found.by_view, strict=True) if share < _BAD]
+    bad = [name for name, share in zip(names, found.by_best, strict=True) if share < _BAD]
     fits = f"{len(names)} photographs, poses fit: {found.median:.1f} px"
     most = found.share >= 1 - _MOST_WRONG
     if most and not bad and found.median <= _BLURRED:

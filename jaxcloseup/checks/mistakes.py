@@ -15,7 +15,8 @@ _TRIED = 3000  # matches that are tried with each mistake
 _FITS = 0.7  # share of fitting matches with which a correction counts as right
 _GAIN = 0.2  # by which it is better than the capture as it is, and than any other correction
 _WORST = 10.0  # pixels; larger errors count as this, so that wrong matches do not lead the search
-_FAR = (math.log(10), 0.6, 0.6)  # largest log zoom, and move of the center, that is tried
+_MOST_ZOOM = math.log(10)  # of focal lengths, either way
+_OUTSIDE = 0.1  # how far, in widths and heights, the principal point may lie outside of the image
 _SAME = 0.02  # share of focal length or width within which two lenses are the same
 
 
@@ -94,10 +95,12 @@ def _lens(matches: Matches, cameras: Cameras) -> tuple[tuple[str, ...], str, Cam
     given = 0.5 - middle
     starts = [
         (log, *center)
-        for log in np.linspace(math.log(0.1), math.log(10), 25)
-        for center in ((0, 0), middle, np.clip((math.exp(log) - 1) * given, -_FAR[1], _FAR[1]))
+        for log in np.linspace(-_MOST_ZOOM, _MOST_ZOOM, 25)
+        for center in ((0, 0), middle, (math.exp(log) - 1) * given)
     ]
-    zoom, *center = _search(matches, cameras, starts)
+    low, high = -_OUTSIDE - given, 1 + _OUTSIDE - given
+    bounds = np.array([[-_MOST_ZOOM, *low], [_MOST_ZOOM, *high]])
+    zoom, *center = _search(matches, cameras, starts, bounds)
     zoom, moved = math.exp(zoom), np.array(center)
     best = _with_lens(cameras, zoom, moved)
     if np.abs(moved).max() < _SAME and abs(zoom - 1) < _SAME:
@@ -136,7 +139,7 @@ def _with_lens(cameras: Cameras, zoom: float, moved: np.ndarray) -> Cameras:
 
 
 def _search(
-    matches: Matches, cameras: Cameras, starts: Sequence[tuple[float, ...]]
+    matches: Matches, cameras: Cameras, starts: Sequence[tuple[float, ...]], bounds: np.ndarray
 ) -> tuple[float, ...]:
     """Return log zoom and move of the principal point with the smallest errors, by pattern search.
 
@@ -144,6 +147,7 @@ def _search(
       matches: matches of photographs.
       cameras: cameras as they were read.
       starts: parameters to begin with; the best is refined.
+      bounds: `[2, 3]` smallest and largest parameters.
     """
 
     def cost(parameters: tuple[float, ...]) -> float:
@@ -154,7 +158,7 @@ def _search(
     step = 0.08
     while step > 1e-3:
         around = [
-            tuple(np.clip(np.add(best, sign * step * np.eye(3)[axis]), np.negative(_FAR), _FAR))
+            tuple(np.clip(np.add(best, sign * step * np.eye(3)[axis]), *bounds))
             for axis in range(3)
             for sign in (-1, 1)
         ]
