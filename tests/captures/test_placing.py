@@ -83,8 +83,8 @@ def test_every_split_has_the_same_coordinates(tmp_path):
     whole, few = load_scene(tmp_path), load_scene(tmp_path, photographs=3)
     np.testing.assert_array_equal(whole.placement.center, few.placement.center)
     assert whole.placement.scale == few.placement.scale
-    finer, _ = few.photographs_at(1)
-    np.testing.assert_array_equal(finer.cameras.camtoworld, few.train.cameras.camtoworld)
+    finer = np.stack([photograph.camera.camtoworld for photograph in few.photographs_at(1)])
+    np.testing.assert_array_equal(finer, few.train.cameras.camtoworld)
 
 
 def test_a_stray_camera_and_point_move_nothing_much():
