@@ -197,8 +197,11 @@ def test_parts_have_words():
     assert plan.in_words("coarse_baseline") == "coarse_baseline"
 
 
-@pytest.mark.parametrize("cores", [1, 2, 64])
-def test_each_keeps_the_order(monkeypatch, cores):
+@pytest.mark.parametrize(
+    ("cores", "pixels", "workers"),
+    [(1, 1, 1), (2, 1, 2), (64, 1, 4), (64, 2**21, 2), (64, 2**23, 1)],
+)
+def test_each_keeps_the_order(monkeypatch, cores, pixels, workers):
     """Later values may be done first; the first is done before another one begins."""
     monkeypatch.setattr(threads.os, "cpu_count", lambda: cores)
     begun, ended, before_second = [], [], []
@@ -211,9 +214,9 @@ def test_each_keeps_the_order(monkeypatch, cores):
         ended.append(value)
         return -value
 
-    found = progress.each(give, range(9), "values")
+    found = progress.each(give, range(9), "values", pixels=pixels)
     assert next(found) == 0
-    assert len(begun) <= 1 + min(cores, 4) + 1  # no more is held than threads work on
+    assert len(begun) <= 1 + workers + 1  # no more is held than threads work on
     assert list(found) == [-value for value in range(1, 9)]
     assert before_second == [0]
     assert sorted(ended) == list(range(9))

@@ -2,6 +2,8 @@
 
 import types
 
+import jax
+import numpy as np
 import pytest
 
 from jaxcloseup.io import memory
@@ -31,6 +33,13 @@ def test_other_c_libraries_change_nothing(monkeypatch, library):
     monkeypatch.setattr(memory.ctypes, "CDLL", load)
     memory.reuse_freed_memory()
     memory.give_back_memory()
+
+
+def test_jax_on_a_cpu_takes_arrays_without_a_copy():
+    array = memory.empty_for_jax((3, 5, 4), np.int8)
+    assert (array.shape, array.dtype) == ((3, 5, 4), np.int8)
+    taken = jax.device_put(array, jax.devices("cpu")[0])
+    assert taken.unsafe_buffer_pointer() == array.ctypes.data
 
 
 def test_installed_memory_is_known():
