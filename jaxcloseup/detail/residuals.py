@@ -13,7 +13,7 @@ from jaxcloseup.detail.weights import DetailWeights
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.geometry.numerics import matmul
-from jaxcloseup.io.memory import empty_for_jax
+from jaxcloseup.io.buffers import empty_for_jax
 from jaxcloseup.labels.rules import label_depth
 from jaxcloseup.metrics.image_metrics import change_colors, fit_colors
 from jaxcloseup.photos.depth_maps import GatherSources, gather_sources
@@ -101,16 +101,15 @@ def render_residuals(
       enlarge: `(rgb, camera, finer_camera) -> rgb` of a render; not called where `rendered` is 0.
       each: like `map`; may show progress.
     """
-    last = len(pyramid.sizes) - 1
     rows = np.arange(len(pyramid)) if chosen is None else np.asarray(chosen)
     extents = np.asarray(pyramid.extents)[rows]
     values = empty_for_jax((int(extents.prod(-1).sum()), 6), np.int8)
     depth_level = max(rendered, pyramid.level_near(FINER_DEPTHS * cameras.width))
 
     def compare(view: int) -> tuple[list[np.ndarray], jax.Array]:
-        """Return the residual of each level, the coarsest first, and the depth at one."""
+        """Return the residual of each level, the finest first, and the depth at one."""
         levels = []
-        for level in range(last, -1, -1):
+        for level in reversed(range(len(pyramid.sizes))):
             camera = pyramid.camera(camera_at(cameras, view), view, level)
             photograph = pyramid.image(view, level)
             if level >= rendered:
@@ -118,22 +117,22 @@ def render_residuals(
             else:
                 assert enlarge is not None, "levels that are not rendered need `enlarge`"
                 rgb, shown_by = enlarge(rgb, shown_by, camera), camera
-            if level == last:
+            if not levels:
                 # The model reproduces the exposure best at the size that it learned from.
                 colors = _match(photograph, rendering.rgb, rendering.alpha)
             if level == depth_level:
                 depth = label_depth(rendering, near=near, far=far)
             levels.append(np.asarray(_subtract(photograph, rgb, colors)).reshape(-1, 6))
-        return levels, depth
+        return levels[::-1], depth
 
-    depths, images = [], iter(np.split(values, extents.prod(-1).cumsum()[:-1]))
+    images, depths = iter(np.split(values, extents.prod(-1).cumsum()[:-1])), []
     for levels, depth in each(compare, rows.tolist()):
-        for image in levels[::-1]:
-            next(images)[:] = image
         depths.append(depth)
+        for image in levels:
+            next(images)[:] = image
     shown = Pyramid(jax.device_put(values), pyramid.intrinsics[rows], jnp.asarray(extents))
-    cameras = pyramid.cameras(jax.tree.map(lambda leaf: leaf[rows], cameras), depth_level)
-    return Residuals(shown, cameras, _stack(depths, pyramid.sizes[depth_level]))
+    own = pyramid.cameras(jax.tree.map(lambda leaf: leaf[rows], cameras), depth_level)
+    return Residuals(shown, own, _stack(depths, pyramid.sizes[depth_level]))
 
 
 def _stack(images: Sequence[Any], size: tuple[int, int]) -> jax.Array:

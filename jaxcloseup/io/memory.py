@@ -4,9 +4,6 @@ import contextlib
 import ctypes
 import os
 import pathlib
-from typing import Any
-
-import numpy as np
 
 
 def installed_memory() -> int:
@@ -15,20 +12,6 @@ def installed_memory() -> int:
     with contextlib.suppress(OSError, ValueError):  # the file says "max" without a limit
         held = min(held, int(pathlib.Path("/sys/fs/cgroup/memory.max").read_text()))
     return held
-
-
-_ALIGNED = 64  # bytes, as XLA wants its buffers
-
-
-def empty_for_jax(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-    """Return an array without values that `jax.device_put` does not copy on a CPU.
-
-    Nothing may be written to it from then on.
-    """
-    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
-    whole = np.empty(size + _ALIGNED, np.uint8)
-    start = -whole.ctypes.data % _ALIGNED
-    return whole[start : start + size].view(dtype).reshape(shape)
 
 
 # Parameters of glibc's mallopt.

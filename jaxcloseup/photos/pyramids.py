@@ -10,7 +10,7 @@ import numpy as np
 from flax import struct
 
 from jaxcloseup.geometry.cameras import Camera, mean_focal
-from jaxcloseup.io.memory import empty_for_jax
+from jaxcloseup.io.buffers import empty_for_jax
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.views import Photograph, Views, to_float, unpadded
 

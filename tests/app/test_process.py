@@ -324,11 +324,13 @@ def test_flags_that_make_no_sense_are_one_sentence(tmp_path):
             run_process(**given)
         assert "\n" not in error.value.code and error.value.code.startswith("jaxcloseup process: ")
         assert not (tmp_path / "out").exists()
-    renamed = [tmp_path / f"heic/{i}.HEIC" for i in range(3)]
+    renamed = [pathlib.Path(f"heic/{i}.HEIC") for i in range(3)]
     with pytest.raises(
         solver_process.ProcessingError, match=r"only 0 .*0\.HEIC is a HEIC photograph, which"
     ):
-        copy_photographs(renamed, tmp_path / "out")
+        copy_photographs(
+            [path.relative_to(tmp_path) for path in renamed], tmp_path, tmp_path / "out"
+        )
     with pytest.raises(flags.IllegalFlagValueError, match="count"):
         run_process(video=video, count=2)
     write_noise(tmp_path / "noise", 3)

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxcloseup.io import memory
+from jaxcloseup.io import buffers, memory
 
 
 def test_glibc_keeps_freed_memory_until_it_is_given_back(monkeypatch):
@@ -36,7 +36,7 @@ def test_other_c_libraries_change_nothing(monkeypatch, library):
 
 
 def test_jax_on_a_cpu_takes_arrays_without_a_copy():
-    array = memory.empty_for_jax((3, 5, 4), np.int8)
+    array = buffers.empty_for_jax((3, 5, 4), np.int8)
     assert (array.shape, array.dtype) == ((3, 5, 4), np.int8)
     taken = jax.device_put(array, jax.devices("cpu")[0])
     assert taken.unsafe_buffer_pointer() == array.ctypes.data
