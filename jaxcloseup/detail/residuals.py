@@ -108,7 +108,7 @@ def render_residuals(
 
     def compare(view: int) -> tuple[list[np.ndarray], jax.Array]:
         """Return the residual of each level, the finest first, and the depth at one."""
-        levels = []
+        levels: list[np.ndarray] = []
         for level in reversed(range(len(pyramid.sizes))):
             camera = pyramid.camera(camera_at(cameras, view), view, level)
             photograph = pyramid.image(view, level)

@@ -328,9 +328,7 @@ def test_flags_that_make_no_sense_are_one_sentence(tmp_path):
     with pytest.raises(
         solver_process.ProcessingError, match=r"only 0 .*0\.HEIC is a HEIC photograph, which"
     ):
-        copy_photographs(
-            [path.relative_to(tmp_path) for path in renamed], tmp_path, tmp_path / "out"
-        )
+        copy_photographs(renamed, tmp_path, tmp_path / "out")
     with pytest.raises(flags.IllegalFlagValueError, match="count"):
         run_process(video=video, count=2)
     write_noise(tmp_path / "noise", 3)
