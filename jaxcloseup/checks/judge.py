@@ -17,7 +17,7 @@ from jaxcloseup.checks.point_patches import coverage, find_points_mistake, fit_p
 FITS, LOOSE, MISFIT, UNKNOWN = "fits", "loose", "misfit", "unknown"
 _FEWEST = 60  # matches, below which nothing is said of poses
 _MOST_WRONG = 0.5  # share of matches that do not fit, from which the capture is refused
-_BLURRED = 1.0  # pixels of median error from which close-ups are blurred
+_BLURRED = 0.8  # pixels of median error from which close-ups are blurred
 _SHOWN = 0.3  # share of points with texture in two photographs, below which a turn may show more
 _FEW_VIEWS = 3  # of photographs that depth needs; most that see a point may be hidden from it
 _BAD = 0.3  # share of a photograph's fitting matches below which its pose is wrong
