@@ -4,13 +4,14 @@ Images are RGB `[H, W, 3]` or gray `[H, W]`; floats in [0, 1] or uint8; NumPy or
 """
 
 import base64
+import io
 import pathlib
 from collections.abc import Callable, Iterable, Sequence
 
 import cv2
-import imageio.v3 as imageio
 import jax
 import numpy as np
+import PIL.Image
 
 from jaxcloseup.io.files import write_file
 
@@ -31,7 +32,7 @@ def to_uint8(image: Image) -> np.ndarray:
         raise ValueError(f"an image must be [H, W, 3] or [H, W], got {image.shape}.")
     if image.dtype != np.uint8:
         image = np.rint(np.clip(np.nan_to_num(image.astype(np.float32)), 0, 1) * 255)
-    image = image.astype(np.uint8)
+    image = image.astype(np.uint8, copy=False)
     return np.repeat(image[..., None], 3, 2) if image.ndim == 2 else image
 
 
@@ -66,14 +67,17 @@ def encode_webp_animation(frames: Sequence[Image], *, fps: float, quality: int =
     """Encode frames of one size as the bytes of a WebP that plays for ever.
 
     Args:
-      frames: at least one image.
+      frames: at least one image; one that is shown several times is kept once.
       fps: frames per second.
       quality: WebP's, 1 to 100.
     """
-    shown = [to_uint8(frame) for frame in frames]
-    return imageio.imwrite(
-        "<bytes>", shown, extension=".webp", duration=round(1000 / fps), loop=0, quality=quality
-    )
+    each = {id(frame): frame for frame in frames}
+    made = {key: PIL.Image.fromarray(to_uint8(frame)) for key, frame in each.items()}
+    first, *rest = (made[id(frame)] for frame in frames)
+    file, duration = io.BytesIO(), round(1000 / fps)
+    options = {"duration": duration, "loop": 0, "quality": quality}
+    first.save(file, "WEBP", save_all=True, append_images=rest, **options)
+    return file.getvalue()
 
 
 def colorize_depth(

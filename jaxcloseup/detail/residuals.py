@@ -106,8 +106,8 @@ def render_residuals(
     values = empty_for_jax((int(extents.prod(-1).sum()), 6), np.int8)
     depth_level = max(rendered, pyramid.level_near(FINER_DEPTHS * cameras.width))
 
-    def compare(view: int) -> tuple[list[np.ndarray], jax.Array]:
-        """Return the residual of each level, the finest first, and the depth at one."""
+    def compare(view: int) -> tuple[np.ndarray, jax.Array]:
+        """Return the residuals of all levels, the finest first, and the depth at one."""
         levels: list[np.ndarray] = []
         for level in reversed(range(len(pyramid.sizes))):
             camera = pyramid.camera(camera_at(cameras, view), view, level)
@@ -123,13 +123,12 @@ def render_residuals(
             if level == depth_level:
                 depth = label_depth(rendering, near=near, far=far)
             levels.append(np.asarray(_subtract(photograph, rgb, colors)).reshape(-1, 6))
-        return levels[::-1], depth
+        return np.concatenate(levels[::-1]), depth
 
-    images, depths = iter(np.split(values, extents.prod(-1).cumsum()[:-1])), []
-    for levels, depth in each(compare, rows.tolist()):
+    depths, of_views = [], np.split(values, extents.prod(-1).sum(-1).cumsum()[:-1])
+    for residual, (found, depth) in zip(of_views, each(compare, rows.tolist()), strict=True):
+        residual[:] = found
         depths.append(depth)
-        for image in levels:
-            next(images)[:] = image
     shown = Pyramid(jax.device_put(values), pyramid.intrinsics[rows], jnp.asarray(extents))
     own = pyramid.cameras(jax.tree.map(lambda leaf: leaf[rows], cameras), depth_level)
     return Residuals(shown, own, _stack(depths, pyramid.sizes[depth_level]))

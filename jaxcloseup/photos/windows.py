@@ -4,6 +4,7 @@ A window is a camera with a shifted principal point, so a field renders it as an
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -87,6 +88,8 @@ def windows_that_see(
 ) -> Windows:
     """Restrict windows to places around the surfaces that other cameras see; `key` is consumed.
 
+    Outside of `jax.jit`, which would copy the photographs.
+
     Pixels of these cameras are drawn uniformly, and for each one of the photographs that see its
     surface; a pixel that none sees draws a place in any photograph.
 
@@ -100,6 +103,24 @@ def windows_that_see(
       count: number K of places.
       tolerance: relative difference of depths up to which a photograph sees a surface.
     """
+    sizes = windows.pyramid.extents[:, -1, ::-1]
+    of_cameras, of_views = (cameras, depths), (views.cameras, view_depths, views.weight)
+    places = _find_places(key, of_cameras, of_views, sizes, count=count, tolerance=tolerance)
+    return dataclasses.replace(windows, places=places)
+
+
+@functools.partial(jax.jit, static_argnames=("count", "tolerance"))
+def _find_places(
+    key: jax.Array,
+    of_cameras: tuple[Camera, jax.Array],
+    of_views: tuple[Camera, jax.Array, jax.Array],
+    sizes: jax.Array,
+    *,
+    count: int,
+    tolerance: float,
+) -> jax.Array:
+    """Return `Windows.places`; `sizes` `[V, 2]` are width and height of views without padding."""
+    cameras, depths = of_cameras
     key_camera, key_pixel, key_view, key_any = jax.random.split(key, 4)
     which = jax.random.randint(key_camera, (count,), 0, depths.shape[0])
     size = jnp.array([cameras.width, cameras.height], jnp.float32)
@@ -118,19 +139,18 @@ def windows_that_see(
         landed, _, weight = sample_where_visible(camera, view_depth, weight, points, tolerance)
         return landed, weight
 
-    landed, seen = jax.vmap(look)(views.cameras, view_depths, views.weight)
+    landed, seen = jax.vmap(look)(*of_views)
     seen = jnp.where(depth[None] > 0, seen, 0)
     # Any photograph is as good as another where none sees the point.
     view = jax.random.categorical(key_view, jnp.log(seen + 1e-6), axis=0)
     chosen = view, jnp.arange(count)
-    size = jnp.array([views.cameras.width, views.cameras.height], jnp.float32)
+    size = jnp.array([of_views[0].width, of_views[0].height], jnp.float32)
     # Views of a photograph that is smaller than others are padded.
-    own = windows.pyramid.extents[:, -1, ::-1].astype(jnp.float32)
+    own = sizes.astype(jnp.float32)
     shares = landed[chosen] / size[None] * (own.max(0)[None] / own)[view]
     anywhere = jax.random.uniform(key_any, (count, 2))
     place = jnp.where(seen[chosen][:, None] > 0, shares, anywhere)
-    places = jnp.concatenate([view[:, None].astype(place.dtype), place], 1)
-    return dataclasses.replace(windows, places=places)
+    return jnp.concatenate([view[:, None].astype(place.dtype), place], 1)
 
 
 def sample_window(key: jax.Array, windows: Windows) -> Batch:

@@ -65,7 +65,7 @@ def prepare_target_views(
         state = method.add_for_targets(key_add, field, state, views, render, programs.scene)
         if isinstance(photographs, Windows):
             depths = rendered_depths(render, cameras, programs.scene)
-            photographs = jax.jit(windows_that_see)(
+            photographs = windows_that_see(
                 key_windows, photographs, cameras, depths, start.sources.views, start.sources.depths
             )
             # What is compiled for windows of photographs serves windows of labels too, and a step
