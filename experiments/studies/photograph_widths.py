@@ -138,7 +138,10 @@ def _write_capture(scene: Scene, folder: pathlib.Path, width: int) -> None:
             intrinsics = dict(
                 zip(("fx", "fy", "cx", "cy"), map(float, camera.intrinsics), strict=True)
             )
-            frames.append({"file_path": name, "transform_matrix": pose.tolist()} | intrinsics)
+            size = {"w": camera.width, "h": camera.height}
+            frames.append(
+                {"file_path": name, "transform_matrix": pose.tolist(), **intrinsics, **size}
+            )
         text = json.dumps({"near": scene.near, "far": scene.far, "frames": frames})
         (folder / f"transforms_{split}.json").write_text(text)
     points = np.column_stack([scene.points, np.round(255 * np.asarray(scene.rgb)).astype(int)])

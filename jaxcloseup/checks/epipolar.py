@@ -25,7 +25,7 @@ class Fit(NamedTuple):
     median: float  # median error in pixels
     by_view: np.ndarray  # `[V]` share of each photograph's matches that fit; NaN without matches
     # `[V]` the same of the best of the photographs that it matches; NaN if there are less than two,
-    # because a repeated pattern may match a photograph wrongly
+    # or half as many matches as usual, because a repeated pattern may match a photograph wrongly
     by_best: np.ndarray
 
 
@@ -68,7 +68,8 @@ def fit(matches: Matches, cameras: Cameras) -> Fit:
     by_best = np.full(count, -1.0)
     for side in range(2):
         np.maximum.at(by_best, pairs[:, side], shares)
-    by_best[np.bincount(pairs.ravel(), minlength=count) < 2] = np.nan
+    few = total < np.median(total[total > 0]) / 2 if total.any() else total == 0
+    by_best[few | (np.bincount(pairs.ravel(), minlength=count) < 2)] = np.nan
     return Fit(float(inside.mean()), float(np.median(errors)), by_view, by_best)
 
 
