@@ -8,7 +8,7 @@ __all__, __getattr__, __dir__ = lazy_names(
     {
         "config": "StereoConfig",
         "consistency": "Confirmed count_consistent",
-        "estimate": "StereoMaps estimate_depths",
+        "stereo_maps": "StereoMaps estimate_depths",
         "matching": "Photographs match_planes pack_photographs",
         "neighbors": "choose_neighbors",
         "planes": "Relative plane_normals relative_transforms shift_planes",

@@ -119,31 +119,27 @@ class _Patches(NamedTuple):
     gray: jax.Array
 
 
-def _offsets(config: StereoConfig) -> list[tuple[int, int]]:
-    """Return (dx, dy) of the samples of a patch."""
-    steps = range(-config.radius, config.radius + 1, config.stride)
-    return [(dx, dy) for dy in steps for dx in steps]
+def _offsets(config: StereoConfig) -> jax.Array:
+    """Return (dx, dy) of the samples of a patch, `[S, 2]` int32."""
+    steps = jnp.arange(-config.radius, config.radius + 1, config.stride)
+    return jnp.stack(jnp.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
 
 
-def _read_patches(
-    photographs: Photographs, reference: jax.Array, config: StereoConfig
-) -> _Patches:
+def _read_patches(photographs: Photographs, reference: jax.Array, config: StereoConfig) -> _Patches:
     gray = (photographs.quads[reference] & 255).astype(jnp.float32)
-    height, width = gray.shape
     gray_scale, pixel_scale, _ = _scales(config)
-    padding = config.radius
-
-    def around(image: jax.Array, dx: int, dy: int) -> jax.Array:
-        padded = jnp.pad(image, padding, mode="edge")
-        return padded[padding + dy :, padding + dx :][:height, :width]
-
-    samples = jnp.stack([around(gray, dx, dy) for dx, dy in _offsets(config)])
-    counts = jnp.stack(
-        [around(photographs.weight[reference], dx, dy) > 0 for dx, dy in _offsets(config)]
+    padded, counts = (
+        jnp.pad(image, config.radius, mode="edge")
+        for image in (gray, photographs.weight[reference] > 0)
     )
-    far = jnp.array([pixel_scale * (dx * dx + dy * dy) for dx, dy in _offsets(config)])
-    apart = gray_scale * (samples - gray[None]) ** 2
-    weight = jnp.where(counts, jnp.exp(-apart - far[:, None, None]), 0)
+
+    def sample(offset: jax.Array) -> tuple[jax.Array, jax.Array]:
+        start = offset[::-1] + config.radius
+        own, count = (jax.lax.dynamic_slice(image, start, gray.shape) for image in (padded, counts))
+        far = pixel_scale * jnp.sum(offset**2).astype(gray.dtype)
+        return jnp.where(count, jnp.exp(-gray_scale * (own - gray) ** 2 - far), 0), own
+
+    weight, samples = jax.vmap(sample)(_offsets(config))
     total = jnp.maximum(jnp.sum(weight, axis=0), 1e-12)
     return _Patches(weight / total[None], samples)
 
@@ -161,19 +157,19 @@ def _compare(
     quads, weight = photographs.quads[neighbor], photographs.weight[neighbor]
     pixels = pixel_grid(height, width)
 
-    def project(dx: int, dy: int) -> tuple[jax.Array, jax.Array]:
+    def project(offset: jax.Array) -> tuple[jax.Array, jax.Array]:
+        dx, dy = offset.astype(plane.dtype)
         inverse = plane[0] + dx * plane[1] + dy * plane[2]
-        moved = jnp.stack([pixels[..., 0] + dx, pixels[..., 1] + dy], axis=-1)
-        one = jnp.concatenate([moved, jnp.ones_like(inverse)[..., None], inverse[..., None]], -1)
-        seen = matmul(one, transform.T)
+        one = jnp.stack([pixels[..., 0] + dx, pixels[..., 1] + dy, jnp.ones_like(inverse), inverse])
+        seen = jnp.moveaxis(matmul(transform, one.reshape(4, -1)).reshape(3, height, width), 0, -1)
         return seen[..., :2] / seen[..., 2:], seen[..., 2]
 
-    landed, ratio = project(0, 0)
+    landed, ratio = project(jnp.zeros(2))
     x, y = landed[..., 0], landed[..., 1]
     inside = (ratio > 1e-6) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
     column, row = (jnp.clip(at, 0, size - 1).astype(int) for at, size in ((x, width), (y, height)))
     inside &= (weight[row, column] > 0) & (neighbor >= 0)
-    grays = jnp.stack([_read(quads, project(*offset)[0]) for offset in _offsets(config)])
+    grays = jax.vmap(lambda offset: _read(quads, project(offset)[0]))(_offsets(config))
 
     def average(of: jax.Array) -> jax.Array:
         return jnp.sum(patches.weight * of, axis=0)

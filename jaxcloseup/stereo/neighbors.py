@@ -10,11 +10,7 @@ _GRID, _DEPTHS, _MOST_POINTS = 6, 4, 512  # samples of a photograph's view; poin
 
 
 def choose_neighbors(
-    cameras: Camera,
-    near: float,
-    far: float,
-    config: StereoConfig,
-    points: np.ndarray | None = None,
+    cameras: Camera, near: float, far: float, config: StereoConfig, points: np.ndarray | None = None
 ) -> np.ndarray:
     """Choose neighbors by the surface that they share, and by the angles at which they see it.
 
@@ -33,7 +29,9 @@ def choose_neighbors(
     Returns:
       `[V, N]` int32 indices of the photographs, the best ones first; -1 where there is none.
     """
-    pose, lens = (np.asarray(array, np.float64) for array in (cameras.camtoworld, cameras.intrinsics))
+    pose, lens = (
+        np.asarray(array, np.float64) for array in (cameras.camtoworld, cameras.intrinsics)
+    )
     size = np.array([cameras.width, cameras.height])
     chosen = np.full((len(pose), config.neighbors), -1, np.int32)
     given = np.zeros((0, 3)) if points is None else np.asarray(points, np.float64)
@@ -81,7 +79,9 @@ def _worth(
     return worth, rays
 
 
-def _project(pose: np.ndarray, lens: np.ndarray, points: np.ndarray, size: np.ndarray) -> np.ndarray:
+def _project(
+    pose: np.ndarray, lens: np.ndarray, points: np.ndarray, size: np.ndarray
+) -> np.ndarray:
     """Return which views `[V]` show points `[P, 3]`: `[V, P]` bool."""
     local = np.einsum("vpc,vck->vpk", points - pose[:, None, :, 3], pose[:, :, :3])
     depth = np.maximum(local[..., 2:], 1e-12)
@@ -94,8 +94,12 @@ def _view_samples(
 ) -> np.ndarray:
     """Return points `[P, 3]` on a grid of pixels of one view, at depths from near to far."""
     share = (np.arange(_GRID) + 0.5) / _GRID
-    x, y = np.meshgrid(*((share * side - center) / focal
-                         for side, center, focal in zip(size, lens[2:], lens[:2], strict=True)))
+    x, y = np.meshgrid(
+        *(
+            (share * side - center) / focal
+            for side, center, focal in zip(size, lens[2:], lens[:2], strict=True)
+        )
+    )
     rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
     depths = np.geomspace(near, far, _DEPTHS + 2)[1:-1]
     local = (depths[:, None, None] * rays).reshape(-1, 3)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcloseup.photos.views import camera_at
 from jaxcloseup.stereo.config import StereoConfig
@@ -19,14 +20,10 @@ from jaxcloseup.stereo.planes import shift_planes
 
 _STEEPEST = 4.0  # tangent of the largest tilt along one axis
 _TILT = 20.0  # change of slopes that is tried, beside that of inverse depth
-# Where each round looks for planes: the best of each group is tried.
-_RAYS = (
-    *[[(dx * k, dy * k) for k in (1, 3)] for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1))],
-    *[
-        [(dx * k, dy * k) for k in (5, 9, 15)]
-        for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1))
-    ],
-)
+# Where each round looks for planes, in pixels along each of four directions: the cheapest of each
+# group is tried.
+_GROUPS = (1, 2, 3), (5, 9, 15)
+_DIRECTIONS = (1, 0), (-1, 0), (0, 1), (0, -1)
 
 
 class Matched(NamedTuple):
@@ -110,22 +107,23 @@ def _choose(planes: jax.Array, costs: jax.Array) -> Matched:
 
 def _planes_around(matched: Matched) -> jax.Array:
     """Return the cheapest planes of pixels in eight directions, continued to each pixel."""
-    most = max(abs(step) for ray in _RAYS for offset in ray for step in offset)
-    height, width = matched.cost.shape
-    planes = jnp.pad(matched.planes, ((0, 0), (most, most), (most, most)), mode="edge")
-    cost = jnp.pad(matched.cost, most, constant_values=2)
+    most = max(map(max, _GROUPS))
+    padded = jnp.pad(matched.planes, ((0, 0), (most, most), (most, most)), mode="edge")
+    padded_cost = jnp.pad(matched.cost, most, constant_values=2)
+    shape = matched.planes.shape
 
-    def look(dx: int, dy: int) -> Matched:
-        rows, columns = slice(most + dy, most + dy + height), slice(most + dx, most + dx + width)
-        return Matched(shift_planes(planes[:, rows, columns], -dx, -dy), cost[rows, columns])
+    def best_of(steps: jax.Array) -> jax.Array:
+        def look(step: jax.Array) -> Matched:
+            dx, dy = step
+            planes = jax.lax.dynamic_slice(padded, (0, most + dy, most + dx), shape)
+            cost = jax.lax.dynamic_slice(padded_cost, (most + dy, most + dx), shape[1:])
+            dx, dy = -step.astype(planes.dtype)
+            return Matched(shift_planes(planes, dx, dy), cost)
 
-    def best_of(ray: list[tuple[int, int]]) -> jax.Array:
-        found = [look(*offset) for offset in ray]
-        return _choose(
-            jnp.stack([own.planes for own in found]), jnp.stack([own.cost for own in found])
-        ).planes
+        return _choose(*jax.lax.map(look, steps)).planes
 
-    return jnp.stack([best_of(ray) for ray in _RAYS])
+    groups = np.array(_GROUPS)[:, None, :, None] * np.array(_DIRECTIONS)[None, :, None]
+    return jax.lax.map(best_of, jnp.asarray(groups.reshape(-1, len(_GROUPS[0]), 2)))
 
 
 def _changed(key: jax.Array, planes: jax.Array, focal: jax.Array, scale: jax.Array) -> jax.Array:

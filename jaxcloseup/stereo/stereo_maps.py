@@ -104,9 +104,7 @@ def _match_level(item, photographs: Photographs, config: StereoConfig, level: in
     def take_round(matched: Matched, index: jax.Array) -> tuple[Matched, None]:
         scale = jnp.exp2(-index.astype(jnp.float32)) / (_PARALLAX * focal)
         own = jax.random.fold_in(key, index)
-        return refine_planes(
-            own, photographs, reference, neighbors, matched, scale, config
-        ), None
+        return refine_planes(own, photographs, reference, neighbors, matched, scale, config), None
 
     return jax.lax.scan(take_round, matched, jnp.arange(config.iterations[level]))[0]
 
