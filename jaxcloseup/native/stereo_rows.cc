@@ -103,7 +103,7 @@ V compare(const Match& job, const Patches& patches, int which, const V* plane, V
   }
   const float last_x = job.width - 1, last_y = job.height - 1;
   const V scale = 1.f / at[2], u = at[0] * scale, v = at[1] * scale;
-  const M seen = less(broadcast(1e-6f), at[2]) & at_most(V{}, u) & less(u, broadcast(job.width)) &
+  const M seen = less(V{}, plane[0]) & less(broadcast(1e-6f), at[2]) & at_most(V{}, u) & less(u, broadcast(job.width)) &
                  at_most(V{}, v) & less(v, broadcast(job.height));
   if (!any(seen)) return broadcast(1);
   const I own = truncate(clamp(v, last_y)) * job.width + truncate(clamp(u, last_x));

@@ -17,12 +17,12 @@ class StereoConfig:
         20.0, "difference of gray levels at which a patch's pixel has 1 / e of its weight", low=0.1
     )
     noise: float = setting(
-        2.0, "variance of gray levels that counts as noise, not as contrast", low=0
+        2.0, "variance of gray levels that counts as noise, not as contrast", low=1e-3
     )
     levels: int = setting(3, "sizes from coarse to fine, each half of the next", low=1, high=8)
     sweep: int = setting(96, "depths tried at every pixel of the coarsest size", low=1)
     iterations: tuple[int, ...] = setting(
-        (3, 3, 4), "rounds of propagation and refinement at each size, from fine to coarse", low=0
+        (2, 2, 4), "rounds of propagation and refinement at each size, from fine to coarse", low=0
     )
     min_angle: float = setting(0.05, "smallest useful angle between two rays in radians")
     max_angle: float = setting(0.45, "largest useful angle between two rays in radians")

@@ -168,7 +168,7 @@ def _compare(
     x, y = landed[..., 0], landed[..., 1]
     inside = (ratio > 1e-6) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
     column, row = (jnp.clip(at, 0, size - 1).astype(int) for at, size in ((x, width), (y, height)))
-    inside &= (weight[row, column] > 0) & (neighbor >= 0)
+    inside &= (weight[row, column] > 0) & (neighbor >= 0) & (plane[0] > 0)
     grays = jax.vmap(lambda offset: _read(quads, project(offset)[0]))(_offsets(config))
 
     def average(of: jax.Array) -> jax.Array:
