@@ -1,5 +1,6 @@
 """Estimate depth and normal maps of photographs from the photographs alone."""
 
+import functools
 from typing import NamedTuple
 
 import chex
@@ -55,21 +56,27 @@ def estimate_depths(
       near: `[]` or `[V]` smallest z-depth, world units.
       far: `[]` or `[V]` largest z-depth.
       config: see there.
+
+    Returns:
+      `StereoMaps` of all photographs; where confidence is 0, depth is a guess or undefined.
+
+    Raises:
+      ValueError: `config.iterations` has fewer numbers than there are levels.
     """
     chex.assert_rank([views.rgb, neighbors], [4, 2])
+    if len(config.iterations) < config.levels:
+        raise ValueError(
+            f"iterations has {len(config.iterations)} numbers, and levels is {config.levels}: "
+            "each level needs one"
+        )
     count = len(views)
     near, far = (jnp.broadcast_to(jnp.asarray(z, jnp.float32), (count,)) for z in (near, far))
     levels = make_levels(views, config)
     planes = None
     for level, photographs in reversed([*enumerate(levels)]):
-        key, own = jax.random.split(key)
-        keys = jax.random.split(own, count)
-        arrays = (keys, jnp.arange(count), neighbors, near, far)
-
-        def match(item, photographs=photographs, level=level):
-            return _match_level(item, photographs, config, level)
-
-        matched = jax.lax.map(match, (*arrays, planes))
+        match = functools.partial(_match_level, photographs, config, level)
+        keys = jax.random.split(jax.random.fold_in(key, level), count)
+        matched = jax.lax.map(match, _Item(keys, jnp.arange(count), neighbors, near, far, planes))
         planes = matched.planes
     return join_maps(levels[0], matched, neighbors, config)
 
@@ -89,7 +96,21 @@ def make_levels(views: Views, config: StereoConfig) -> list[Photographs]:
     return levels
 
 
-def _match_level(item, photographs: Photographs, config: StereoConfig, level: int) -> Matched:
+class _Item(NamedTuple):
+    """What is different for each photograph; `planes` are those of the next coarser size."""
+
+    key: jax.Array
+    reference: jax.Array
+    neighbors: jax.Array
+    near: jax.Array
+    far: jax.Array
+    planes: jax.Array | None
+
+
+def _match_level(
+    photographs: Photographs, config: StereoConfig, level: int, item: _Item
+) -> Matched:
+    """Return the best planes of one photograph at one size."""
     key, reference, neighbors, near, far, planes = item
     height, width = photographs.quads.shape[1:]
     if planes is None:
