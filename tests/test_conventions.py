@@ -10,7 +10,7 @@ PACKAGE = pathlib.Path(__file__).parents[1] / "jaxcloseup"
 
 MODULES = {str(path.relative_to(PACKAGE)): path for path in sorted(PACKAGE.rglob("*.py"))}
 SCRIPTS = {str(path): path for path in sorted((PACKAGE.parent / "experiments").rglob("*.py"))}
-ROOMS = ("geometry", "photos", "fields", "labels", "detail", "training", "metrics")
+ROOMS = ("geometry", "photos", "fields", "labels", "detail", "training", "metrics", "stereo")
 PUBLIC = [name for name in MODULES if name.split("/")[0] in ROOMS]
 LONGEST_MODULE, LONGEST_FUNCTION, MOST_POSITIONAL = 300, 60, 7
 # A docstring begins with a verb: what the function does, not what its result is.

@@ -17,6 +17,7 @@ MAY_IMPORT = {
     "native": set(),
     "photos": {"geometry", "io", "native"},
     "metrics": {"geometry", "io"},
+    "stereo": {"geometry", "io", "native", "photos"},
     "fields": {"geometry", "metrics", "native", "photos"},
     "labels": {"geometry", "photos", "fields"},
     "detail": {"geometry", "io", "metrics", "native", "photos", "fields", "labels"},
@@ -43,7 +44,7 @@ ROOMS = {
     },
 }
 LIBRARIES_OF_GEOMETRY = {"jax", "chex", "flax", "typing", "collections", "jaxcloseup"}
-MOST_PROGRAMS, MOST_ROOMS = 11, 14
+MOST_PROGRAMS, MOST_ROOMS = 11, 15
 # What tells one type of field from another.
 FIELD_TYPES = re.compile(
     r"isinstance\([^)]*(Surfel|Nerf|Mcmc|Adaptive|Buffers|Aux)"

@@ -11,11 +11,11 @@ import pathlib
 import jax
 
 
-# The functions that XLA may call, of `splats.cc`, `surfels.cc` and `gather.cc`.
+# The functions that XLA may call, of `splats.cc`, `surfels.cc`, `gather.cc` and `stereo.cc`.
 TARGETS = (
     *("splats_forward", "splats_backward", "splats_count"),
     *("surfels_forward", "surfels_backward"),
-    "gather",
+    *("gather", "stereo"),
 )
 
 INSTALL = (

@@ -69,3 +69,6 @@ void call_twice(const char* name, XLA_FFI_Handler* handler, const Make& make, Re
 
 // Gathers once; in `fuzz_gather.cc`.
 void fuzz_gathering();
+
+// Matches patches once; in `fuzz_stereo.cc`.
+void fuzz_matching();

@@ -185,6 +185,7 @@ int main(int, char** arguments) {
     const Size size = Size::draw();
     number % 2 ? fuzz_surfels(size) : fuzz_tables(size);
     fuzz_gathering();
+    fuzz_matching();
   }
   check_limits();
   std::printf("%d cases\n", cases);

@@ -61,6 +61,7 @@ struct Array {
 
 inline XLA_FFI_DataType type_of(const float*) { return XLA_FFI_DataType_F32; }
 inline XLA_FFI_DataType type_of(const int32_t*) { return XLA_FFI_DataType_S32; }
+inline XLA_FFI_DataType type_of(const uint32_t*) { return XLA_FFI_DataType_U32; }
 inline XLA_FFI_DataType type_of(const int64_t*) { return XLA_FFI_DataType_S64; }
 inline XLA_FFI_DataType type_of(const int8_t*) { return XLA_FFI_DataType_S8; }
 inline XLA_FFI_DataType type_of(const uint8_t*) { return XLA_FFI_DataType_U8; }
