@@ -8,6 +8,7 @@ scenes, and to the visible points of captures, where *all pixels* means all such
 """
 
 import time
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
@@ -96,6 +97,23 @@ def by_sgbm(scene: Scene, neighbors: np.ndarray) -> Timed:
     return Timed(np.stack(depth), time.process_time() - start, None)
 
 
+def _disparities(images: Sequence[np.ndarray], lowest: int, count: int) -> np.ndarray:
+    """Return disparities `[H, W]` of two rectified images; below `lowest` where none is found."""
+    matcher = cv2.StereoSGBM_create(
+        lowest,
+        count,
+        5,
+        P1=8 * 3 * 25,
+        P2=32 * 3 * 25,
+        disp12MaxDiff=1,
+        uniquenessRatio=10,
+        speckleWindowSize=100,
+        speckleRange=2,
+        mode=cv2.STEREO_SGBM_MODE_HH,
+    )
+    return matcher.compute(*images).astype(np.float32) / 16
+
+
 def _match_pair(scene: Scene, images: np.ndarray, view: int, other: int) -> np.ndarray:
     """Return the z-depths `[H, W]` of one photograph where it matches another."""
     cameras = [camera_at(scene.train.cameras, index) for index in (view, other)]
@@ -135,19 +153,7 @@ def _match_pair(scene: Scene, images: np.ndarray, view: int, other: int) -> np.n
     shift = left[0] - left[1]  # columns between disparity 0 and that of points at infinity
     lowest = int(np.floor(-shift))
     count = 16 * int(np.ceil((focal * baseline / nearest + 1) / 16))
-    matcher = cv2.StereoSGBM_create(
-        lowest,
-        count,
-        5,
-        P1=8 * 3 * 25,
-        P2=32 * 3 * 25,
-        disp12MaxDiff=1,
-        uniquenessRatio=10,
-        speckleWindowSize=100,
-        speckleRange=2,
-        mode=cv2.STEREO_SGBM_MODE_HH,
-    )
-    disparity = matcher.compute(*flat).astype(np.float32) / 16
+    disparity = _disparities(flat, lowest, count)
     valid = disparity >= lowest
     inverse = np.where(valid, (disparity + shift) / (focal * baseline), 0)
     # Back to the photograph's pixels, whose z-depth is that along its own axis.
