@@ -255,7 +255,9 @@ def trained(name, capture_folder):
     numbers = np.random.default_rng(0)
     points = np.float32(np.column_stack([numbers.uniform(-0.5, 0.5, (200, 2)), np.zeros(200)]))
     rgb = np.float32(plane.texture(points))
-    scene = dataclasses.replace(load_scene(str(capture_folder)), points=points, rgb=rgb)
+    scene = load_scene(str(capture_folder))
+    points = np.float32(scene.placement.to_scene(points))
+    scene = dataclasses.replace(scene, points=points, rgb=rgb)
     programs = Programs(tiny_preset(name), scene)
     state = initial_state(programs, run_keys(0))
     return programs, programs.run(state, TrainData(scene.train), count=3)[0]
