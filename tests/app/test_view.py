@@ -59,6 +59,7 @@ def serve(viser):
         server.stop()
 
 
+RESTS = 1.0  # seconds without work after which the window is at rest
 MIDDLE = np.s_[:, 340:640]  # of a window of 1280 pixels, what no panel or sign covers
 
 
@@ -78,6 +79,13 @@ def sees(browser, expected, seconds=20):
         if off < 3 or time.monotonic() > until:
             return off
         time.sleep(0.1)
+
+
+def settle(page):
+    """Work until nothing has moved for `RESTS` seconds."""
+    with contextlib.suppress(queue.Empty):
+        while True:
+            page.work(timeout=RESTS)
 
 
 def click(browser, page):
@@ -116,15 +124,18 @@ def test_the_window_shows_the_rendered_closeup_in_a_browser(serve, kept, monkeyp
         assert sees(browser, before) < 3
         seconds = []
         for _ in range(2):
-            with contextlib.suppress(queue.Empty):  # until nothing moves
-                while True:
-                    page.work(timeout=1)
+            settle(page)
             visitor._status.content = ""
             start = click(browser, page)
-            while visitor._rendered is None or "photographs show" not in visitor._status.content:
+            # The window may be rendered once more where the browser reports a camera late, and
+            # the renders' status then stands in place of what the click has found.
+            found = "photographs show" in visitor._status.content
+            while visitor._rendered is None or not found:
                 page.work(timeout=30)
+                found |= "photographs show" in visitor._status.content
+            settle(page)
             assert sees(browser, expected()) < 3
-            seconds.append(time.monotonic() - start)
+            seconds.append(time.monotonic() - start - RESTS)
         # The second click takes less than 2 seconds on two quiet cores; here others work too.
         assert seconds[1] < 8, seconds
         assert np.abs(expected() - before).mean() > 3
