@@ -27,8 +27,8 @@ class StereoConfig:
     min_angle: float = setting(0.05, "smallest useful angle between two rays in radians")
     max_angle: float = setting(0.45, "largest useful angle between two rays in radians")
     pixel_tolerance: float = setting(
-        1.0, "pixels by which a confirmed point may miss its pixel, there and back"
+        0.5, "pixels by which a confirmed point may miss its pixel, there and back"
     )
     depth_tolerance: float = setting(0.01, "relative difference of depths that agree")
     confirmations: int = setting(2, "photographs that must confirm a depth", low=1)
-    max_cost: float = setting(0.5, "1 - NCC above which nothing is matched", high=1)
+    max_cost: float = setting(0.7, "1 - NCC above which nothing is matched", high=1)
