@@ -17,7 +17,6 @@ from jaxcloseup.app.score.metrics_text import REDUCED, describe_split
 from jaxcloseup.app.score.renders import write_renders
 from jaxcloseup.app.score.scores import Perceptual, evaluate
 from jaxcloseup.app.score.targets import Target, exact_depths, score_divisor, targets_by_split
-from jaxcloseup.artifacts.images import to_uint8
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.training.state import TrainState
@@ -94,7 +93,7 @@ class Scorer:
                 write_renders(self._folder / "renders" / stage / split, seen, programs.scene)
                 if split in targets:
                     self.images[stage, split] = {
-                        name: to_uint8(rendering.rgb) for name, rendering in seen.items()
+                        name: np.asarray(rendering.rgb) for name, rendering in seen.items()
                     }
                     name, first = next(iter(seen.items()))
                     shown[f"{split}/{name}"] = np.asarray(first.rgb)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxcloseup.app import progress
 from jaxcloseup.app.score.surface_error import point_depth_error, surface_error
 from jaxcloseup.app.score.targets import Target
+from jaxcloseup.artifacts.images import to_uint8
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.metrics.image_metrics import SSIM_TAPS, cc_psnr, psnr, quantize, ssim
@@ -195,12 +196,13 @@ def evaluate(
 ) -> tuple[dict[str, Any], dict[str, Rendering]]:
     """Render and score every target; return the summary and the renderings by name.
 
-    Renderings have the size of their target, and neither `aux` nor normals.
+    Renderings have the size of their target, colors of 8 bits, and neither `aux` nor normals.
     """
 
     def scored(target: Target) -> tuple[View, Rendering]:
         seen = jax.device_get(render(target.camera)._replace(aux=()))
-        return score(seen, target, perceptual), seen._replace(normal=None)
+        kept = seen._replace(rgb=to_uint8(seen.rgb), normal=None)
+        return score(seen, target, perceptual), kept
 
     names = [target.name for target in targets]
     pixels = max((target.weight.size for target in targets), default=1)

@@ -13,7 +13,6 @@ from jaxcloseup.app.score.metrics_text import SPLIT_TITLES
 from jaxcloseup.app.score.scores import Perceptual, evaluate
 from jaxcloseup.app.score.targets import Target
 from jaxcloseup.app.sweep.named_arms import Arm
-from jaxcloseup.artifacts.images import to_uint8
 from jaxcloseup.training.state import TrainState
 
 
@@ -57,7 +56,7 @@ class ArmScorer:
                 splits[split], seen = evaluate(render, targets, self._perceptual)
                 if seed == 0 and split in self._shown:
                     self._images[arm, split] = {
-                        view.name: to_uint8(seen[view.name].rgb) for view in self._shown[split]
+                        view.name: np.asarray(seen[view.name].rgb) for view in self._shown[split]
                     }
         self.scores[arm][str(seed)] = {"skipped": skipped, "splits": splits}
 
