@@ -6,7 +6,7 @@ from jaxcloseup.lazy import lazy_names
 __all__, __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "choices": "ALPHA_MODES FORMATS SPLITS",
+        "choices": "ALPHA_MODES CHOICES FORMATS SPLITS",
         "folder": "load_capture",
         "json_fields": "number read_object rigid_transform",
         "load": "load_scene",

@@ -47,6 +47,7 @@ def load_capture(
     format: str | None = None,
     split: str = "given",
     photographs: int | None = None,
+    choose: str = "path",
     pixels: int | None = None,
     corrections: Sequence[str] = (),
 ) -> Scene:
@@ -68,6 +69,7 @@ def load_capture(
             downscale=reading.downscale if pixels is None else None,
             pixels=pixels or 1,
             photographs=photographs,
+            choose=choose,
             find_points=functools.partial(_points_of, reading),
             corrections=corrections,
         )

@@ -7,13 +7,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxcloseup.captures.choosing import choose_photographs
 from jaxcloseup.captures.contents import placed, read_content
 from jaxcloseup.captures.leftovers import unused_note
 from jaxcloseup.captures.photo_files import size_of_image
 from jaxcloseup.captures.photo_masks import attach_masks
 from jaxcloseup.captures.placing import describe_offset
 from jaxcloseup.captures.reduced_photos import attach_reduced, note_stand_ins
-from jaxcloseup.captures.splits import FindPoints, divide, splits_from_file, spread, warn_duplicates
+from jaxcloseup.captures.splits import FindPoints, divide, splits_from_file, warn_duplicates
 from jaxcloseup.captures.world_frames import Frame
 from jaxcloseup.io.messages import printable
 from jaxcloseup.io.placement import Placement
@@ -47,6 +48,7 @@ def read_listing(
     downscale: int | None = 1,
     pixels: int = 1,
     photographs: int | None = None,
+    choose: str = "path",
     find_points: FindPoints | None = None,
     corrections: Sequence[str] = (),
 ) -> Listing:
@@ -65,11 +67,8 @@ def read_listing(
     division = divide(scene, content.frames, given, split, points, zoom, find_points=find_points)
     if split != "zoom":  # crops share files with training photographs but show finer detail
         warn_duplicates(folder, division.frames)
-    train = division.frames["train"]
-    chosen = spread(scene, len(train), photographs)
-    fewer = len(chosen) < len(train)
-    frames = division.frames | {"train": [train[i] for i in chosen]}
-    frames = attach_masks(folder, frames)
+    train, fewer = _chosen(scene, division.frames["train"], photographs, choose)
+    frames = attach_masks(folder, division.frames | {"train": train})
     if downscale is None:
         sizes = (size_of_image(frame.file) or frame.size for frame in frames["train"])
         downscale = fitting_divisor(filter(None, sizes), zoom**2 * pixels)
@@ -79,9 +78,7 @@ def read_listing(
         keep = _seen_in_training(frames["train"], len(points))
     used = [*content.frames, *(frame for part in frames.values() for frame in part)]
     notes = [*content.notes, *note_stand_ins(scene, content.frames), *division.notes, *reduced]
-    notes += [*unused_note(folder, used), *describe_offset(scene, placement)]
-    if fewer:
-        notes.append(f"{scene}: learns from {len(chosen)} of {len(train)} training photographs")
+    notes += [*unused_note(folder, used), *describe_offset(scene, placement), *fewer]
     notes += _describe_dropped(scene, keep)
     return Listing(
         format=detected.format,
@@ -97,6 +94,19 @@ def read_listing(
         downscale=downscale,
         placement=placement,
     )
+
+
+def _chosen(
+    scene: str, train: list[Frame], photographs: int | None, choose: str
+) -> tuple[list[Frame], list[str]]:
+    """Return the training photographs that are used, and a note if they are not all."""
+    poses = np.stack([frame.camtoworld for frame in train])
+    rows = choose_photographs(scene, poses, photographs, choose)
+    if len(rows) == len(train):
+        return train, []
+    apart = ", far apart" * (choose == "spread")
+    note = f"{scene}: learns from {len(rows)} of {len(train)} training photographs{apart}"
+    return [train[i] for i in rows], [note]
 
 
 def _describe_dropped(scene: str, keep: np.ndarray) -> list[str]:

@@ -16,9 +16,11 @@ padded with weight 0. Points come from the model, a PLY file, or triangulated fe
 import pathlib
 from collections.abc import Sequence
 
-from jaxcloseup.captures import ALPHA_MODES, FORMATS, SPLITS, Reading, load_capture
+import numpy as np
+
+from jaxcloseup.captures import ALPHA_MODES, CHOICES, FORMATS, SPLITS, Reading, load_capture
+from jaxcloseup.captures.choosing import choose_photographs
 from jaxcloseup.captures.formats import fitting_divisor
-from jaxcloseup.captures.splits import spread
 from jaxcloseup.drawn_scenes import DRAWN_SCENES, draw_scene
 from jaxcloseup.drawn_scenes.drawn import HEIGHT, WIDTH
 from jaxcloseup.photos.scene import Scene, SceneError, SceneWarning, Surface, keep_photographs
@@ -42,6 +44,7 @@ def load_scene(
     invert_masks: bool = False,
     alpha_mode: str = "blend",
     photographs: int | None = None,
+    choose: str = "path",
     corrections: Sequence[str] = (),
 ) -> Scene:
     """Load a drawn scene by its name, or a capture from its folder.
@@ -61,7 +64,9 @@ def load_scene(
       invert_masks: whether masks mark ignored pixels in white instead of black.
       alpha_mode: `blend` shows the background through transparent pixels; `mask` keeps the file's
         colors and uses alpha as the weight; `ignore` keeps them and drops alpha.
-      photographs: keep so many training photographs, evenly spread; None means all.
+      photographs: keep so many training photographs; None means all.
+      choose: which of them: `path` takes them evenly over their order, `spread` from cameras that
+        stand and look as far apart as possible.
       corrections: corrections of known mistakes, as `captures.corrections` lists them.
 
     Returns:
@@ -73,16 +78,17 @@ def load_scene(
     Raises:
       SceneError: one sentence that names the file and the field and says what to do.
     """
-    _check_options(downscale, background, format, split, zoom, alpha_mode, photographs)
+    _check_options(downscale, background, format, split, zoom, alpha_mode)
+    _check_choice(photographs, choose)
     zoom = (zoom or _DEFAULT_ZOOM) if split == "zoom" else 1
     wanted = None if downscale else pixels
     path = pathlib.Path(name_or_path)
     if is_drawn(name_or_path):
         _check_drawn(path.name, format, split, invert_masks, alpha_mode)
-        return _draw(path.name, downscale, pixels, photographs)
+        return _draw(path.name, downscale, pixels, photographs, choose)
     _check_exists(path)
     reading = Reading(downscale or 1, zoom, background, half_pixel, alpha_mode, invert_masks)
-    chosen = {"format": format, "split": split, "photographs": photographs}
+    chosen = {"format": format, "split": split, "photographs": photographs, "choose": choose}
     return load_capture(path, reading, pixels=wanted, corrections=corrections, **chosen)
 
 
@@ -99,9 +105,14 @@ def is_drawn(name_or_path: str | pathlib.Path) -> bool:
     return str(name_or_path) in DRAWN_SCENES
 
 
-def _draw(name: str, downscale: int | None, pixels: int, photographs: int | None) -> Scene:
+def _draw(
+    name: str, downscale: int | None, pixels: int, photographs: int | None, choose: str
+) -> Scene:
     scene = draw_scene(name, downscale=downscale or fitting_divisor([(WIDTH, HEIGHT)], pixels))
-    return keep_photographs(scene, spread(scene.name, len(scene.train), photographs))
+    if photographs is None:
+        return scene
+    poses = np.asarray(scene.train.cameras.camtoworld)
+    return keep_photographs(scene, choose_photographs(name, poses, photographs, choose))
 
 
 def _check_drawn(
@@ -127,7 +138,6 @@ def _check_options(
     split: str,
     zoom: int | None,
     alpha_mode: str,
-    photographs: int | None,
 ) -> None:
     if downscale is not None and (
         isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1
@@ -147,7 +157,14 @@ def _check_options(
         raise SceneError(
             f"alpha_mode {alpha_mode!r} is unknown: choose one of {', '.join(ALPHA_MODES)}."
         )
+
+
+def _check_choice(photographs: int | None, choose: str) -> None:
     if photographs is not None and (
         isinstance(photographs, bool) or not isinstance(photographs, int) or photographs < 2
     ):
         raise SceneError(f"photographs must be a whole number of at least 2, got {photographs!r}.")
+    if choose not in CHOICES:
+        raise SceneError(f"choose {choose!r} is unknown: choose one of {', '.join(CHOICES)}.")
+    if choose != "path" and photographs is None:
+        raise SceneError(f"choose {choose!r} needs photographs: say how many to keep.")

@@ -118,24 +118,6 @@ def divide(
     )
 
 
-def spread(name: str, total: int, count: int | None) -> list[int]:
-    """Choose `count` of `total` training photographs, evenly spread over their order.
-
-    Args:
-      name: name of the capture, for the error.
-      total: how many there are.
-      count: how many to keep; None keeps all.
-
-    Raises:
-      SceneError: there are fewer.
-    """
-    if count is None:
-        return list(range(total))
-    if count > total:
-        raise SceneError(f"{name} has {total} training photographs: ask for fewer than {count}.")
-    return [(2 * i + 1) * total // (2 * count) for i in range(count)]
-
-
 def without_repeats(frames: Sequence[Frame]) -> list[Frame]:
     """Keep the first of the frames that one file lists for one photograph, and warn of others."""
     first: dict[tuple[pathlib.Path, pathlib.Path], Frame] = {}

@@ -339,6 +339,8 @@ WHOLE = "must be a whole number of at least"
         ),
         *((llff, same, {"photographs": x}, f"photographs {WHOLE} 2") for x in (1, 2.0)),
         (llff, same, {"photographs": 4}, "has 2 training photographs: ask for fewer than 4"),
+        (llff, same, {"photographs": 2, "choose": "best"}, "choose 'best' is unknown: choose one"),
+        (llff, same, {"choose": "spread"}, "choose 'spread' needs photographs: say how many"),
         (llff, same, {"format": "nerf"}, "format 'nerf' is unknown: choose one of transforms"),
         (llff, same, {"format": "colmap"}, "holds no capture in the format colmap"),
         (llff, same, {"split": "nearest"}, "split 'nearest' is unknown: choose one of given, eve"),

@@ -10,7 +10,7 @@ from jaxcloseup.app.cli.topics import topic
 from jaxcloseup.app.methods.method import Preset
 from jaxcloseup.app.methods.registry import DEFAULT, METHODS
 from jaxcloseup.app.methods.settings import describe_settings, with_settings
-from jaxcloseup.captures.choices import ALPHA_MODES, FORMATS, SPLITS
+from jaxcloseup.captures.choices import ALPHA_MODES, CHOICES, FORMATS, SPLITS
 
 
 if TYPE_CHECKING:
@@ -84,10 +84,14 @@ with topic("The capture") as _CAPTURE:
         lower_bound=2,
     )
     flags.DEFINE_integer(
-        "photographs",
-        None,
-        "number of training photographs to use, evenly spread over their order; default: all",
-        lower_bound=2,
+        "photographs", None, "number of training photographs to use; default: all", lower_bound=2
+    )
+    flags.DEFINE_enum(
+        "choose",
+        "path",
+        list(CHOICES),
+        "with --photographs: which ones: path: evenly over their order; spread: from cameras that "
+        "stand and look as far apart as possible",
     )
     flags.DEFINE_bool("invert_masks", False, "read white in masks as pixels to ignore")
     flags.DEFINE_enum(
