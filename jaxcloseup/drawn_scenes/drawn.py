@@ -6,6 +6,7 @@ cached on disk under a key that covers the source files that draw them.
 """
 
 import functools
+import math
 import pathlib
 import warnings
 import zlib
@@ -37,7 +38,7 @@ from jaxcloseup.photos.views import Photograph, Views, camera_at, unpadded
 
 
 DRAWN_SCENES: tuple[str, ...] = tuple(SCENES)
-NUM_TRAIN, NUM_TEST, NUM_FAR = 60, 12, 8
+NUM_TEST, NUM_FAR = 12, 8
 _SAMPLES = 8  # rays per pixel
 _SOURCES = ("*.py", "builtin/*.py", "textures/*.py")  # any change may change the pixels
 
@@ -155,8 +156,8 @@ def _capture(name: str, width: int, height: int) -> dict[str, np.ndarray]:
     """Draw the arrays of a capture that the cache holds."""
     world, rig = _world(name), SCENES[name]().rig
     rng = _rng(name, 0)
-    far = plan_far(world.solids, rig, rng, NUM_TRAIN + NUM_FAR)
-    held_out = np.s_[2 :: (NUM_TRAIN + NUM_FAR) // NUM_FAR + 1]  # evenly among the others
+    far = plan_far(world.solids, rig, rng, rig.photographs + NUM_FAR)
+    held_out = np.s_[2 :: math.ceil(len(far) / NUM_FAR)]  # evenly among the others
     train, test_far = np.delete(far, held_out, axis=0), far[held_out]
     closeups = plan_closeups(world.solids, rig, train, rng, NUM_TEST)
 
@@ -178,7 +179,7 @@ def _capture(name: str, width: int, height: int) -> dict[str, np.ndarray]:
         return np.round(np.asarray(rgb) * 255).astype(np.uint8)
 
     photographs = map_in_threads(photograph, range(len(every)))
-    for split, stop in (("test", NUM_TEST), ("test_far", NUM_FAR), ("train", NUM_TRAIN)):
+    for split, stop in (("test", NUM_TEST), ("test_far", NUM_FAR), ("train", len(train))):
         capture[f"{split}_rgb"] = np.stack(photographs[-stop:])
         del photographs[-stop:]
     capture["points"], capture["colors"] = _sparse_points(

@@ -50,6 +50,8 @@ class Rig(NamedTuple):
     elevation: tuple[float, float]  # (lo, hi) degrees above the horizon
     # (x, y, z, radius) balls that hold the subjects of close-ups
     interests: tuple[tuple[float, float, float, float], ...]
+    photographs: int = 60  # number of training photographs
+    magnification: tuple[float, float] = (2.1, 7.6)  # (lo, hi) of close-ups
 
 
 class Model(NamedTuple):

@@ -93,7 +93,7 @@ def plan_far(solids: Solids, rig: Rig, rng: np.random.Generator, count: int) -> 
 def plan_closeups(
     solids: Solids, rig: Rig, train: np.ndarray, rng: np.random.Generator, count: int
 ) -> Closeups:
-    """Plan `count` close-ups, each 2 to 8 times nearer to its subject than any training view.
+    """Plan `count` close-ups, each nearer to its subject than any training view, as the rig says.
 
     Each camera lies 12 to 45 degrees off the line from its subject to a training view, and does not
     point straight at the subject. A candidate is kept only if nothing blocks its view of the
@@ -102,7 +102,8 @@ def plan_closeups(
     """
     chosen = []
     for k in range(count):
-        magnification = 2.1 * (7.6 / 2.1) ** ((k * 5 % count + 0.5) / count)
+        low, high = rig.magnification
+        magnification = low * (high / low) ** ((k * 5 % count + 0.5) / count)
         for attempt in range(8 * len(rig.interests)):
             # Try each subject twice, then move on to the next.
             interest = np.array(rig.interests[(k + attempt // 2) % len(rig.interests)])

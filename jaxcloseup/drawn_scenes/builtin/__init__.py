@@ -1,4 +1,4 @@
-"""The five built-in scenes, in meters with z up, photographed mainly from -y."""
+"""The built-in scenes, in meters with z up: five photographed mainly from -y, one all around."""
 
 from collections.abc import Callable
 
@@ -6,6 +6,7 @@ from jaxcloseup.drawn_scenes.builtin.bench import bench
 from jaxcloseup.drawn_scenes.builtin.counter import counter
 from jaxcloseup.drawn_scenes.builtin.room import room
 from jaxcloseup.drawn_scenes.builtin.stairs import stairs
+from jaxcloseup.drawn_scenes.builtin.statue import statue
 from jaxcloseup.drawn_scenes.builtin.table import table
 from jaxcloseup.drawn_scenes.modeling import Model
 
@@ -16,4 +17,5 @@ SCENES: dict[str, Callable[[], Model]] = {
     "room": room,
     "bench": bench,
     "stairs": stairs,
+    "statue": statue,
 }

@@ -86,7 +86,7 @@ def framed(
     center: tuple, size: tuple, name: str, *, facing: str = "-y", frame: Finish = WALNUT
 ) -> list[Solid]:
     """Model a print in a frame of four bars, hung on the wall at `center`."""
-    out = np.array({"-y": (0.0, -1.0, 0.0), "-x": (-1.0, 0.0, 0.0)}[facing])
+    out = (-1.0 if facing[0] == "-" else 1.0) * np.eye(3)["xy".index(facing[1])]
     across, up = np.array([abs(out[1]), abs(out[0]), 0]), np.array([0, 0, 1])
     width, height = size
     middle, bar, bulk = center + 0.013 * out, 0.025, 0.026 * np.abs(out)
