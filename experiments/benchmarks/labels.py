@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.studies.tables import SCENES
 from jaxcloseup.app.report.pictures import label_pictures
 from jaxcloseup.app.score.audit import audit_labels
 from jaxcloseup.app.score.footprints import resolved_by_photographs
 from jaxcloseup.app.score.targets import exact_depths
 from jaxcloseup.captures.load import load_scene
-from jaxcloseup.drawn_scenes.drawn import DRAWN_SCENES
 from jaxcloseup.labels.config import LabelConfig, pseudo_settings
 from jaxcloseup.labels.make import label_sources
 from jaxcloseup.metrics.image_metrics import psnr
@@ -40,7 +40,7 @@ def run() -> None:
     """Print error, kept and leaked shares by scene and mask, and write pictures of labels."""
     print(f"labels from exact depth at 1/{DOWNSCALE} of the full size")
     print(f"{'scene':>8}  {'mask':<22}  {'error':>6}  {'kept':>6}  {'leaked':>6}")
-    for name in DRAWN_SCENES:
+    for name in SCENES:
         scene = load_scene(name, downscale=DOWNSCALE)
         scene = dataclasses.replace(scene, train=jax.device_put(scene.train))
         exact = exact_depths(scene, scene.train.cameras)

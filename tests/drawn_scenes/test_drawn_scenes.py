@@ -11,7 +11,7 @@ import reference
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.drawn_scenes import assembly, drawn, planning
 from jaxcloseup.drawn_scenes.builtin import SCENES
-from jaxcloseup.drawn_scenes.raycast import cast_rays
+from jaxcloseup.drawn_scenes.raycast import PLANE, cast_rays
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points, points_to_pixels
 from jaxcloseup.geometry.warp import backward_warp
 from jaxcloseup.photos.views import camera_at
@@ -81,6 +81,27 @@ def test_cameras(name, monkeypatch):
             world.solids, subject + 1e-3 * (pose[:, 3] - subject), pose[:, 3] - subject
         )
         assert back.depth > 0.998
+
+
+def test_the_statue_is_seen_whole_from_all_sides(monkeypatch):
+    """No view cuts it off, and about half of them see what a close-up shows."""
+    monkeypatch.setattr(assembly, "draw_texture", lambda name: np.zeros((1024, 1024, 3)))
+    model = SCENES["statue"]()
+    solids = assembly.build_world(model, lambda *scene: np.ones((8, 4))).solids
+    rng = np.random.default_rng(0)
+    train = planning.plan_far(solids, model.rig, rng, model.rig.photographs)
+    azimuths = np.sort(np.rad2deg(np.arctan2(train[:, 1, 3], train[:, 0, 3])))
+    assert len(train) == 24 and np.diff([*azimuths, azimuths[0] + 360]).max() < 18
+    on_top = [s for s in model.solids if s.center[2] > 0.5 and np.abs(s.center).max() < 2]
+    axes = [(s.rotation * s.size / 2).T[: 2 if s.kind == PLANE else 3] for s in on_top]
+    ends = [s.center + sign * a for s, a in zip(on_top, axes, strict=True) for sign in (-1, 1)]
+    for pose in train:
+        pixels, depths = reference.project(pose, [800.0, 800.0, 480.0, 270.0], np.concatenate(ends))
+        assert (depths > 0).all() and (pixels > 0).all() and (pixels < [960, 540]).all()
+    close = planning.plan_closeups(solids, model.rig, train, rng, 6)
+    assert ((close.magnification > 2) & (close.magnification < 4.1)).all()
+    seen = planning.count_views(solids, close.subjects, train) / 24
+    assert seen.max() < 0.75 and 0.25 < seen.mean() < 0.6
 
 
 def sees(solids, pose, intrinsics, point):
@@ -201,6 +222,16 @@ def test_fewer_photographs_are_the_same_ones(scene):
     assert 100 < inside.sum() < len(inside)
     np.testing.assert_array_equal(fewer.points, scene.points[inside])
     np.testing.assert_array_equal(fewer.rgb, scene.rgb[inside])
+
+
+def test_photographs_far_apart_are_farther_apart(scene):
+    smallest = {}
+    for choose in ("path", "spread"):
+        chosen = load_scene("counter", downscale=DOWNSCALE, photographs=5, choose=choose)
+        at = np.asarray(chosen.train.cameras.position)
+        apart = np.linalg.norm(at[:, None] - at[None], axis=-1)
+        smallest[choose] = apart[np.triu_indices(5, 1)].min()
+    assert smallest["spread"] > 1.2 * smallest["path"]
 
 
 def test_the_cache_is_used_and_survives_damage(scene, cache, monkeypatch):

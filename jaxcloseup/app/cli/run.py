@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 FLAGS = flags.FLAGS
 share(TRAINING)
 flags.DEFINE_string(
-    "scene", "table", "a built-in scene (counter, table, room, bench, stairs) or a folder"
+    "scene", "table", "a built-in scene (counter, table, room, bench, stairs, statue) or a folder"
 )
 flags.DEFINE_integer(
     "seed",
