@@ -6,7 +6,7 @@ from jaxcloseup.photos.scene import SceneError
 
 
 _CLOSEST = 1e-3  # of a capture's size; nearer cameras count as being so far apart
-_DIGITS = 9  # of sums of reciprocals, so that rounding does not choose between equal ones
+_DIGITS = 6  # of sums of reciprocals, so that rounding does not choose between equal ones
 
 
 def choose_photographs(
@@ -62,21 +62,31 @@ def _far_apart(places: np.ndarray, count: int) -> list[int]:
     It begins at the place nearest to the middle of all, adds the farthest from those chosen, and
     then moves one at a time until none finds a better place.
     """
-    gaps = np.linalg.norm(places[:, None] - places[None], axis=-1)
-    pushes = 1 / np.maximum(gaps, _CLOSEST) ** 2
-    chosen = [int(np.argmin(np.linalg.norm(places - places.mean(0), axis=1).round(_DIGITS)))]
+
+    def gaps(index: int) -> np.ndarray:
+        return np.linalg.norm(places - places[index], axis=1)
+
+    middle = np.linalg.norm(places - places.mean(0), axis=1)
+    chosen = [int(middle.round(_DIGITS).argmin())]
+    nearest = gaps(chosen[0])
     while len(chosen) < count:
-        nearest = gaps[:, chosen].min(1).round(_DIGITS)
-        nearest[chosen] = -1
-        chosen.append(int(nearest.argmax()))
+        nearest[chosen[-1]] = -1
+        chosen.append(int(nearest.round(_DIGITS).argmax()))
+        nearest = np.minimum(nearest, gaps(chosen[-1]))
+
+    def pushes(index: int) -> np.ndarray:
+        return 1 / np.maximum(gaps(index), _CLOSEST) ** 2
+
+    rows = np.array([pushes(index) for index in chosen])
     moved = True
     while moved:
-        moved = False
+        moved, total = False, rows.sum(0)
         for slot in range(count):
-            others = chosen[:slot] + chosen[slot + 1 :]
-            push = pushes[:, others].sum(1).round(_DIGITS)
-            push[others] = np.inf
+            push = (total - rows[slot]).round(_DIGITS)
+            push[chosen[:slot] + chosen[slot + 1 :]] = np.inf
             best = int(push.argmin())
             if push[best] < push[chosen[slot]]:
                 chosen[slot], moved = best, True
+                total += pushes(best) - rows[slot]
+                rows[slot] = pushes(best)
     return sorted(chosen)

@@ -195,6 +195,10 @@ def test_format_and_split_reach_the_capture(parsed_flags, capture_folder, capsys
         scene = load(str(capture_folder), shared.load_options_from_flags(TINY))
         assert scene.metadata["times_nearer"][0] == 2
         assert shared.names_from_flags()["zoom"] == 2
+    with flagsaver.flagsaver(photographs=2, choose="spread"):
+        chosen = {"photographs": 2, "choose": "spread"}
+        assert shared.load_options_from_flags(TINY).items() >= chosen.items()
+        assert shared.names_from_flags().items() >= chosen.items()
     with (
         flagsaver.flagsaver(invert_masks=True, alpha_mode="mask"),
         pytest.raises(ValueError, match="no photograph has a mask to invert"),
