@@ -27,8 +27,10 @@ def detect(path: pathlib.Path, format: str | None) -> Detected:
     """Find what is read of a folder, of one of `FORMATS`, or of the first found if None.
 
     Raises:
-      SceneError: the folder holds no capture of this format.
+      SceneError: there is no such folder, or it holds no capture of this format.
     """
+    if not path.is_dir():
+        raise SceneError(f"{path} is not a folder: give the folder that holds the capture.")
     files = [("transforms", SEPARATE), ("transforms", SINGLE)]
     found = [(kind, name, name) for kind, name in files if (path / name).is_file()]
     models = find_models(path)

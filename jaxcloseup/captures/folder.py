@@ -59,8 +59,6 @@ def load_capture(
       SceneError: one sentence that names the file and the field and says what to do.
     """
     try:
-        if not path.is_dir():
-            raise SceneError(f"{path} is not a folder: give the folder that holds the capture.")
         listing = read_listing(
             path,
             format=format,

@@ -86,13 +86,14 @@ def load_scene(
     if is_drawn(name_or_path):
         _check_drawn(path.name, format, split, invert_masks, alpha_mode)
         return _draw(path.name, downscale, pixels, photographs, choose)
-    _check_exists(path)
+    check_exists(path)
     reading = Reading(downscale or 1, zoom, background, half_pixel, alpha_mode, invert_masks)
     chosen = {"format": format, "split": split, "photographs": photographs, "choose": choose}
     return load_capture(path, reading, pixels=wanted, corrections=corrections, **chosen)
 
 
-def _check_exists(path: pathlib.Path) -> None:
+def check_exists(path: pathlib.Path) -> None:
+    """Raise a `SceneError` for a name that is neither a folder's nor a built-in scene's."""
     if len(path.parts) == 1 and not path.exists():
         raise SceneError(
             f"{path} is neither a folder nor a built-in scene: choose one of "

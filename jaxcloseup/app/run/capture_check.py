@@ -1,11 +1,12 @@
 """Check captures before they are trained on: say what was found, and refuse those that misfit."""
 
 import dataclasses
+import pathlib
 from collections.abc import Mapping
 from typing import Any
 
 from jaxcloseup.app import progress
-from jaxcloseup.captures.load import is_drawn
+from jaxcloseup.captures.load import check_exists, is_drawn
 from jaxcloseup.captures.photo import Reading
 from jaxcloseup.checks.check import check_capture
 from jaxcloseup.checks.judge import MISFIT, Checked
@@ -64,6 +65,7 @@ def fitting_options(
     """
     if is_drawn(name):
         return dict(options), None
+    check_exists(pathlib.Path(name))
     found = check_scene(name, options)
     first, *others = said_of(found)
     if found.verdict == MISFIT and not allow_misfit and not (fix and found.corrections):
