@@ -7,7 +7,10 @@ import functools
 import json
 
 import cv2
+import jax.numpy as jnp
 import numpy as np
+
+from jaxcloseup import Camera, Views
 
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
@@ -16,6 +19,7 @@ COUNT = 12
 # another.
 WALLS = np.array([[1, 0.3, 0], [0, 1, -0.2], [0.2, 0.1, 1]])
 OFFSETS = np.array([0.0, -0.3, -0.1])
+SMALL, SMALL_LENS = (72, 54), np.array([180.0, 182.0, 36.2, 26.9])  # of `corner_views`
 LENS = np.array([FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2])
 
 
@@ -63,6 +67,24 @@ def draw(pose, lens=LENS, size=(WIDTH, HEIGHT)):
         painted = cv2.remap(texture(axis), u, v, cv2.INTER_LINEAR)
         image[wall == axis] = painted[wall == axis]
     return image, points
+
+
+def corner_views(count=5):
+    """Photographs of three walls in a corner, and their exact points `[V, H, W, 3]`."""
+    width, height = SMALL
+    chosen = poses(12)[1::2][:count]
+    images, points = [], []
+    for pose in chosen:  # three rays across a pixel, so that nothing aliases
+        image, world = draw(pose, 3 * SMALL_LENS, (3 * width, 3 * height))
+        images.append(image.reshape(height, 3, width, 3, 3).mean((1, 3)).round().astype(np.uint8))
+        points.append(world[1::3, 1::3])
+    cameras = Camera(
+        *(jnp.asarray(array, jnp.float32) for array in (chosen, np.tile(SMALL_LENS, (count, 1)))),
+        height,
+        width,
+    )
+    rgb = jnp.asarray(np.stack(images))
+    return Views(cameras, rgb, jnp.ones(rgb.shape[:3])), np.stack(points)
 
 
 def write_corner(folder, **fields):

@@ -69,6 +69,8 @@ class RadianceField(NamedTuple):
       adapt: `(key, state) -> state`, density control or occupancy refresh; identity by default.
       gradient_chunk: pixels that training differentiates at once, see `rendered_loss`; None for
         all. With chunks, every array that `render` returns is per pixel.
+      depth_loss: `(rendering, depth, trust) -> scalar` of a whole image whose depth is known, see
+        `Measured`; None for fields that learn from no depth so.
       local: for fields of which a view can change a part alone; None where it can change all.
     """
 
@@ -77,4 +79,5 @@ class RadianceField(NamedTuple):
     loss: Callable[..., tuple[jax.Array, dict[str, jax.Array]]]
     adapt: Callable[..., Any] = lambda key, state: state
     gradient_chunk: int | None = None
+    depth_loss: Callable[..., jax.Array] | None = None
     local: Local | None = None

@@ -6,7 +6,9 @@ from jaxcloseup.lazy import lazy_names
 __all__, __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "views": "Views Photograph Batch unpadded to_float camera_at sample_pixels sample_image",
+        "views": (
+            "Views Photograph Measured Batch unpadded to_float camera_at sample_pixels sample_image"
+        ),
         "scene": (
             "SceneError SceneWarning UnknownKeyWarning ImageSizeWarning NearFarWarning "
             "DuplicateFileWarning PointsWarning Surface Scene keep_photographs"
@@ -19,8 +21,7 @@ __all__, __getattr__, __dir__ = lazy_names(
         "gather": "gather_parts",
         "gather_sums": "GatherSettings Gathered Reader gather_points",
         "support": "Support find_support count_seen",
-        "depth_maps": (
-            "DepthMaps Fused GatherSources fuse fuse_grid gather_sources prepare_depth_maps"
-        ),
+        "depth_maps": "GatherSources gather_sources join_maps read_depths",
+        "fusion": "DepthMaps Fused fuse fuse_grid prepare_depth_maps",
     },
 )

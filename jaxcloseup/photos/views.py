@@ -56,6 +56,18 @@ def unpadded(views: Views, sizes: Sequence[tuple[int, int]] | None = None) -> li
     return found
 
 
+class Measured(NamedTuple):
+    """Depth that is known of the pixels of an image, apart from any field.
+
+    Attributes:
+      depth: `[H, W]` z-depth in world units; 0 where it is unknown.
+      trust: `[H, W]` in [0, 1]; 0 where it is unknown.
+    """
+
+    depth: jax.Array
+    trust: jax.Array
+
+
 class Batch(NamedTuple):
     """Pixels to render and their true colors.
 
@@ -64,12 +76,14 @@ class Batch(NamedTuple):
       pixels: `[B, 2]` pixel centers, or None for the whole image.
       rgb: `[B, 3]` or `[H, W, 3]` float colors in [0, 1].
       weight: `[B]` or `[H, W]`, 0 where the color does not count.
+      measured: depth of the pixels of a whole image, where it is known; None: nowhere.
     """
 
     cameras: Camera
     pixels: jax.Array | None
     rgb: jax.Array
     weight: jax.Array
+    measured: Measured | None = None
 
 
 _Array = TypeVar("_Array", jax.Array, np.ndarray)

@@ -15,6 +15,7 @@ from flax import struct
 
 from jaxcloseup.geometry.cameras import Camera, crop_camera, pixels_to_points
 from jaxcloseup.geometry.visibility import sample_where_visible
+from jaxcloseup.photos.depth_maps import GatherSources, read_depths
 from jaxcloseup.photos.pyramids import Pyramid, photograph_pyramid
 from jaxcloseup.photos.views import Batch, Views, camera_at, to_float
 
@@ -30,12 +31,14 @@ class Windows:
       shares: `[L]` probability of each level, finest first.
       places: `[K, 3]` centers of windows, of which each is drawn alike: a view, and x and y as
         shares of its width and height; None: windows lie anywhere.
+      depths: depth maps of the photographs, whose depths windows have too; None: there are none.
     """
 
     cameras: Camera
     pyramid: Pyramid
     shares: jax.Array
     places: jax.Array | None = None
+    depths: GatherSources | None = None
 
     def __len__(self) -> int:
         """Return the number of photographs."""
@@ -229,7 +232,8 @@ def cut_window(
     values = to_float(pyramid.values[start + rows * across + columns])
     camera = camera_at(windows.cameras, view).replace(intrinsics=pyramid.intrinsics[view, level])
     camera = crop_camera(camera, corner[::-1], height=height, width=width)
-    return Batch(camera, None, values[..., :3], values[..., 3])
+    measured = None if windows.depths is None else read_depths(windows.depths, view, camera)
+    return Batch(camera, None, values[..., :3], values[..., 3], measured)
 
 
 def in_quarters(render: Callable[[Camera], Any], camera: Camera) -> Any:

@@ -98,7 +98,10 @@ def _plain(
     field: RadianceField, params: Any, buffers: Any, batch: Batch, key: jax.Array | None
 ) -> Loss:
     rendering = field.render(params, buffers, batch.cameras, batch.pixels, key)
-    return judge(field, rendering, batch.rgb, batch.weight)
+    loss, metrics = judge(field, rendering, batch.rgb, batch.weight)
+    if batch.measured is not None and field.depth_loss is not None:
+        loss += field.depth_loss(rendering, *batch.measured)
+    return loss, metrics
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))

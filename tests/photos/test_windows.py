@@ -18,6 +18,7 @@ from jaxcloseup.geometry.cameras import (
     pixels_to_rays,
     points_to_pixels,
 )
+from jaxcloseup.photos.depth_maps import join_maps
 from jaxcloseup.photos.pyramids import photograph_pyramid
 from jaxcloseup.photos.views import Views, camera_at
 from jaxcloseup.photos.windows import (
@@ -60,6 +61,31 @@ def test_a_window_is_a_part_of_its_level(windows):
         part = whole[row : row + 12, column : column + 16]
         np.testing.assert_allclose(window.rgb, part[..., :3], rtol=1e-6)
         np.testing.assert_allclose(window.weight, part[..., 3], rtol=1e-6)
+
+
+def test_a_window_has_the_depth_of_its_photograph_at_any_size():
+    """Inverse depth is linear on a plane, so maps of half the size have the exact depth."""
+    poses = [plane.camera_above(x, 0.2, 3.0, tilt=0.3 * x) for x in (-1.0, 1.0)]
+    views, depths = plane.make_views(poses)
+    shown = np.ones(depths.shape, np.float32)
+    shown[1, 10, 20] = 0  # nothing is known of this pixel
+    known = join_maps(views.cameras, 1 / depths, jnp.asarray(shown))
+    twice = Camera(views.cameras.camtoworld, 2 * views.cameras.intrinsics, 48, 64)
+    rgb = jnp.zeros((2, 48, 64, 3))
+    pyramid = photograph_pyramid(Views(twice, rgb, jnp.ones(rgb.shape[:3])), views)
+    windows = photograph_windows(views.cameras, pyramid, whole_share=WHOLE_SHARE)
+    windows = dataclasses.replace(windows, depths=known)
+    batch = cut_window(windows, 1, 0, jnp.array([13, 25]))
+    camera = batch.cameras
+    origins, directions = pixels_to_rays(camera, pixel_grid(camera.height, camera.width))
+    exact = -np.asarray(origins)[..., 2] / np.asarray(directions)[..., 2]
+    unknown = np.asarray(batch.measured.trust) == 0
+    np.testing.assert_allclose(batch.measured.depth[~unknown], exact[~unknown], rtol=1e-5)
+    # Of the window's pixels, those between it and its neighbors, in columns 19.5 to 21.5.
+    rows, columns = np.nonzero(unknown)
+    assert (rows.min() + 13, rows.max() + 13) == (19, 22)
+    assert (columns.min() + 25, columns.max() + 25) == (39, 42)
+    assert np.all(np.asarray(batch.measured.depth)[unknown] == 0)
 
 
 def test_views_of_any_size_have_windows_of_a_given_one(windows, key):

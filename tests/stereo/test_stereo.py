@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import textured_corner
+from textured_corner import SMALL, SMALL_LENS, corner_views
 
-from jaxcloseup import Camera, Views
 from jaxcloseup.geometry.cameras import pixel_grid
 from jaxcloseup.native import library
 from jaxcloseup.photos.views import camera_at
@@ -24,28 +24,12 @@ from jaxcloseup.stereo import (
 )
 
 
-HEIGHT, WIDTH = 54, 72
-LENS = np.array([180.0, 182.0, 36.2, 26.9])
+WIDTH, HEIGHT = SMALL
+LENS = SMALL_LENS
 CONFIG = StereoConfig(neighbors=4, best=2, levels=2, sweep=24, iterations=(3, 2))
 needs_library = pytest.mark.skipif(
     not library.available(), reason="there is no native library, and loops take minutes"
 )
-
-
-def corner_views(count=5):
-    """Photographs of three walls in a corner, and their exact points `[V, H, W, 3]`."""
-    poses = textured_corner.poses(12)[1::2][:count]
-    images, points = [], []
-    for pose in poses:  # three rays across a pixel, so that nothing aliases
-        image, world = textured_corner.draw(pose, 3 * LENS, (3 * WIDTH, 3 * HEIGHT))
-        images.append(image.reshape(HEIGHT, 3, WIDTH, 3, 3).mean((1, 3)).round().astype(np.uint8))
-        points.append(world[1::3, 1::3])
-    cameras = Camera(
-        *(jnp.asarray(array, jnp.float32) for array in (poses, np.tile(LENS, (count, 1)))),
-        *(HEIGHT, WIDTH),
-    )
-    rgb = jnp.asarray(np.stack(images))
-    return Views(cameras, rgb, jnp.ones(rgb.shape[:3])), np.stack(points)
 
 
 def exact_planes(views, points):

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from jaxcloseup.labels.config import LabelConfig
 from jaxcloseup.setting import setting
+from jaxcloseup.stereo.config import StereoConfig
 from jaxcloseup.training.config import TrainConfig
 
 
@@ -61,6 +62,20 @@ class CoarseConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class StereoTraining:
+    """What training takes from depth that photographs show by themselves."""
+
+    pixels: int = setting(
+        2**21,
+        "about how many pixels of all photographs together are matched: few photographs are "
+        "matched at a larger size than many",
+        low=256,
+    )
+    points: int = setting(10_000, "initial points at matched pixels", low=0)
+    matching: StereoConfig = setting(StereoConfig(), "how they are matched")
+
+
+@dataclasses.dataclass(frozen=True)
 class Preset:
     """One experiment with one method."""
 
@@ -90,6 +105,9 @@ class Preset:
     )
     coarse: CoarseConfig | None = setting(
         None, "training before stage 1; none begins stage 1 with the initial points"
+    )
+    stereo: StereoTraining | None = setting(
+        None, "depth by matching photographs, before any field; none uses the capture's points"
     )
     targets: TargetConfig | None = setting(
         None, "how target views are labeled; none labels them as random close-ups"

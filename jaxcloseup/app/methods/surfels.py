@@ -2,7 +2,14 @@
 
 import dataclasses
 
-from jaxcloseup.app.methods.method import CoarseConfig, Method, Preset, TargetConfig, WindowConfig
+from jaxcloseup.app.methods.method import (
+    CoarseConfig,
+    Method,
+    Preset,
+    StereoTraining,
+    TargetConfig,
+    WindowConfig,
+)
 from jaxcloseup.fields.splats.config import (
     AdaptiveConfig,
     McmcConfig,
@@ -111,6 +118,7 @@ QUICK = dataclasses.replace(
     ),
     coarse=CoarseConfig(field=_COARSE, steps=1500),
     windows=WindowConfig(whole_share=0.03),
+    stereo=StereoTraining(),
     targets=TargetConfig("residual", label_loss_weight=0.7, lr_scale=10.0, control_lr_scale=2.0),
     baseline_steps=6500,
     downscale=None,

@@ -55,16 +55,18 @@ def _schedules(preset: Preset, steps: int) -> list[str]:
 
 def _time_steps(preset: Preset, scene: Scene) -> tuple[float, float]:
     """Return the seconds before the first step of stage 1, and those of a step."""
-    programs, keys, before = Programs(preset, scene), run_keys(0), 0.0
+    programs, keys, start = Programs(preset, scene), run_keys(0), time.perf_counter()
+    stereo = programs.stereo
+    before = time.perf_counter() - start
     if preset.coarse is None:
-        state = initial_state(programs, keys)
+        state = initial_state(programs, keys, stereo)
     else:
         coarse = programs.coarse
-        state = initial_state(coarse, keys)
+        state = initial_state(coarse, keys, stereo)
         state, each = _steps(coarse, state, TrainData(coarse.photographs))
         start = time.perf_counter()
         state = jax.block_until_ready(refine_state(programs, state))
-        before = preset.coarse.steps * each + time.perf_counter() - start
+        before += preset.coarse.steps * each + time.perf_counter() - start
     return before, _steps(programs, state, TrainData(programs.photographs))[1]
 
 

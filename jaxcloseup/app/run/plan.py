@@ -17,6 +17,7 @@ _STEP = {
     "test_time": 0.09,
 }
 _PART = {
+    "stereo": 20,
     "refine_baseline": 9,
     "depths": 27,
     "gate": 3,
@@ -32,6 +33,7 @@ _PART = {
 _EVALUATION = 7  # seconds of any other
 _RAYS = 8  # times as long for images of a field that renders single rays
 _WORDS = {
+    "stereo": "matching photographs",
     "depths": "rendering depths of the photographs, and what is scored",
     "gate": "comparing labels with left-out photographs",
     "audit": "comparing labels with the truth",
@@ -45,7 +47,8 @@ def plan_run(preset: Preset, scene: Scene, to_run: Sequence[str]) -> dict[str, f
     """Return typical seconds of the parts of a run by name, in order."""
     method = METHODS[preset.method]
     steps = {"baseline": preset.baseline_steps}
-    parts = ["coarse_baseline", "refine_baseline"] if preset.coarse is not None else []
+    parts = ["stereo"] if preset.stereo is not None else []
+    parts += ["coarse_baseline", "refine_baseline"] if preset.coarse is not None else []
     if preset.coarse is not None:
         steps["coarse_baseline"] = preset.coarse.steps
     parts += ["baseline", "depths", "baseline_evaluation", "gate"]

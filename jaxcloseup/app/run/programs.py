@@ -25,6 +25,7 @@ from jaxcloseup.app.run.devices import (
 )
 from jaxcloseup.app.run.photograph_sizes import describe_photographs, finest_read
 from jaxcloseup.app.run.step_data import ArmsData, StepData
+from jaxcloseup.app.run.stereo_depths import StereoDepths, match_photographs
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.io.memory import give_back_memory
@@ -103,9 +104,7 @@ class Programs:
     def pyramid(self, finest: int = 1) -> tuple[Pyramid, int]:
         """Return the training photographs from the finest size that fits, and its divisor.
 
-        They are read once.
-
-        `finest` is the smallest divisor of their size.
+        They are read once. `finest` is the smallest divisor of their size.
         """
         if finest not in self._pyramids:
             scene = self.scene
@@ -118,6 +117,15 @@ class Programs:
             self._pyramids[finest] = read
             give_back_memory()  # of the photographs
         return self._pyramids[finest]
+
+    @functools.cached_property
+    def stereo(self) -> StereoDepths | None:
+        """Return depth of the photographs by stereo; None without, or with too few to confirm."""
+        config = self.preset.stereo
+        if config is None or len(self.scene.train) <= config.matching.confirmations:
+            return None
+        finest = finest_read(self.preset, self.scene)
+        return match_photographs(self.scene, self.pyramid(finest)[0], config)
 
     @functools.cached_property
     def coarse(self) -> "Programs":

@@ -13,12 +13,17 @@ from jaxcloseup.app.run.loop import Training, TrainingError, train_stage
 from jaxcloseup.app.run.photograph_sizes import finest_read
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.step_data import TrainData
+from jaxcloseup.app.run.stereo_depths import StereoDepths, draw_points
 from jaxcloseup.app.run.timers import timed
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.fields.splats.surfels import random_points
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.io.memory import installed_memory
+from jaxcloseup.photos.depth_maps import GatherSources
+from jaxcloseup.photos.pyramids import photograph_pyramid
 from jaxcloseup.photos.scene import Scene
+from jaxcloseup.photos.views import Views
+from jaxcloseup.photos.windows import Windows, photograph_windows
 from jaxcloseup.training.state import TrainState, init_state
 
 
@@ -31,15 +36,21 @@ _init_state = jax.jit(init_state, static_argnames=("field", "optimizer"))
 def train_baseline(training: Training, stage: str, keys: RunKeys) -> TrainState:
     """Train stage 1 on photographs alone, and before it the preset's coarse model, if any."""
     programs, preset = training.programs, training.programs.preset
+    stereo = None
+    if preset.stereo is not None:
+        with timed(training.seconds, "stereo"):
+            stereo = programs.stereo
     if preset.coarse is None:
-        start = initial_state(programs, keys)
+        start = initial_state(programs, keys, stereo)
     else:
-        start = _refine_coarse(training, stage, keys)
-    data = TrainData(programs.photographs)
+        start = _refine_coarse(training, stage, keys, stereo)
+    data = TrainData(_with_depths(programs, stereo))
     return train_stage(training, stage, start, data, steps=preset.baseline_steps)
 
 
-def _refine_coarse(training: Training, stage: str, keys: RunKeys) -> TrainState:
+def _refine_coarse(
+    training: Training, stage: str, keys: RunKeys, stereo: StereoDepths | None
+) -> TrainState:
     """Train `preset.coarse`, and give its state the room and the detail of the preset itself."""
     programs, preset = training.programs, training.programs.preset
     assert preset.coarse is not None
@@ -47,16 +58,32 @@ def _refine_coarse(training: Training, stage: str, keys: RunKeys) -> TrainState:
     state: Any = train_stage(
         coarse,
         f"coarse_{stage}",
-        initial_state(coarse.programs, keys),
-        TrainData(coarse.programs.photographs),
+        initial_state(coarse.programs, keys, stereo),
+        TrainData(_with_depths(coarse.programs, stereo)),
         steps=preset.coarse.steps,
     )
     with timed(training.seconds, f"refine_{stage}"):
-        return refine_state(programs, state)
+        return refine_state(programs, state, None if stereo is None else stereo.sources)
 
 
-def refine_state(programs: Programs, state: TrainState) -> TrainState:
-    """Return the state of a coarse model with the room and the detail of the preset itself."""
+def _with_depths(programs: Programs, stereo: StereoDepths | None) -> Views | Windows:
+    """Return the programs' photographs, with stereo's depths if the field learns from them."""
+    photographs = programs.photographs
+    if stereo is None or programs.field.depth_loss is None:
+        return photographs
+    if isinstance(photographs, Views):
+        pyramid = photograph_pyramid(photographs)
+        photographs = photograph_windows(photographs.cameras, pyramid, whole_share=1.0)
+    return dataclasses.replace(photographs, depths=stereo.sources)
+
+
+def refine_state(
+    programs: Programs, state: TrainState, depths: GatherSources | None = None
+) -> TrainState:
+    """Return the state of a coarse model with the room and the detail of the preset itself.
+
+    What is added lies at measured `depths` where there are any.
+    """
     preset = programs.preset
     assert programs.method.refine is not None
     pyramid, _ = programs.pyramid(finest_read(preset, programs.scene))
@@ -65,21 +92,27 @@ def refine_state(programs: Programs, state: TrainState) -> TrainState:
         return programs.render(state.replace(params=params, buffers=buffers), camera)
 
     key_fine, key_refine = jax.random.split(jax.random.fold_in(state.key, state.step))
+    old = state.params, state.buffers
     params, buffers = programs.method.refine(
-        key_refine, preset.field, state.params, state.buffers, render, programs.scene, pyramid
+        key_refine, preset.field, *old, render, programs.scene, pyramid, depths
     )
     moments = jax.jit(programs.optimizer.init)(params)
     return TrainState(jnp.zeros_like(state.step), params, buffers, moments, key_fine)
 
 
-def initial_state(programs: Programs, keys: RunKeys) -> TrainState:
-    """Return the state before the first step of a baseline.
+def initial_state(
+    programs: Programs, keys: RunKeys, stereo: StereoDepths | None = None
+) -> TrainState:
+    """Return the state before the first step of a baseline, with points that stereo found.
 
     Raises:
       TrainingError: it does not fit into memory.
     """
     state_shapes(programs)
     points, rgb = initial_points(keys.points, programs.scene)
+    if stereo is not None and programs.preset.stereo is not None:
+        found = draw_points(stereo, programs.preset.stereo.points)
+        points, rgb = (np.concatenate(both) for both in zip((points, rgb), found, strict=True))
     return _initialize(programs)(keys.init, points, rgb)
 
 

@@ -13,7 +13,7 @@ from jaxcloseup.artifacts.images import to_uint8
 from jaxcloseup.artifacts.mesh_files import Mesh, surface_mesh
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points
 from jaxcloseup.labels.rules import label_depth
-from jaxcloseup.photos.depth_maps import fuse, fuse_grid, prepare_depth_maps
+from jaxcloseup.photos.fusion import fuse, fuse_grid, prepare_depth_maps
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.support import count_seen
 from jaxcloseup.photos.views import Views, camera_at

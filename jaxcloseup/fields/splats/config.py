@@ -152,6 +152,12 @@ class SplatConfig:
     regularize_from: int = setting(
         3000, "first step with the losses of distortion and of surfels' normals"
     )
+    depth_weight: float = setting(
+        0.0, "weight of the relative error of depths that stereo found; 0 learns from none"
+    )
+    depth_kept: float = setting(
+        0.0, "share of `depth_weight` that stays: it falls until `means_lr_steps`", high=1
+    )
     opacity_weight: float = setting(0.01, "weight of the mean opacity")
     scale_weight: float = setting(0.01, "weight of the mean scale")
     means_lr: tuple[float, float] = setting(

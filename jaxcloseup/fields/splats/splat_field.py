@@ -24,7 +24,7 @@ from jaxcloseup.fields.splats.control import DensityControl
 from jaxcloseup.fields.splats.filters import sampling_intervals, smoothed
 from jaxcloseup.fields.splats.local import Bounds, local_steps
 from jaxcloseup.fields.splats.render import SurfelAux, render_surfels
-from jaxcloseup.fields.splats.splat_loss import penalty_of, prior_of, splat_loss
+from jaxcloseup.fields.splats.splat_loss import depth_loss, penalty_of, prior_of, splat_loss
 from jaxcloseup.fields.splats.splat_optimizer import control_of
 from jaxcloseup.fields.splats.surfels import Surfels, surfels_from_points
 from jaxcloseup.geometry.cameras import Camera
@@ -45,6 +45,7 @@ class SurfelBuffers(struct.PyTreeNode):
       interval: `[N]` between the pixels of the photographs that show surfels finest, in world
         units; None without a smoothing filter, see `filters`.
       number: `[]` living surfels in all, where these are a part of them; None: count them.
+      hold: `[]` weight of the loss on measured depth; None without that loss.
       bounds: boxes around chunks of surfels, see `local`; None but in local steps.
     """
 
@@ -54,6 +55,7 @@ class SurfelBuffers(struct.PyTreeNode):
     expected: jax.Array
     interval: jax.Array | None = None
     number: jax.Array | None = None
+    hold: jax.Array | None = None
     bounds: Bounds | None = None
 
 
@@ -64,11 +66,15 @@ class SurfelFieldAux(NamedTuple):
       surfels: the `aux` of `render_surfels`.
       penalty: `[H, W]` weighted normal and distortion losses.
       prior: `[]` weighted mean opacity and scale.
+      expected_depth: `[H, W]`.
+      hold: `[]` weight of the loss on measured depth, or None.
     """
 
     surfels: SurfelAux
     penalty: jax.Array
     prior: jax.Array
+    expected_depth: jax.Array
+    hold: jax.Array | None
 
 
 def surfel_field(
@@ -103,12 +109,7 @@ def surfel_field(
       ValueError: a setting is out of range.
       TypeError: `config.density` is not the config of a density control.
     """
-    if config.depth not in ("median", "expected"):
-        raise ValueError(f'SurfelConfig.depth must be "median" or "expected", not "{config.depth}"')
-    if config.max_scale is not None and not config.max_scale > 0:
-        raise ValueError(f"SurfelConfig.max_scale must be positive or None, not {config.max_scale}")
-    if not extent > 0:
-        raise ValueError(f"extent must be a positive length, not {extent}")
+    _check(config, extent)
     field = _SplatField(config, extent, center, photographs, control_of(config, extent))
     # Compiled here, for callers render eagerly too, and every kind of step that a program compiles
     # then traces these parts once.
@@ -128,8 +129,22 @@ def surfel_field(
 
     loss = jax.jit(functools.partial(splat_loss, config=config))
     return RadianceField(
-        init=field.init, render=render, loss=loss, adapt=jax.jit(field.adapt), local=field.local()
+        init=field.init,
+        render=render,
+        loss=loss,
+        adapt=jax.jit(field.adapt),
+        depth_loss=depth_loss if config.depth_weight else None,
+        local=field.local(),
     )
+
+
+def _check(config: SplatConfig, extent: float) -> None:
+    if config.depth not in ("median", "expected"):
+        raise ValueError(f'SurfelConfig.depth must be "median" or "expected", not "{config.depth}"')
+    if config.max_scale is not None and not config.max_scale > 0:
+        raise ValueError(f"SurfelConfig.max_scale must be positive or None, not {config.max_scale}")
+    if not extent > 0:
+        raise ValueError(f"extent must be a positive length, not {extent}")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -156,9 +171,9 @@ class _SplatField:
             num_scales=config.num_scales,
         )
         expected = jnp.float32(config.depth == "expected")
-        degree, regularize = _schedule(config, jnp.zeros((), jnp.int32))
+        degree, regularize, hold = _schedule(config, jnp.zeros((), jnp.int32))
         buffers = SurfelBuffers(
-            alive, degree, regularize, expected, interval=self.intervals(surfels)
+            alive, degree, regularize, expected, interval=self.intervals(surfels), hold=hold
         )
         return self.control.init(surfels), buffers
 
@@ -179,7 +194,7 @@ class _SplatField:
         prior = prior_of(params, buffers.alive, config, self.extent, buffers.number)
         return image._replace(
             depth=jnp.where(buffers.expected > 0, image.depth, image.aux.median_depth),
-            aux=SurfelFieldAux(image.aux, penalty, prior),
+            aux=SurfelFieldAux(image.aux, penalty, prior, image.depth, buffers.hold),
         )
 
     def adapt(self, key: jax.Array, state: Any) -> Any:
@@ -188,8 +203,9 @@ class _SplatField:
         return state if self.photographs is None else self.renew_intervals(state)
 
     def follow_schedule(self, state: Any) -> Any:
-        degree, regularize = _schedule(self.config, state.step)
-        return state.replace(buffers=state.buffers.replace(degree=degree, regularize=regularize))
+        degree, regularize, hold = _schedule(self.config, state.step)
+        buffers = state.buffers.replace(degree=degree, regularize=regularize, hold=hold)
+        return state.replace(buffers=buffers)
 
     def bound_scales(self, state: Any) -> Any:
         surfels = _bound_scales(state.params, self.config, self.extent, self.center)
@@ -240,10 +256,16 @@ def camera_extent(cameras: Camera) -> jax.Array:
     return 1.1 * jnp.max(jnp.linalg.norm(offset, axis=-1))
 
 
-def _schedule(config: SplatConfig, step: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the degree of harmonics, and 1 where the normal and distortion losses count."""
+def _schedule(
+    config: SplatConfig, step: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array | None]:
+    """Return the buffers `degree`, `regularize` and `hold` after so many steps."""
     degree = jnp.minimum(step // config.sh_every, config.sh_degree).astype(jnp.int32)
-    return degree, (step >= config.regularize_from).astype(jnp.float32)
+    regularize = (step >= config.regularize_from).astype(jnp.float32)
+    if not config.depth_weight:
+        return degree, regularize, None
+    left = jnp.maximum(1 - step.astype(jnp.float32) / config.means_lr_steps, config.depth_kept)
+    return degree, regularize, config.depth_weight * left
 
 
 def _bound_scales(

@@ -17,6 +17,7 @@ from jaxcloseup.geometry.numerics import safe_divide
 from jaxcloseup.metrics.image_metrics import change_colors, fit_colors, ssim
 
 
+_SATURATED = 0.1  # relative error of depth at which its pull is a quarter
 _UNCHANGED_SHARE = 0.3  # share of the image loss on unchanged colors when images may change theirs
 
 
@@ -70,6 +71,20 @@ def _match_colors(
     any_weight = jnp.sum(weight) > 0
     matrix = jnp.where(any_weight, matrix, jnp.eye(3, dtype=matrix.dtype))
     return change_colors(seen, matrix, jnp.where(any_weight, offset, 0))
+
+
+def depth_loss(rendering: Rendering, depth: jax.Array, trust: jax.Array) -> jax.Array:
+    """Return the weighted relative error `[]` of the expected depth, saturated where it is large.
+
+    The expected depth moves with everything that is drawn along a ray, so what floats before the
+    surface fades, and what lies behind it comes forward. A measured depth may be wrong: beyond
+    some percent its pull falls.
+    """
+    chex.assert_equal_shape([rendering.depth, depth, trust])
+    seen = rendering.aux.expected_depth
+    error = jnp.abs(safe_divide(seen, depth) - 1)
+    pull = trust * jax.lax.stop_gradient(rendering.alpha) * error / (1 + error / _SATURATED)
+    return rendering.aux.hold * jnp.mean(jnp.where((trust > 0) & (seen > 0), pull, 0))
 
 
 def penalty_of(image: Rendering, camera: Camera, config: SplatConfig) -> jax.Array:

@@ -4,6 +4,7 @@ import dataclasses
 
 import chex
 import jax
+import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import plane
@@ -57,6 +58,40 @@ def trained(capture):
 
 
 render = jax.jit(lambda params, buffers, camera: FIELD.render(params, buffers, camera, None, None))
+
+
+def test_measured_depth_pulls_what_is_drawn_to_it(trained, capture):
+    """Its loss is that of NumPy, and falls when what lies before the surface fades."""
+    state, camera = trained[2], camera_at(capture[0].cameras, 0)
+    exact = np.asarray(capture[1][0])
+    config = dataclasses.replace(CONFIG, depth_weight=2.0, depth_kept=0.25)
+    field = surfel_field(config, extent=EXTENT)
+    assert FIELD.depth_loss is None
+    buffers = field.adapt(jax.random.key(0), state.replace(step=jnp.int32(STEPS // 2))).buffers
+    trust = np.zeros(exact.shape, np.float32)
+    trust[4:20, 4:28] = 0.5
+    depth = np.where(trust > 0, exact, 0).astype(np.float32)
+
+    @jax.jit
+    @jax.value_and_grad
+    def loss_of(params):
+        image = field.render(params, buffers, camera, None, None)
+        return field.depth_loss(image, jnp.asarray(depth), jnp.asarray(trust))
+
+    value, gradient = loss_of(state.params)
+    image = field.render(state.params, buffers, camera, None, None)
+    seen, alpha = (np.asarray(x, np.float64) for x in (image.aux.expected_depth, image.alpha))
+    error = np.abs(seen / exact - 1)
+    expected = np.mean(2.0 * 0.5 * alpha * trust * error / (1 + error / 0.1))  # half of the weight
+    np.testing.assert_allclose(value, expected, rtol=1e-4)
+    # The plane is z = 0, and cameras look down: what is above it should fade.
+    up = np.asarray(state.params.means[:, 2]) > 0.05
+    fades = np.asarray(gradient.opacity_logits)
+    assert np.sum(fades[up & (fades != 0)] > 0) > 0.7 * np.sum(up & (fades != 0))
+    assert np.all(np.isfinite(jax.flatten_util.ravel_pytree(gradient)[0]))
+    # It is gone at the end but for the share that is kept.
+    last = field.adapt(jax.random.key(0), state.replace(step=jnp.int32(10 * STEPS))).buffers
+    np.testing.assert_allclose(last.hold, 2.0 * 0.25)
 
 
 @jax.jit

@@ -29,6 +29,7 @@ from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.io.placement import Placement
 from jaxcloseup.labels.rules import label_depth
 from jaxcloseup.native import library
+from jaxcloseup.photos.depth_maps import GatherSources, read_depths
 from jaxcloseup.photos.pyramids import Pyramid
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.views import Views, camera_at, to_float
@@ -126,8 +127,12 @@ def refine(
     render: Callable[[Surfels, SurfelBuffers, Camera], Rendering],
     scene: Scene,
     pyramid: Pyramid,
+    depths: GatherSources | None = None,
 ) -> tuple[Surfels, SurfelBuffers]:
-    """Fill the rows that `config` has beyond `surfels` where photographs show more than these."""
+    """Fill the rows that `config` has beyond `surfels` where photographs show more than these.
+
+    They lie at the depths that were measured, and elsewhere at those that are rendered.
+    """
     views, cameras = len(pyramid), scene.train.cameras
     level = pyramid.level_near(_REFINED_AT * cameras.width)
     free = config.capacity - int(buffers.alive.sum())
@@ -141,13 +146,17 @@ def refine(
         camera = pyramid.camera(camera_at(cameras, view), view, level)
         photograph = to_float(pyramid.image(view, level))
         seen = render(padded, padded_buffers, camera)
+        depth = label_depth(seen)
+        if depths is not None:
+            known = read_depths(depths, view, camera).depth
+            depth = jnp.where(known > 0, known, depth)
         return sample(
             jax.random.fold_in(key, view),
             camera,
             photograph[..., :3],
             photograph[..., 3],
             seen.rgb,
-            label_depth(seen),
+            depth,
         )
 
     new = _search_each(search, views, "photographs searched")

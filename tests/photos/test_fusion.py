@@ -22,7 +22,7 @@ from jaxcloseup.app.view import surface
 from jaxcloseup.artifacts.mesh_files import Mesh, surface_mesh, write_mesh
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_rays
 from jaxcloseup.io.ply import read_vertices
-from jaxcloseup.photos.depth_maps import fuse, fuse_grid, prepare_depth_maps
+from jaxcloseup.photos.fusion import fuse, fuse_grid, prepare_depth_maps
 from jaxcloseup.photos.scene import Surface
 from jaxcloseup.photos.views import camera_at
 
