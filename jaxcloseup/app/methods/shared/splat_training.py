@@ -163,7 +163,9 @@ def refine(
     # The filter of finer photographs is smaller, so what the coarse one made stays as it is.
     old = smoothed(surfels, buffers.interval), buffers.alive
     surfels, alive = _join(old, new, capacity=config.capacity)
-    return surfels, buffers.replace(alive=alive, interval=_intervals(config, surfels, scene))
+    interval = _intervals(config, surfels, scene)
+    hold = jnp.float32(config.depth_weight) if config.depth_weight else None
+    return surfels, buffers.replace(alive=alive, interval=interval, hold=hold)
 
 
 def _intervals(config: SplatTrainingConfig, surfels: Surfels, scene: Scene) -> jax.Array | None:
