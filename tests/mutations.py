@@ -18,6 +18,7 @@ import numpy as np
 import PIL.Image
 
 
+LARGEST = 2**30  # bytes of a file that is read to be damaged
 NESTED = "nested"
 VALUES = [
     *(None, True, False, "", "a" * 300, "\x1b[31mred", "a\nb", "a\0b", "../../up", "/", "\ud800"),
@@ -304,7 +305,8 @@ def replace_file(rng, path):
 
 def mutate(rng: random.Random, folder: pathlib.Path, only: str = "*") -> str:
     """Damage one file of a folder whose name fits the pattern `only`; return which and how."""
-    path = rng.choice(sorted(path for path in folder.rglob(only) if path.is_file()))
+    files = (path for path in folder.rglob(only) if path.is_file())
+    path = rng.choice(sorted(path for path in files if path.stat().st_size < LARGEST))
     if rng.random() < 0.07:
         replace_file(rng, path)
         return f"{path.relative_to(folder)} replaced"

@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import pytest
+from wrong_captures import CASES
 
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -44,3 +45,18 @@ def test_tables_of_programs_are_those_of_today():
     check = [sys.executable, "-m", "experiments.studies.program_tables", "--compare"]
     done = subprocess.run(check, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_troubles_that_photographs_md_quotes_are_what_programs_say():
+    """Those of loading are cases of wrong captures, whose sentences are asserted."""
+    said = [words for cases in CASES.values() for _, words, *_ in cases]
+    for module in ("checks/judge.py", "app/process/capture_summary.py"):
+        text = (ROOT / "jaxcloseup" / module).read_text(encoding="utf-8")
+        said.append(re.sub(r'"\n\s+f?"', "", text))
+    _, _, table = (
+        (ROOT / "docs/photographs.md").read_text(encoding="utf-8").partition("bad capture")
+    )
+    quoted = re.findall(r'^\| "(?:\.\.\. )?(.*?)"', table, re.MULTILINE)
+    assert len(quoted) == 4
+    for one in quoted:
+        assert any(one in sentence for sentence in said), one

@@ -2,6 +2,7 @@
 
 import json
 import os
+import struct
 import zlib
 
 import cv2
@@ -25,6 +26,30 @@ def write_image(path, image=None, value=100):
     if path.suffix == ".png":  # photographs of one content are no copies: bytes at the end differ
         data += b"%08x" % zlib.crc32(os.fsencode(path))
     path.write_bytes(data)
+
+
+def tiff(image, order, orientation, *more):
+    """Encode an uncompressed TIFF; `more` are further tags and their numbers."""
+    height, width, channels = image.shape
+    tags = {256: width, 257: height, 258: 8 * image.itemsize, 259: 1, 262: 1 + (channels > 1)}
+    tags |= {273: 8, 274: orientation, 277: channels, 278: height, 279: image.nbytes, 284: 1}
+    tags |= {338: 2} if channels == 4 else {}
+    tags |= dict(more)
+    entries = [struct.pack(order + "HHIHH", tag, 3, 1, tags[tag], 0) for tag in sorted(tags)]
+    if channels > 1:  # the bits of each channel follow the directory
+        bits = 8 + image.nbytes + 2 + 12 * len(entries) + 4
+        entries[sorted(tags).index(258)] = struct.pack(order + "HHII", 258, 3, channels, bits)
+    return b"".join(
+        [
+            b"II*\0" if order == "<" else b"MM\0*",
+            struct.pack(order + "I", 8 + image.nbytes),
+            image.astype(image.dtype.newbyteorder(order)).tobytes(),
+            struct.pack(order + "H", len(entries)),
+            *entries,
+            bytes(4),
+            struct.pack(order + f"{channels}H", *[8 * image.itemsize] * channels),
+        ]
+    )
 
 
 def own_poses(scene, split="train"):

@@ -6,6 +6,7 @@ checks the sentence that the user reads.
 
 import json
 import os
+import pathlib
 import shutil
 import signal
 
@@ -39,12 +40,6 @@ IMAGES = [image_line(1, "000.png"), "", image_line(2, "001.png"), ""]
 
 def single(folder):
     single_file(folder, 2)
-
-
-def masked(folder):
-    """The paper's layout, with a mask that its file names."""
-    paper(folder)
-    frames(frame("train/a.png", mask_path="m.png"), frame("train/b.png"))(folder)
 
 
 def binary(folder):
@@ -121,15 +116,35 @@ def terabyte(name):
     return change
 
 
-def endless(name):
+def link(name, target):
     def change(folder):
         (folder / name).unlink(missing_ok=True)
-        (folder / name).symlink_to("/dev/zero")
+        (folder / name).symlink_to(target)
 
     return change
 
 
+def endless(name):
+    return link(name, "/dev/zero")
+
+
+def loop(name):
+    return link(name, pathlib.PurePath(name).name)
+
+
 # Changes to one format.
+
+
+def listed(before, after):
+    """Change what the files of either format list."""
+
+    def change(folder):
+        file = next(
+            name for name in ("transforms.json", "sparse/0/images.txt") if (folder / name).exists()
+        )
+        edit(file, lambda data: data.replace(before.encode(), after.encode()))(folder)
+
+    return change
 
 
 def frames(*listed, **fields):

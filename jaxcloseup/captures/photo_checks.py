@@ -22,11 +22,9 @@ from jaxcloseup.photos.scene import (
 def warn_copies(listing: Listing) -> None:
     """Warn of photographs under several names: files of the same bytes."""
     by_size = collections.defaultdict(list)
-    listed = {frame.file for part in listing.frames.values() for frame in part}
-    for file in sorted(
-        filter(pathlib.Path.is_file, listed)
-    ):  # others are refused when they are read
-        by_size[file.stat().st_size].append(file)
+    for file in sorted({frame.file for part in listing.frames.values() for frame in part}):
+        if file.is_file():  # what is none is refused where it is read
+            by_size[file.stat().st_size].append(file)
     same: dict[str, list[pathlib.Path]] = collections.defaultdict(list)
     for files in by_size.values():
         for file in files if len(files) > 1 else ():

@@ -185,9 +185,6 @@ def test_masks_become_weights(capture):
     write_image(capture / "masks/a.png", clear)
     again = load_scene(capture, downscale=2)
     np.testing.assert_array_equal(again.train.weight, scene.train.weight)
-    write_image(capture / "masks/a.png", mask[:3])
-    with pytest.raises(SceneError, match=r"masks/a\.png is 8 x 3 pixels but its photograph is 8"):
-        load_scene(capture)
 
 
 def test_downscale_averages_areas(tmp_path):
@@ -271,9 +268,6 @@ def test_points_come_with_the_capture(capture):
     frames = [frame("train/a.png")]
     write_json(capture / "transforms_train.json", frames, ply_file_path="other.ply")
     assert load_scene(capture).points.shape == (2, 3)
-    write_json(capture / "transforms_train.json", frames, ply_file_path="none.ply")
-    with pytest.raises(SceneError, match=r"ply_file_path 'none\.ply' does not exist"):
-        load_scene(capture)
 
 
 @pytest.mark.parametrize("given", [{"near": None, "far": None}, {"near": 0.5, "far": None}])

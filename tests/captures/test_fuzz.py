@@ -4,9 +4,9 @@ The files are read in a process of its own, which a crash may take down, as
 
     python tests/captures/test_fuzz.py FOLDER RUN      # then numbers of mutations on its input
 
-A number decides what is damaged and how, so a fault is found again by its number. RUN is a run of
-surfels. `JAXCLOSEUP_FUZZ=5000` reads so many files instead of the usual number, and
-`JAXCLOSEUP_FUZZ=17:18` the seventeenth again.
+A number decides what is damaged and how, so a fault is found again by its number. Some captures
+are wrong before they are damaged. RUN is a run of surfels. `JAXCLOSEUP_FUZZ=5000` reads so many
+files instead of the usual number, and `JAXCLOSEUP_FUZZ=17:18` the seventeenth again.
 """
 
 import collections
@@ -28,18 +28,9 @@ import jax
 import numpy as np
 import pytest
 from mutations import mutate
-from tiny_capture import (
-    colmap_capture,
-    frame,
-    llff_capture,
-    paper_capture,
-    single_file,
-    vertices,
-    write_image,
-    write_json,
-    write_ply,
-)
-from wrong_input import binary
+from tiny_capture import frame, single_file, vertices, write_image, write_json, write_ply
+from wrong_captures import CASES
+from wrong_input import binary, colmap, llff, paper, single
 
 from jaxcloseup.app.run.logs import TrainLog
 from jaxcloseup.app.run.programs import Programs
@@ -56,6 +47,7 @@ from jaxcloseup.io.torch_file import TorchFileError, read_tensors
 
 
 MUTATIONS = 300
+WRONG = 0.25  # of the captures are so before they are damaged
 HANG = 10  # seconds of a computer that does nothing else
 PATIENCE = 3  # times as long on a busy one
 LARGEST = 2**31  # bytes that reading may take
@@ -119,7 +111,7 @@ def check_scene(scene):
 
 
 def make_paper(folder):
-    paper_capture(folder)
+    paper(folder)
     frames = [frame("train/a.png", mask_path="m.png"), frame("train/b.png")]
     write_json(folder / "transforms_train.json", frames, ply_file_path="points3d.ply")
     write_image(folder / "m.png", np.full((6, 8), 255, np.uint8))
@@ -138,7 +130,7 @@ def make_single(folder):
 
 
 def make_llff(folder):
-    llff_capture(folder)
+    llff(folder)
     write_ply(folder / "points3d.ply", vertices(), "ascii")
 
 
@@ -249,17 +241,25 @@ class RunReader:
             )
 
 
+def wrong(good):
+    """The changes that make a capture of a format wrong."""
+    return [change for change, *_ in CASES[good]]
+
+
 def cases(run):
-    """Functions that make a folder and read it, and the pattern of the names to damage in it."""
+    """Functions that make a folder and read it, and the pattern of the names to damage in it.
+
+    A fourth value has changes that make the folder wrong.
+    """
     reader = RunReader(run)
     return {
-        "transforms": (make_paper, read_capture, "*"),
+        "transforms": (make_paper, read_capture, "*", wrong(paper)),
         "fields": (make_single, read_capture, "*.json"),
-        "files": (make_single, read_capture, "*"),
-        "colmap text": (colmap_capture, read_capture, "*.txt"),
-        "colmap binary": (binary, read_capture, "*.bin"),
+        "files": (make_single, read_capture, "*", wrong(single)),
+        "colmap text": (colmap, read_capture, "*.txt", wrong(colmap)),
+        "colmap binary": (binary, read_capture, "*.bin", wrong(binary)),
         "llff": (make_llff, read_capture, "*.npy"),
-        "capture of llff": (make_llff, read_capture, "*"),
+        "capture of llff": (make_llff, read_capture, "*", wrong(llff)),
         "pictures": (make_pictures, read_pictures, "*"),
         "points": (make_points, read_points, "*"),
         "weights": (make_weights, read_weights, "*"),
@@ -307,10 +307,12 @@ def main():
     for number in map(int, sys.stdin):
         rng, start = random.Random(number), time.process_time()
         name = sorted(made)[number % len(made)]
-        make, read, pattern = made[name]
+        make, read, pattern, *changes = made[name]
         place = folder / f"read {number}"
         place.mkdir()
         make(place)
+        for change in (rng.choice(some) for some in changes if rng.random() < WRONG):
+            change(place)
         what = mutate(rng, place, pattern)
         refused, fault = outcome(rng, read, place)
         shutil.rmtree(place, ignore_errors=True)

@@ -27,11 +27,6 @@ def test_known_cameras(capture):
     np.testing.assert_allclose(depth, 3, rtol=1e-6)
 
 
-def change(rows, column, value):
-    rows[1, column] = value
-    return rows
-
-
 def test_hidden_files_are_not_photographs(capture):
     (capture / "images/._0.png").write_bytes(b"metadata of macOS")
     assert len(load_scene(capture).train) == 2

@@ -1,14 +1,12 @@
 """Decoding of photographs and masks."""
 
 import struct
-import zlib
 
 import cv2
 import numpy as np
 import PIL.Image
 import pytest
-from tiny_capture import HEIGHT, WIDTH, write_image
-from wrong_input import HEIC
+from tiny_capture import HEIGHT, WIDTH, tiff, write_image
 
 from jaxcloseup.captures import photo_files
 from jaxcloseup.captures.load import SceneError
@@ -57,53 +55,6 @@ def test_tiff_orientation_is_not_applied(tmp_path, order, kind, channels):
         np.testing.assert_array_equal(decode_image(tmp_path / "a.tif"), plain)
 
 
-def tiff(image, order, orientation, *more):
-    """Encode an uncompressed TIFF; `more` are further tags and their numbers."""
-    height, width, channels = image.shape
-    tags = {256: width, 257: height, 258: 8 * image.itemsize, 259: 1, 262: 1 + (channels > 1)}
-    tags |= {273: 8, 274: orientation, 277: channels, 278: height, 279: image.nbytes, 284: 1}
-    tags |= {338: 2} if channels == 4 else {}
-    tags |= dict(more)
-    entries = [struct.pack(order + "HHIHH", tag, 3, 1, tags[tag], 0) for tag in sorted(tags)]
-    if channels > 1:  # the bits of each channel follow the directory
-        bits = 8 + image.nbytes + 2 + 12 * len(entries) + 4
-        entries[sorted(tags).index(258)] = struct.pack(order + "HHII", 258, 3, channels, bits)
-    return b"".join(
-        [
-            b"II*\0" if order == "<" else b"MM\0*",
-            struct.pack(order + "I", 8 + image.nbytes),
-            image.astype(image.dtype.newbyteorder(order)).tobytes(),
-            struct.pack(order + "H", len(entries)),
-            *entries,
-            bytes(4),
-            struct.pack(order + f"{channels}H", *[8 * image.itemsize] * channels),
-        ]
-    )
-
-
-GRAY = np.zeros((HEIGHT, WIDTH, 1), np.uint8)
-
-
-@pytest.mark.parametrize(
-    ("data", "words"),
-    [
-        (HEIC, "is a HEIC photograph, which is not read: export it as JPEG"),
-        (b"\x76\x2f\x31\x01" + bytes(99), "is an OpenEXR image, .*: export it as PNG"),
-        (b"\xff\x0a" + bytes(99), "is a JPEG XL image"),
-        (b"\0\0\0\x0cJXL \r\n\x87\n" + bytes(99), "is a JPEG XL image"),
-        (b"\0\0\0\x18ftypcrx " + bytes(99), "is a camera's raw file, .*: develop it and"),
-        (b"II*\0\x10\0\0\0CR\x02\0" + bytes(99), "is a camera's raw file"),
-        (tiff(GRAY, "<", 1, (50706, 1)), "is a camera's raw file"),
-        (tiff(GRAY, ">", 1, (254, 1), (330, 8)), "is a camera's raw file"),
-        (tiff(np.repeat(GRAY, 4, -1), "<", 1, (262, 5)), "is a TIFF of CMYK colors.*: export it"),
-    ],
-)
-def test_formats_that_are_not_read_are_named_by_their_content(tmp_path, data, words):
-    (tmp_path / "a.jpg").write_bytes(data)
-    with pytest.raises(SceneError, match=rf"a\.jpg {words}"):
-        read_image(tmp_path / "a.jpg")
-
-
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
 @pytest.mark.parametrize("keep", [0.0, 0.02, 0.5, 0.99])
 def test_truncated_images(tmp_path, suffix, keep, capfd):
@@ -125,25 +76,9 @@ def test_truncated_jpeg_with_a_complete_thumbnail(tmp_path, capfd):
         read_image(tmp_path / "a.jpg")
 
 
-def test_not_an_image(tmp_path):
-    (tmp_path / "a.png").write_text("hello")
-    with pytest.raises(SceneError, match="not a readable image"):
-        read_image(tmp_path / "a.png")
-    write_image(tmp_path / "a.tiff", np.zeros((4, 4, 3), np.float32))
-    with pytest.raises(SceneError, match="holds float32 values"):
-        read_image(tmp_path / "a.tiff")
+def test_no_file(tmp_path):
     with pytest.raises(SceneError, match=r"cannot be read \(No such file"):
         read_image(tmp_path / "b.png")
-
-
-def test_a_header_with_a_huge_image_size(tmp_path):
-    write_image(tmp_path / "a.png")
-    data = (tmp_path / "a.png").read_bytes()
-    header = b"IHDR" + struct.pack(">II", 100_000, 100_000) + data[24:29]
-    huge = data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:]
-    (tmp_path / "a.png").write_bytes(huge)
-    with pytest.raises(SceneError, match=r"a\.png has more than 170 megapixels"):
-        read_image(tmp_path / "a.png")
 
 
 def test_small_files_of_many_pixels_are_refused_before_they_are_decoded(tmp_path, monkeypatch):

@@ -13,7 +13,7 @@ from tiny_capture import (
     write_image,
     write_json,
 )
-from wrong_input import all_of, edit, llff, refused, remove
+from wrong_input import all_of, listed, llff
 
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.photos.scene import DuplicateFileWarning
@@ -38,18 +38,6 @@ def rename(function):
             path.rename(new)
         if not any((folder / "images").iterdir()):
             (folder / "images").rmdir()
-
-    return change
-
-
-def listed(before, after):
-    """Change what the files of either format list."""
-
-    def change(folder):
-        file = next(
-            name for name in ("transforms.json", "sparse/0/images.txt") if (folder / name).exists()
-        )
-        edit(file, lambda data: data.replace(before.encode(), after.encode()))(folder)
 
     return change
 
@@ -115,32 +103,6 @@ def test_llff_beside_its_photographs(tmp_path):
     assert load_scene(tmp_path).train.rgb[:, 0, 0, 0].tolist() == [1, 2]
 
 
-def instead(*names):
-    """Replace the first photograph by others."""
-    return lambda folder: [write_image(folder / name) for name in names] and remove(FIRST)(folder)
-
-
-FIRST = "images/000.png"
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (remove(FIRST), r"1 of 3 listed images do not exist .*images/000\.png\), nor in another"),
-        # Another's photograph and a mask are not the missing one.
-        (listed(FIRST, "images/sub/001.png"), r"1 of 3 .*\(images/sub/001\.png\)"),
-        (instead("images/000.png.png", "images/000.mask.png"), r"1 of 3 .*\(images/000\.png\)"),
-        (instead("images/000.jpg", "images/000.bmp"), r"fits both .*000\.bmp and .*000\.jpg: rem"),
-        (
-            instead("images/000.PNG", "Images/000.png"),
-            r"fits both .*Images/000\.png and .*images/000\.P",
-        ),
-    ],
-)
-def test_what_is_missing_or_ambiguous_is_refused(tmp_path, change, words):
-    refused(tmp_path, single, change, words)
-
-
 def test_views_without_photographs_are_not_scored(tmp_path):
     paper_capture(tmp_path)
     # The training photograph of the same name is not the one of the view.
@@ -155,8 +117,6 @@ def test_views_without_photographs_are_not_scored(tmp_path):
     )
     (tmp_path / "test/a.png").unlink()
     assert load_scene(tmp_path).names == {"train": ["a", "b"]}
-    (tmp_path / "train/a.png").unlink()
-    refused(tmp_path / "again", paper_capture, remove("train/a.png"), "1 of 2 listed images do not")
 
 
 def test_what_is_not_used_is_counted(tmp_path):

@@ -82,18 +82,6 @@ def test_shrunk_photographs_are_used_only_if_complete(tmp_path):
     assert rgb.any() and "because the capture gives no w and h" in notes
 
 
-def test_a_size_that_no_rounding_explains(tmp_path):
-    write_capture(tmp_path)
-    for name in "abc":
-        write_image(
-            tmp_path / f"images_2/{name}.png", np.zeros((3, 6 if name == "b" else 4, 3), "u1")
-        )
-    with pytest.raises(
-        SceneError, match=r"images_2/b\.png is 6 x 3 pixels, which is not 9 x 7 div"
-    ):
-        load_scene(tmp_path, downscale=2)
-
-
 @pytest.mark.parametrize(
     "make", [lambda folder: single_file(folder, 3), llff_capture, colmap_capture]
 )

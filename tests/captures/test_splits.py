@@ -11,7 +11,6 @@ from tiny_capture import (
     colmap_capture,
     image_line,
     llff_capture,
-    llff_rows,
     vertices,
     write_image,
     write_json,
@@ -77,14 +76,6 @@ def test_a_longer_lens_counts_as_nearer(tmp_path):
     scene = load_scene(tmp_path, split="closest")
     assert scene.names == {"train": ["1", "2", "4"], "test": ["3"], "test_far": ["0"]}
     np.testing.assert_allclose(scene.metadata["times_nearer"], [12 / 9])
-
-
-def test_closest_needs_two_photographs(capture):
-    for i in (1, 2):
-        (capture / f"images/{i}.png").unlink()
-    np.save(capture / "poses_bounds.npy", llff_rows(1)[0])
-    with pytest.raises(SceneError, match="closest needs at least 2 photographs"):
-        load_scene(capture, split="closest")
 
 
 @pytest.mark.parametrize(
