@@ -7,14 +7,15 @@ import shutil
 import tempfile
 
 import jax
+import optimized  # noqa: F401
 import pytest
 from tiny_runs import keep_run, write_plane
 
 
-# Arms of sweeps are spread over all devices. Tests compile more than they compute, so LLVM takes
-# its quicker passes, each program is one piece to it, and JAX 0.10 uses XLA's older, smaller code
+# Arms of sweeps are spread over all devices. Tests compile more than they compute, so LLVM
+# optimizes nothing, each program is one piece to it, and JAX 0.10 uses XLA's older, smaller code
 # of fused loops, which 0.11 no longer has. Read when the first array is made.
-QUICKLY = "--xla_backend_optimization_level=1 --xla_cpu_parallel_codegen_split_count=1"
+QUICKLY = "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
 if jax.__version_info__ < (0, 11):
     QUICKLY += " --xla_cpu_use_fusion_emitters=false"
 DEVICES = "--xla_force_host_platform_device_count=8"
@@ -35,7 +36,7 @@ def pytest_configure(config):
         os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp()
         os.environ.setdefault(_CACHE, os.environ["XDG_CACHE_HOME"])
     jax.config.update("jax_compilation_cache_dir", os.environ[_CACHE])
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
 def pytest_collection_modifyitems(items):

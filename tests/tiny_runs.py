@@ -1,6 +1,7 @@
 """Presets and a capture on which a whole run takes seconds."""
 
 import dataclasses
+import functools
 import json
 
 import cv2
@@ -84,14 +85,19 @@ def write_plane(folder):
     return folder
 
 
+@functools.cache
+def programs_of(preset, capture_folder):
+    """Programs on the plane, which all tests of a process share once they are compiled."""
+    return Programs(preset, load_scene(str(capture_folder)))
+
+
 def keep_run(folder, capture_folder):
     """Write the folder of a run that was interrupted after its closeup; surfels cover the plane."""
     with jax.numpy_dtype_promotion("standard"):
-        scene = load_scene(str(capture_folder))
+        programs = programs_of(KEPT, capture_folder)
+        scene, bound = programs.scene, {"field": programs.field, "optimizer": programs.optimizer}
         side = np.linspace(-HALF, HALF, 24)
         points = np.stack([*np.meshgrid(side, side), np.zeros((24, 24))], -1).reshape(-1, 3)
-        programs = Programs(KEPT, scene)
-        bound = {"field": programs.field, "optimizer": programs.optimizer}
         placed = scene.placement.to_scene(points)
         data = (jnp.asarray(x, jnp.float32) for x in (placed, plane.texture(points)))
         state = init_state(jax.random.key(0), *data, **bound)

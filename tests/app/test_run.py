@@ -11,11 +11,12 @@ import numpy as np
 import PIL.Image
 import plane
 import pytest
-from tiny_runs import TINY, TINY_SURFELS
+from tiny_runs import TINY, TINY_SURFELS, programs_of
 
 from jaxcloseup.app.methods.method import CoarseConfig, TargetConfig, WindowConfig
 from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.methods.surfels import REDUCED
+from jaxcloseup.app.report import reported_run
 from jaxcloseup.app.report.comparison import say_which_is_best, write_comparison
 from jaxcloseup.app.report.finished_runs import read_finished
 from jaxcloseup.app.report.reported_run import run
@@ -52,9 +53,11 @@ def finished(capture_folder, tmp_path_factory):
 
 def run_tiny(capture_folder, output_dir):
     # Libraries under a run (optax's schedules) mix integers and floats.
-    with jax.numpy_dtype_promotion("standard"):
-        scene = load_scene(str(capture_folder))
+    with jax.numpy_dtype_promotion("standard"), pytest.MonkeyPatch.context() as patch:
+        programs = programs_of(TINY, capture_folder)  # compiled once for all
+        patch.setattr(reported_run, "Programs", lambda preset, scene: programs)
         names = {"method": "nerf", "preset": "tiny"}
+        scene = load_scene(str(capture_folder))
         return run(scene, TINY, 0, output_dir, names=names, save_every=3)
 
 
@@ -195,9 +198,8 @@ def test_no_step_is_taken_on_a_truncated_image(capture_folder, capsys):
 def test_a_large_image_is_rendered_in_quarters(capture_folder):
     """An image of odd size, twice as wide as what has a program of its own, has no seams."""
     with jax.numpy_dtype_promotion("standard"):
-        scene = load_scene(str(capture_folder))
-        programs = Programs(TINY, scene)
-        state = initial_state(programs, run_keys(0))
+        programs = programs_of(TINY, capture_folder)
+        scene, state = programs.scene, initial_state(programs, run_keys(0))
         camera = camera_at(scene.train.cameras, 1)
         times = 4 + 3 / camera.width
         size = {"height": 4 * camera.height + 1, "width": 4 * camera.width + 3}
@@ -309,13 +311,12 @@ def test_a_run_cut_off_and_resumed_ends_the_same(
     assert_log_is_history(tmp_path, results["history"])
 
 
-def test_training_that_is_no_longer_finite_stops_with_what_was_good(capture_folder, tmp_path):
+def test_training_that_is_no_longer_finite_stops_with_what_was_good(
+    capture_folder, tmp_path, monkeypatch
+):
     with jax.numpy_dtype_promotion("standard"):
-        scene = load_scene(str(capture_folder))
-        programs = Programs(TINY, scene)
-        points = scene.points, scene.rgb
-        key = jax.random.key(0)
-        state = init_state(key, *points, field=programs.field, optimizer=programs.optimizer)
+        programs = programs_of(TINY, capture_folder)
+        scene, state = programs.scene, initial_state(programs, run_keys(0))
         broken = scene.train.replace(rgb=jnp.full(scene.train.rgb.shape, jnp.nan))
         training = Training(programs, Checkpoints(tmp_path, {"scene": "plane"}))
         good, calls, run = [], [], programs.run
@@ -328,7 +329,7 @@ def test_training_that_is_no_longer_finite_stops_with_what_was_good(capture_fold
                 good.append(now[0])
             return now
 
-        programs.run = breaks_in_the_second_and_after_four
+        monkeypatch.setattr(programs, "run", breaks_in_the_second_and_after_four)
         message = r"stopped after 8 good .* kept in .* not finite in each of the next 10:"
         with pytest.raises(TrainingError, match=message):
             train_stage(training, "baseline", state, TrainData(scene.train), steps=20)

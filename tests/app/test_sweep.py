@@ -19,7 +19,7 @@ import pytest
 from absl import flags
 from absl.testing import flagsaver
 from conftest import QUICKLY
-from tiny_runs import TINY, TINY_MIP, TINY_SURFELS
+from tiny_runs import TINY, TINY_MIP, TINY_SURFELS, programs_of
 from tiny_training import assert_same_step
 
 from jaxcloseup.app.cli import sweep
@@ -28,7 +28,6 @@ from jaxcloseup.app.report.pictures import comparisons
 from jaxcloseup.app.report.sweep_tables import paired_bootstrap, rows, write_sweep
 from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.labels import start_labels
-from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.states import initial_points
 from jaxcloseup.app.run.step_data import CloseupData, TrainData
 from jaxcloseup.app.sweep import arm_training
@@ -47,8 +46,8 @@ TINY_STEPS = dataclasses.replace(
 @functools.cache
 def begin(preset, capture_folder):
     """Programs, the start of labels after a few steps, and the settings of each arm."""
-    scene = load_scene(str(capture_folder))
-    programs = Programs(preset, scene)
+    programs = programs_of(preset, capture_folder)
+    scene = programs.scene
     points = initial_points(jax.random.key(1), scene)
     state = init_state(
         jax.random.key(0), *points, field=programs.field, optimizer=programs.optimizer
@@ -123,8 +122,8 @@ def sweep_tiny(scene, folder, arms=("baseline", "control", "diverse", "test_time
 
 
 def test_a_sweep_cut_off_and_resumed_ends_the_same(capture_folder, tmp_path, monkeypatch, capsys):
-    scene = load_scene(str(capture_folder))
-    programs = Programs(TINY_STEPS, scene)  # compiled once for both
+    programs = programs_of(TINY_STEPS, capture_folder)  # compiled once for both
+    scene = programs.scene
     monkeypatch.setattr(arm_training, "Programs", lambda preset, scene: programs)
     render, rendered_by = programs.render, set()
 

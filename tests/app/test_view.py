@@ -17,11 +17,10 @@ from absl import flags
 from absl.testing import flagsaver
 from browser import click_in_the_middle, free_port, open_browser, wait
 from reference_splats import sh_color
-from tiny_runs import TINY
+from tiny_runs import TINY, programs_of
 
 from jaxcloseup.app.cli import view as program
 from jaxcloseup.app.run.loop import TrainingError
-from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.store.stored_run import load_run_scene, read_run, restore
 from jaxcloseup.artifacts.images import color_counts, to_uint8
 
@@ -301,8 +300,8 @@ def test_fine_tuning_is_shown_and_sent_until_the_camera_moves(serve, kept, monke
     assert np.mean(shown(client)) > np.mean(plain) - 5
 
 
-def test_the_page_shows_the_points_of_a_nerf(serve, kept):
-    programs = Programs(TINY, load_run_scene(read_run(kept)))
+def test_the_page_shows_the_points_of_a_nerf(serve, capture_folder):
+    programs = programs_of(TINY, capture_folder)
     page, _ = serve(programs, types.SimpleNamespace(params={}))
     with pytest.raises(queue.Empty):
         page.work(timeout=0)
@@ -312,10 +311,8 @@ def test_the_page_shows_the_points_of_a_nerf(serve, kept):
     assert drawn == bool(len(programs.scene.points)) and not client.scene.add_gaussian_splats.called
 
 
-def test_the_page_shows_failures_and_stays_up(serve, kept, capsys):
-    page, _ = serve(
-        Programs(TINY, load_run_scene(read_run(kept))), types.SimpleNamespace(params={})
-    )
+def test_the_page_shows_failures_and_stays_up(serve, capture_folder, capsys):
+    page, _ = serve(programs_of(TINY, capture_folder), types.SimpleNamespace(params={}))
 
     def fail(error):
         raise error

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from optimized import optimized
 
 from jaxcloseup.drawn_scenes import raycast, shading
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_rays
@@ -124,7 +125,7 @@ def test_solids_must_be_sorted():
 
 def test_culling_by_tiles_changes_nothing(clutter):
     solids, rng = as_solids(clutter), np.random.default_rng(3)
-    render = jax.jit(shading.render_geometry)
+    render = optimized(shading.render_geometry)
     for _ in range(3):
         pose = np.column_stack([random_rotation(rng), rng.uniform(-3, 3, 3)])
         camera = Camera(jnp.asarray(pose, jnp.float32), jnp.array([30.0, 31.0, 26.0, 20.0]), 40, 52)
