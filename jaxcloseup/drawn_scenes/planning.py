@@ -146,8 +146,11 @@ def _closeup(
 
     facing = np.sum(hit.normal * direction, axis=-1) > 0.4
     back = cast_rays(solids, subjects + 1e-3 * hit.normal, positions - subjects).depth > 1
-    clear = cast_rays(solids, *grid_rays(poses, 32, 18)).depth.min(1) > np.maximum(0.07, 0.4 * own)
-    for i in np.flatnonzero(on_subject & facing & back & clear):
+    good = np.flatnonzero(on_subject & facing & back)
+    if not len(good):
+        return None
+    clear = cast_rays(solids, *grid_rays(poses[good], 32, 18)).depth.min(1)
+    for i in good[clear > np.maximum(0.07, 0.4 * own[good])]:
         fine = cast_rays(solids, *grid_rays(poses[i : i + 1], 96, 54)).depth
         if fine.min() < max(0.07, 0.35 * own[i]) or not np.isfinite(fine).all():
             continue

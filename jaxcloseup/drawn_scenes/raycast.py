@@ -131,7 +131,8 @@ def cast_rays(
 ) -> Hit:
     """Find the first hits `[...]` of many rays `[..., 3]`, as NumPy arrays.
 
-    Rays are cast in chunks of 4096, so that one compilation serves any number of rays.
+    Rays are cast in chunks of 4096, or of 256 where there are few, so that two compilations serve
+    any number of rays.
 
     Args:
       solids: `N` solids.
@@ -140,7 +141,8 @@ def cast_rays(
       wanted: `[N]` bool, the solids to test; None tests all.
     """
     shape = np.broadcast_shapes(origins.shape, directions.shape)[:-1]
-    count, chunk = int(np.prod(shape)), 4096
+    count = int(np.prod(shape))
+    chunk = 4096 if count > 2048 else 256
     rays = [np.broadcast_to(r, (*shape, 3)).reshape(-1, 3) for r in (origins, directions)]
     rays = [np.pad(r, [(0, -count % chunk), (0, 0)], mode="edge").astype(np.float32) for r in rays]
     wanted = np.ones(solids.kind.shape, bool) if wanted is None else wanted
