@@ -5,7 +5,7 @@ Tests compile others without optimizing them, as `conftest.py` says.
 
 import jax
 
-from jaxcloseup.detail import learn
+from jaxcloseup.detail import add, learn
 from jaxcloseup.drawn_scenes import drawn, lighting, raycast
 
 
@@ -16,6 +16,8 @@ def optimized(function, *static):
 
 
 for module, name, *static in (
+    (add, "_add"),
+    (add, "_fill"),
     (learn, "_descend", "loss", "steps", "rate"),
     (drawn, "_render_rgb", "samples"),
     (lighting, "_look_up"),
