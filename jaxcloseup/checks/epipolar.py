@@ -8,6 +8,8 @@ from jaxcloseup.checks.matches import Matches
 
 
 FITTING = 2.0  # pixels of epipolar error up to which a match fits the poses
+_PRECISE, _NEARLY = 0.7, 10.0  # pixels of errors of right poses, and of those of poses with noise
+_MANY = 0.15  # share of precise matches that no wrong pose has
 
 
 class Cameras(NamedTuple):
@@ -23,10 +25,14 @@ class Fit(NamedTuple):
 
     share: float  # share of matches with an error of at most `FITTING`
     median: float  # median error in pixels
+    fitting: float  # the same of matches that fit; NaN if none does
     by_view: np.ndarray  # `[V]` share of each photograph's matches that fit; NaN without matches
     # `[V]` the same of the best of the photographs that it matches; NaN if there are less than two,
     # or half as many matches as usual, because a repeated pattern may match a photograph wrongly
     by_best: np.ndarray
+    # `[V]` whether some pair of the photograph has many precise matches and hardly any that are
+    # nearly so: poses put the others far off, as a repeated pattern does, and no wrong pose
+    precise: np.ndarray
 
 
 def epipolar_errors(matches: Matches, cameras: Cameras) -> np.ndarray:
@@ -64,13 +70,24 @@ def fit(matches: Matches, cameras: Cameras) -> Fit:
     right = np.bincount(ends, np.repeat(inside, 2), minlength=count)
     by_view = np.divide(right, total, out=np.full(count, np.nan), where=total > 0)
     pairs, place = np.unique(matches.views, axis=0, return_inverse=True)
-    shares = np.bincount(place, inside) / np.bincount(place)
+    shares = _shares(place, inside)
     by_best = np.full(count, -1.0)
     for side in range(2):
         np.maximum.at(by_best, pairs[:, side], shares)
+    narrow = _shares(place, errors <= _PRECISE)
+    nearly = _shares(place, (errors > FITTING) & (errors <= _NEARLY))
+    precise = np.zeros(count, bool)
+    precise[pairs[(narrow >= _MANY) & (nearly <= narrow / 4)]] = True
     few = total < np.median(total[total > 0]) / 2 if total.any() else total == 0
     by_best[few | (np.bincount(pairs.ravel(), minlength=count) < 2)] = np.nan
-    return Fit(float(inside.mean()), float(np.median(errors)), by_view, by_best)
+    fitting = float(np.median(errors[inside])) if inside.any() else np.nan
+    median = float(np.median(errors))
+    return Fit(float(inside.mean()), median, fitting, by_view, by_best, precise)
+
+
+def _shares(group: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Return the share of each group that is true."""
+    return np.bincount(group, true) / np.bincount(group)
 
 
 def _rays(matches: Matches, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:

@@ -88,11 +88,16 @@ def _judge_poses(
 ) -> tuple[str, str, tuple[str, ...]]:
     """Return verdict, sentence and corrections for poses and lenses."""
     count = len(evidence.matches.views)
-    bad = [name for name, share in zip(names, found.by_best, strict=True) if share < _BAD]
+    wrong = (found.by_best < _BAD) & ~found.precise
+    bad = [name for name, is_wrong in zip(names, wrong, strict=True) if is_wrong]
     fits = f"{len(names)} photographs, poses fit: {found.median:.1f} px"
     most = found.share >= 1 - _MOST_WRONG
     if most and not bad and found.median <= _BLURRED:
         return FITS, fits, ()
+    known = np.isfinite(found.by_best)
+    if not most and known.any() and found.precise[known].all():
+        others = "in some matches of each; the others are far off, as where a pattern repeats"
+        return FITS, f"{len(names)} photographs, poses fit: {found.fitting:.1f} px {others}", ()
     said = (
         f"{round(found.share * count):,} of {count:,} features that match between photographs fit "
         f"their poses (median error {found.median:.0f} px of {SIDE})"

@@ -285,3 +285,22 @@ def test_drawn_corner_shows_what_it_says():
     cameras = Cameras(poses(), np.tile(LENS, (12, 1)), np.tile([WIDTH, HEIGHT], (12, 1)))
     found = project(points[100, 40][None], cameras, 3)
     np.testing.assert_allclose(found[0], [40.5, 100.5], atol=1e-6)
+
+
+def test_a_repeated_pattern_is_no_misfit(corner, evidence):
+    """Most matches of each pair are a period off; the rest tell right poses from wrong ones."""
+    points, found = list_photographs(corner).points, evidence.matches
+    wrong = np.arange(len(found.views)) % 5 > 1  # three of five
+    pixels = found.pixels.copy()
+    pixels[wrong, 1] += (60, 45)
+    repeated = evidence._replace(matches=found._replace(pixels=pixels))
+    checked = judge(repeated, points, opengl=True)
+    assert checked.verdict == "fits"
+    assert "poses fit: 0." in checked.sentence and "as where a pattern repeats" in checked.sentence
+    cameras, rng = evidence.cameras, np.random.default_rng(0)
+    for pixel in (3, 30):  # turned at random by so many pixels
+        turned = cameras.camtoworld.copy()
+        for pose in turned:
+            pose[:, :3] @= cv2.Rodrigues(rng.normal(scale=pixel / LENS[0], size=3))[0]
+        other = repeated._replace(cameras=cameras._replace(camtoworld=turned))
+        assert judge(other, points, opengl=True).verdict == "misfit"
