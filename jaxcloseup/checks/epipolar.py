@@ -34,6 +34,12 @@ class Fit(NamedTuple):
     # nearly so: poses put the others far off, as a repeated pattern does, and no wrong pose
     precise: np.ndarray
 
+    @property
+    def all_precise(self) -> bool:
+        """Return whether this is so of all photographs of which anything is known."""
+        known = np.isfinite(self.by_best)
+        return bool(known.any() and self.precise[known].all())
+
 
 def epipolar_errors(matches: Matches, cameras: Cameras) -> np.ndarray:
     """Compute how far, in pixels, matches are from the projections that poses allow.

@@ -94,8 +94,7 @@ def _judge_poses(
     most = found.share >= 1 - _MOST_WRONG
     if most and not bad and found.median <= _BLURRED:
         return FITS, fits, ()
-    known = np.isfinite(found.by_best)
-    if not most and known.any() and found.precise[known].all():
+    if not most and found.all_precise:
         others = "in some matches of each; the others are far off, as where a pattern repeats"
         return FITS, f"{len(names)} photographs, poses fit: {found.fitting:.1f} px {others}", ()
     said = (

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxcloseup.captures.corrections import correct_poses
-from jaxcloseup.checks.epipolar import Cameras, epipolar_errors, fit
+from jaxcloseup.checks.epipolar import Cameras, Fit, epipolar_errors, fit
 from jaxcloseup.checks.matches import Matches
 
 
@@ -25,7 +25,7 @@ class Mistake(NamedTuple):
 
     corrections: tuple[str, ...]  # as `captures.corrections` takes them
     sentence: str  # what is wrong, for example "the poses are world-to-camera"
-    share: float  # share of matches that fit after the correction
+    fit: Fit  # how well matches fit after the correction
 
 
 _POSES = {
@@ -49,13 +49,16 @@ def find_mistake(matches: Matches, cameras: Cameras, *, opengl: bool) -> Mistake
     matches = matches.take(slice(None, None, math.ceil(len(matches.views) / _TRIED)))
     before = fit(matches, cameras).share
     tried = [
-        Mistake(corrections, sentence, fit(changed, corrected).share)
+        Mistake(corrections, sentence, fit(changed, corrected))
         for corrections, sentence, changed, corrected in _candidates(matches, cameras, opengl)
     ]
-    best, *others = sorted(tried, key=lambda mistake: -mistake.share)
-    second = max((other.share for other in others), default=0.0)
-    clear = best.share - max(before, second) >= _GAIN
-    return best if best.share >= _FITS and clear else None
+    best, *others = sorted(tried, key=lambda mistake: -mistake.fit.share)
+    second = max((other.fit.share for other in others), default=0.0)
+    clear = best.fit.share - max(before, second) >= _GAIN
+    if best.fit.share >= _FITS and clear:
+        return best
+    precise = [mistake for mistake in tried if mistake.fit.all_precise]
+    return precise[0] if len(precise) == 1 else None
 
 
 def _candidates(

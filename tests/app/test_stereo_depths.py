@@ -26,7 +26,7 @@ def stereo():
     none = np.zeros((0, 3), np.float32)
     names = {"train": [str(view) for view in range(len(views))]}
     scene = Scene("corner", views, None, None, none, none, 2.5, 6.0, names)
-    return match_photographs(scene, photograph_pyramid(views), StereoTraining(matching=MATCHING))
+    return match_photographs(scene, photograph_pyramid(views), StereoTraining(), MATCHING)
 
 
 def test_training_begins_with_points_on_the_walls(stereo):

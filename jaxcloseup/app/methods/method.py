@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 from jaxcloseup.labels.config import LabelConfig
 from jaxcloseup.setting import setting
-from jaxcloseup.stereo.config import StereoConfig
 from jaxcloseup.training.config import TrainConfig
 
 
@@ -72,7 +71,6 @@ class StereoTraining:
         low=256,
     )
     points: int = setting(10_000, "initial points at matched pixels", low=0)
-    matching: StereoConfig = setting(StereoConfig(), "how they are matched")
 
 
 @dataclasses.dataclass(frozen=True)

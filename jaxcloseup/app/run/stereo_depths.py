@@ -15,9 +15,10 @@ from jaxcloseup.photos.depth_maps import GatherSources, join_maps
 from jaxcloseup.photos.pyramids import Pyramid
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.views import Views, camera_at, to_float
-from jaxcloseup.stereo import StereoMaps, choose_neighbors, estimate_depths
+from jaxcloseup.stereo import StereoConfig, StereoMaps, choose_neighbors, estimate_depths
 
 
+_MATCHING = StereoConfig()
 _estimate = functools.partial(jax.jit, static_argnames="config")(estimate_depths)
 
 
@@ -40,19 +41,16 @@ class StereoDepths(NamedTuple):
         return join_maps(self.views.cameras, inverse, confidence)
 
 
-def match_photographs(scene: Scene, pyramid: Pyramid, config: StereoTraining) -> StereoDepths:
+def match_photographs(
+    scene: Scene, pyramid: Pyramid, config: StereoTraining, matching: StereoConfig = _MATCHING
+) -> StereoDepths:
     """Estimate depth of all training photographs, at the size that `config` affords."""
     views = _reduced(scene, pyramid, config.pixels)
     size = views.cameras
-    chosen = choose_neighbors(size, scene.near, scene.far, config.matching, scene.points)
+    chosen = choose_neighbors(size, scene.near, scene.far, matching, scene.points)
     with progress.saying(f"matching photographs of {size.width} x {size.height}"):
         maps = _estimate(
-            jax.random.key(0),
-            views,
-            jnp.asarray(chosen),
-            scene.near,
-            scene.far,
-            config=config.matching,
+            jax.random.key(0), views, jnp.asarray(chosen), scene.near, scene.far, config=matching
         )
         return StereoDepths(views, jax.block_until_ready(maps))
 
