@@ -39,7 +39,8 @@ def test_rendered_normals_are_used_and_empty_pixels_do_not_count():
     surface = Surface(jnp.zeros((24, 48, 3)), jnp.where(hit, depth, 0), normal)
     zeros = jnp.zeros((24, 48))
     rendered = jnp.where(hit[..., None], 0.3 * normal, -normal)  # composited, not normalized
-    aux = SurfelFieldAux(SurfelAux(rendered, depth, zeros, jnp.int32(0)), zeros, jnp.float32(0))
+    inner = SurfelAux(rendered, depth, zeros, jnp.int32(0))
+    aux = SurfelFieldAux(inner, zeros, jnp.float32(0), depth, None)
     found = surface_error(CAMERA, Rendering(normal, jnp.where(hit, depth, 9), zeros, aux), surface)
     assert float(found["normal_error_p90"]) == pytest.approx(0, abs=0.05)
     assert float(found["depth_error_p90"]) == 0
