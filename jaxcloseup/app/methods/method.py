@@ -67,8 +67,8 @@ class StereoTraining:
     pixels: int = setting(
         2**21,
         "about how many pixels of all photographs together are matched: few photographs are "
-        "matched at a larger size than many",
-        low=256,
+        "matched at a larger size than many; 0 matches none",
+        low=0,
     )
     points: int = setting(10_000, "initial points at matched pixels", low=0)
 

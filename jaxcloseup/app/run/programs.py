@@ -25,7 +25,7 @@ from jaxcloseup.app.run.devices import (
 )
 from jaxcloseup.app.run.photograph_sizes import describe_photographs, finest_read
 from jaxcloseup.app.run.step_data import ArmsData, StepData
-from jaxcloseup.app.run.stereo_depths import StereoDepths, match_photographs
+from jaxcloseup.app.run.stereo_depths import StereoDepths, can_match, match_photographs
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.io.memory import give_back_memory
@@ -33,7 +33,6 @@ from jaxcloseup.photos.pyramids import Pyramid, photograph_pyramid, scene_pyrami
 from jaxcloseup.photos.scene import Scene, SceneError
 from jaxcloseup.photos.views import Views, unpadded
 from jaxcloseup.photos.windows import Windows, in_quarters, photograph_windows
-from jaxcloseup.stereo.config import StereoConfig
 from jaxcloseup.training.arms import arm_specs, run_arms
 from jaxcloseup.training.parallel import in_a_loop, in_threads, over_devices
 from jaxcloseup.training.state import Metrics, TrainState
@@ -123,7 +122,7 @@ class Programs:
     def stereo(self) -> StereoDepths | None:
         """Return depth of the photographs by stereo; None without, or with too few to confirm."""
         config = self.preset.stereo
-        if config is None or len(self.scene.train) <= StereoConfig().confirmations:
+        if config is None or not config.pixels or not can_match(self.scene):
             return None
         finest = finest_read(self.preset, self.scene)
         return match_photographs(self.scene, self.pyramid(finest)[0], config)

@@ -11,6 +11,7 @@ from jaxcloseup.app import progress
 from jaxcloseup.app.methods.method import StereoTraining
 from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_points
 from jaxcloseup.geometry.numerics import safe_divide
+from jaxcloseup.native import library
 from jaxcloseup.photos.depth_maps import GatherSources, join_maps
 from jaxcloseup.photos.pyramids import Pyramid
 from jaxcloseup.photos.scene import Scene
@@ -39,6 +40,16 @@ class StereoDepths(NamedTuple):
         depth, confidence = self.maps.depth, self.maps.confidence
         inverse = safe_divide(jnp.ones_like(depth), jnp.where(confidence > 0, depth, 0))
         return join_maps(self.views.cameras, inverse, confidence)
+
+
+def can_match(scene: Scene) -> bool:
+    """Return whether depth can be confirmed, in minutes; where a library is missing, say so."""
+    if len(scene.train) <= _MATCHING.confirmations:
+        return False
+    if jax.default_backend() == "cpu" and not library.available():
+        print(f"{library.missing()}, so photographs are not matched for depth")
+        return False
+    return True
 
 
 def match_photographs(
