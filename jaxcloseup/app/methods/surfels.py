@@ -93,7 +93,7 @@ REDUCED = Preset(
 # A surfel above `max_scale` may hide from photographs, and cost a close-up 10 dB.
 _COARSE = dataclasses.replace(
     REDUCED.field,
-    means_lr_steps=1000,
+    means_lr_steps=1500,
     depth_weight=1.0,
     raster=dataclasses.replace(REDUCED.field.raster, antialias=True),
 )
@@ -118,7 +118,7 @@ QUICK = dataclasses.replace(
         density=McmcConfig(start=0, stop=700, growth=1.0, noise=0.0),
         raster=RasterizeConfig(capacity=2**17, antialias=True),
     ),
-    coarse=CoarseConfig(field=_COARSE, steps=1000),
+    coarse=CoarseConfig(field=_COARSE, steps=1500),
     windows=WindowConfig(whole_share=0.03),
     stereo=StereoTraining(),
     targets=TargetConfig("residual", label_loss_weight=0.7, lr_scale=10.0, control_lr_scale=2.0),
@@ -141,7 +141,7 @@ STANDARD = dataclasses.replace(
             capacity=20_000,
             raster=dataclasses.replace(_COARSE.raster, capacity=2**17, block=128),
         ),
-        steps=1000,
+        steps=1500,
     ),
     step_pixels=4 * QUICK.step_pixels,
 )
