@@ -13,6 +13,7 @@ ARGUMENTS = (
     *("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--window-size=900,500"),
     *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-first-run"),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+    "--test-type",  # no bars above the page, which come and go and change its height
 )
 BUTTON = "//button[normalize-space()='{}']"
 
@@ -37,6 +38,7 @@ def open_browser():
     options.binary_location = chromium
     for argument in ARGUMENTS:
         options.add_argument(argument)
+    options.add_experimental_option("excludeSwitches", ["enable-automation"])
     with mock.patch.dict(os.environ, {"no_proxy": "localhost"}):  # the driver listens there
         driver = webdriver.Chrome(options, webdriver.ChromeService(chromedriver))
     try:

