@@ -114,4 +114,5 @@ def read_depths(sources: GatherSources, view: jax.Array | int, camera: Camera) -
     mean = jnp.sum(share * inverse, axis=0)
     smooth = jnp.ptp(inverse, axis=0) < _SMOOTH * mean
     known = (trust > 0) & smooth
-    return Measured(jnp.where(known, 1 / jnp.where(known, mean, 1), 0), jnp.where(known, trust, 0))
+    depth = safe_divide(jnp.ones_like(mean), jnp.where(known, mean, 0))
+    return Measured(depth, jnp.where(known, trust, 0))

@@ -81,7 +81,7 @@ def test_a_window_has_the_depth_of_its_photograph_at_any_size():
     exact = -np.asarray(origins)[..., 2] / np.asarray(directions)[..., 2]
     unknown = np.asarray(batch.measured.trust) == 0
     np.testing.assert_allclose(batch.measured.depth[~unknown], exact[~unknown], rtol=1e-5)
-    # Of the window's pixels, those between it and its neighbors, in columns 19.5 to 21.5.
+    # The window's pixels around it, up to the centers of its neighbors, have no depth either.
     rows, columns = np.nonzero(unknown)
     assert (rows.min() + 13, rows.max() + 13) == (19, 22)
     assert (columns.min() + 25, columns.max() + 25) == (39, 42)

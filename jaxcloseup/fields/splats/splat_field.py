@@ -262,10 +262,15 @@ def _schedule(
     """Return the buffers `degree`, `regularize` and `hold` after so many steps."""
     degree = jnp.minimum(step // config.sh_every, config.sh_degree).astype(jnp.int32)
     regularize = (step >= config.regularize_from).astype(jnp.float32)
+    return degree, regularize, depth_hold(config, step)
+
+
+def depth_hold(config: SplatConfig, step: jax.Array) -> jax.Array | None:
+    """Return the weight `[]` of the loss on measured depth after so many steps, or None."""
     if not config.depth_weight:
-        return degree, regularize, None
+        return None
     left = jnp.maximum(1 - step.astype(jnp.float32) / config.means_lr_steps, config.depth_kept)
-    return degree, regularize, config.depth_weight * left
+    return config.depth_weight * left
 
 
 def _bound_scales(

@@ -89,7 +89,7 @@ def test_measured_depth_pulls_what_is_drawn_to_it(trained, capture):
     fades = np.asarray(gradient.opacity_logits)
     assert np.sum(fades[up & (fades != 0)] > 0) > 0.7 * np.sum(up & (fades != 0))
     assert np.all(np.isfinite(jax.flatten_util.ravel_pytree(gradient)[0]))
-    # It is gone at the end but for the share that is kept.
+    # At the end only the share that is kept remains.
     last = field.adapt(jax.random.key(0), state.replace(step=jnp.int32(10 * STEPS))).buffers
     np.testing.assert_allclose(last.hold, 2.0 * 0.25)
 

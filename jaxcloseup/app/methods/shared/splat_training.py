@@ -22,7 +22,12 @@ from jaxcloseup.fields.splats.control import replace_surfels
 from jaxcloseup.fields.splats.filters import sampling_intervals, smoothed
 from jaxcloseup.fields.splats.raster_plan import plan_raster
 from jaxcloseup.fields.splats.refinement import join_surfels, replace_least, surfels_where_wrong
-from jaxcloseup.fields.splats.splat_field import SurfelBuffers, camera_extent, surfel_field
+from jaxcloseup.fields.splats.splat_field import (
+    SurfelBuffers,
+    camera_extent,
+    depth_hold,
+    surfel_field,
+)
 from jaxcloseup.fields.splats.splat_optimizer import surfel_optimizer
 from jaxcloseup.fields.splats.surfels import Surfels, pad_rows
 from jaxcloseup.geometry.cameras import Camera
@@ -164,7 +169,7 @@ def refine(
     old = smoothed(surfels, buffers.interval), buffers.alive
     surfels, alive = _join(old, new, capacity=config.capacity)
     interval = _intervals(config, surfels, scene)
-    hold = jnp.float32(config.depth_weight) if config.depth_weight else None
+    hold = depth_hold(config, jnp.int32(0))
     return surfels, buffers.replace(alive=alive, interval=interval, hold=hold)
 
 
