@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxcloseup.app import progress
 from jaxcloseup.app.methods.method import StereoTraining
+from jaxcloseup.captures.photo_files import pad_images
 from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_points
 from jaxcloseup.geometry.numerics import safe_divide
 from jaxcloseup.native import library
@@ -72,10 +73,8 @@ def _reduced(scene: Scene, pyramid: Pyramid, pixels: int) -> Views:
     each = max(cameras.height * cameras.width, pixels / len(pyramid))
     level = pyramid.level_near((each * cameras.width / cameras.height) ** 0.5)
     height, width = pyramid.sizes[level]
-    values = np.zeros((len(pyramid), height, width, 4), np.uint8)
-    for view, padded in enumerate(values):
-        image = np.asarray(pyramid.image(view, level))
-        padded[: image.shape[0], : image.shape[1]] = image
+    images = [np.asarray(pyramid.image(view, level)) for view in range(len(pyramid))]
+    values = pad_images(images, height, width)
     weight = to_float(jnp.asarray(values[..., 3]))
     return Views(pyramid.cameras(cameras, level), jnp.asarray(values[..., :3]), weight)
 
