@@ -5,6 +5,7 @@ gray differs from the center's likely lie on another surface. `native/stereo_row
 arithmetic for CPUs.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -61,7 +62,8 @@ def match_planes(
       neighbors: `[N]` int32, indices of the photographs to compare with; -1 is none.
       planes: `[K, 3, H, W]` planes, see `planes`.
       config: size of patches, scales, and how many of the neighbors count.
-      native: whether to call the native library, on a CPU; None: if it is there.
+      native: whether to call the native library; None: where it is there and a program is
+        compiled for CPUs.
 
     Returns:
       `[K, H, W]` costs in [0, 1]: the mean of 1 - NCC, no more than 1, over the `config.best`
@@ -71,8 +73,22 @@ def match_planes(
     others = camera_at(photographs.cameras, jnp.maximum(neighbors, 0))
     matrix, offset = relative_transforms(camera, others)
     transforms = jnp.concatenate([matrix, offset[..., None]], axis=-1)
-    if library.available() if native is None else native:
-        return _match_natively(photographs, reference, neighbors, transforms, planes, config)
+    arrays = photographs, reference, neighbors, transforms, planes
+    natively = functools.partial(_match_natively, config=config)
+    in_jax = functools.partial(_match_in_jax, config=config)
+    if native is None and library.available():
+        return jax.lax.platform_dependent(*arrays, cpu=natively, default=in_jax)
+    return natively(*arrays) if native else in_jax(*arrays)
+
+
+def _match_in_jax(
+    photographs: Photographs,
+    reference: jax.Array,
+    neighbors: jax.Array,
+    transforms: jax.Array,
+    planes: jax.Array,
+    config: StereoConfig,
+) -> jax.Array:
     patches = _read_patches(photographs, reference, config)
     best = min(config.best, neighbors.shape[0])
 

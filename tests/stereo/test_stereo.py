@@ -1,5 +1,6 @@
 """Multi-view stereo against NumPy in float64, and on walls drawn by ray casting."""
 
+import functools
 import dataclasses
 
 import jax
@@ -136,6 +137,16 @@ def test_costs_are_those_of_a_slow_loop(neighbors, native):
             slow = slow_cost(views, gray, pixel, plane, neighbors, CONFIG)
             assert costs[pixel] == pytest.approx(slow, abs=2e-3)
     assert np.asarray(found[2]).min() == 1 and np.median(found[0]) < np.median(found[1])
+
+
+@needs_library
+@pytest.mark.parametrize("platform", ["cpu", "cuda"])
+def test_only_programs_for_cpus_call_the_library(platform):
+    views, _ = corner_views(4)
+    match = jax.jit(functools.partial(estimate_depths, config=CONFIG))
+    traced = match.trace(jax.random.key(0), views, jnp.array([[1, 2, 3]] * 4), 1.0, 9.0)
+    program = traced.lower(lowering_platforms=(platform,)).as_text()
+    assert ("jaxcloseup_stereo" in program) == (platform == "cpu")
 
 
 def test_consistency_is_that_of_a_slow_loop():
