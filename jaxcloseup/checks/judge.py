@@ -19,6 +19,7 @@ _FEWEST = 60  # matches, below which nothing is said of poses
 _MOST_WRONG = 0.5  # share of matches that do not fit, from which the capture is refused
 _BLURRED = 0.8  # pixels of median error from which close-ups are blurred
 _SHOWN = 0.3  # share of points with texture in two photographs, below which a turn may show more
+_OUT_OF_VIEW = 0.05  # share of points in two views, below which they are of no use
 _FEW_VIEWS = 3  # of photographs that depth needs; most that see a point may be hidden from it
 _BAD = 0.3  # share of a photograph's fitting matches below which its pose is wrong
 
@@ -151,6 +152,11 @@ def _judge_points(
             f"; {len(points):,} points lie in another world than the cameras, turned to ({axes})",
             (f"points={axes}",),
         )
+    if found.shown < _OUT_OF_VIEW:
+        return (
+            f"; {len(points):,} points lie where no two photographs look (but for "
+            f"{100 * found.shown:.0f} %)"
+        ), ("points=none",)
     if not found.known:
         return f"; {len(points):,} points are not checked: photographs show too few of them", ()
     if found.fits:

@@ -30,6 +30,7 @@ class PointsFit(NamedTuple):
     moved: float  # the same after moving the points off their place
     textured: int  # number of points that were compared
     tried: int  # number of points, of which those count that two photographs show with texture
+    shown: float  # share of points that two photographs have in view
 
     @property
     def known(self) -> bool:
@@ -57,11 +58,12 @@ def fit_points(points: np.ndarray, gray: Sequence[np.ndarray], cameras: Cameras)
     """
     some = points[:: max(1, len(points) // _TRIED)][:_TRIED].astype(np.float64)
     if not len(some):
-        return PointsFit(0.0, 0.0, 0, 0)
+        return PointsFit(0.0, 0.0, 0, 0, 0.0)
     share, textured = _alike(some, gray, cameras)
+    shown = float((_in_view(some, cameras, margin=0.0)[0].sum(1) >= 2).mean())
     middle = np.median(cameras.camtoworld[:, :, 3], 0)
     moved = [_alike(middle + (1 + by) * (some - middle), gray, cameras) for by in (-_MOVED, _MOVED)]
-    return PointsFit(share, float(np.mean([m for m, _ in moved])), textured, len(some))
+    return PointsFit(share, float(np.mean([m for m, _ in moved])), textured, len(some), shown)
 
 
 def find_points_mistake(

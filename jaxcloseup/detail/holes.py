@@ -18,11 +18,12 @@ from jaxcloseup.photos.depth_maps import GatherSources
 
 
 OPAQUE = 0.9  # opacity from which a render counts as opaque
-_PHOTOGRAPHS = 3  # photographs that must see through a place that counts as empty; fewer may err
+_PHOTOGRAPHS = 2  # photographs that must see through a place that counts as empty; one may err
 _DEPTHS = 16  # places that are tried on a ray,
 _REACH = 3.0  # from 2**-3 to 2**3 times the typical depth of the photographs
 _RAYS = 120  # rays that are tried across an image
 _BAND = 4  # rows of these that are skipped together
+_FAINT = 0.02  # opacity below which a color is not known
 _ACROSS = 20  # width in pixels of the small image whose enlargement blurs the rims of holes
 
 
@@ -98,7 +99,8 @@ def fill_holes(rgb: jax.Array, alpha: jax.Array, seen: jax.Array, empty: jax.Arr
     A hole is where no photograph saw a surface, nor emptiness. Its rendered opacity stays, and the
     rest is filled; so are its rims, where opacity fades. Colors are averaged into coarser images
     by their weight and flow back to finer pixels of low weight (Gortler et al. 1996, section
-    3.4.2).
+    3.4.2). The fog that a model has in a hole is a weak hint of its color, so it weighs as the
+    root of its opacity.
 
     Args:
       rgb: `[H, W, 3]` colors over black.
@@ -111,9 +113,10 @@ def fill_holes(rgb: jax.Array, alpha: jax.Array, seen: jax.Array, empty: jax.Arr
     near = jax.image.resize(hole.astype(rgb.dtype), few, "linear")
     near = jnp.clip(2 * jax.image.resize(near, hole.shape, "linear"), 0, 1)
     missing = near * (1 - jnp.clip(alpha / OPAQUE, 0, 1))
-    opacity = jnp.where(seen, jnp.maximum(alpha, 0.05), 1)
+    opacity = jnp.where(empty, 1, jnp.maximum(alpha, _FAINT))
     colors = jnp.clip(rgb / opacity[..., None], 0, 1)
-    weight = jnp.where(hole, 0, jnp.where(seen, jnp.clip(alpha, 0, 1), 1))
+    alpha = jnp.clip(alpha, 0, 1)
+    weight = jnp.where(hole, jnp.sqrt(alpha), jnp.where(seen, alpha, 1))
     planes = jnp.concatenate([jnp.moveaxis(colors, -1, 0), weight[None]])
     around = jnp.moveaxis(_spread(planes), 0, -1)
     return jnp.clip(rgb + missing[..., None] * around, 0, 1)
