@@ -21,7 +21,7 @@ from jaxcloseup.captures.photo_checks import (
     warn_copies,
     without_transparent,
 )
-from jaxcloseup.captures.photo_files import pad_images, read_image
+from jaxcloseup.captures.photo_files import read_image
 from jaxcloseup.captures.photo_masks import understood_masks
 from jaxcloseup.captures.photo_reading import read_photos
 from jaxcloseup.captures.scale import LENGTH
@@ -30,7 +30,7 @@ from jaxcloseup.captures.world_frames import Frame
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.io.messages import printable
 from jaxcloseup.photos.scene import NearFarWarning, Scene, SceneError
-from jaxcloseup.photos.views import Photograph, Views
+from jaxcloseup.photos.views import Photograph, Views, pad_images
 
 
 _UP = (0.0, 0.0, 1.0)

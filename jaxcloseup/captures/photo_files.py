@@ -5,7 +5,6 @@ import math
 import pathlib
 import threading
 import warnings
-from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -87,14 +86,6 @@ def downscale_image(image: np.ndarray, factor: int) -> np.ndarray:
         return image
     height, width = (max(1, side // factor) for side in image.shape[:2])
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-
-
-def pad_images(images: Sequence[np.ndarray], height: int, width: int) -> np.ndarray:
-    """Stack `[h, w, ...]` images into the top left of zeros `[V, height, width, ...]`."""
-    stack = np.zeros((len(images), height, width, *images[0].shape[2:]), images[0].dtype)
-    for target, image in zip(stack, images, strict=True):
-        target[: image.shape[0], : image.shape[1]] = image
-    return stack
 
 
 def size_of_image(path: pathlib.Path) -> tuple[int, int] | None:

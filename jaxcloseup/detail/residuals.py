@@ -18,7 +18,7 @@ from jaxcloseup.labels.rules import label_depth
 from jaxcloseup.metrics.image_metrics import change_colors, fit_colors
 from jaxcloseup.photos.depth_maps import GatherSources, gather_sources
 from jaxcloseup.photos.pyramids import Pyramid
-from jaxcloseup.photos.views import Views, camera_at, to_float
+from jaxcloseup.photos.views import Views, camera_at, pad_images, to_float
 
 
 # How many times finer than the photographs that the model learned from their depth maps are, if
@@ -131,15 +131,7 @@ def render_residuals(
         depths.append(depth)
     shown = Pyramid(jax.device_put(values), pyramid.intrinsics[rows], jnp.asarray(extents))
     own = pyramid.cameras(jax.tree.map(lambda leaf: leaf[rows], cameras), depth_level)
-    return Residuals(shown, own, _stack(depths, pyramid.sizes[depth_level]))
-
-
-def _stack(images: Sequence[Any], size: tuple[int, int]) -> jax.Array:
-    """Stack images of at most height and width `size`; padding is 0."""
-    stack = np.zeros((len(images), *size), np.float32)
-    for padded, image in zip(stack, images, strict=True):
-        padded[: image.shape[0], : image.shape[1]] = image
-    return jnp.asarray(stack)
+    return Residuals(shown, own, jnp.asarray(pad_images(depths, *pyramid.sizes[depth_level])))
 
 
 def reproduced(shown: Pyramid, *, blur: Callable[[Any, float], Any] = blur_images) -> jax.Array:
@@ -158,7 +150,7 @@ def reproduced(shown: Pyramid, *, blur: Callable[[Any, float], Any] = blur_image
         errors.append(np.asarray(blur(np.abs(residual).mean(-1)[None], _BLUR))[0])
     typical = max(float(np.median(np.concatenate([error.ravel() for error in errors]))), 1e-6)
     trust = [1 / (1 + (error / (MISFIT * typical)) ** 4) ** 2 for error in errors]
-    return _stack(trust, shown.sizes[last])
+    return jnp.asarray(pad_images(trust, *shown.sizes[last]))
 
 
 @jax.jit

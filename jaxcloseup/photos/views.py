@@ -56,6 +56,14 @@ def unpadded(views: Views, sizes: Sequence[tuple[int, int]] | None = None) -> li
     return found
 
 
+def pad_images(images: Sequence[Any], height: int, width: int) -> np.ndarray:
+    """Stack `[h, w, ...]` images into the top left of zeros `[V, height, width, ...]`."""
+    stack = np.zeros((len(images), height, width, *images[0].shape[2:]), images[0].dtype)
+    for target, image in zip(stack, images, strict=True):
+        target[: image.shape[0], : image.shape[1]] = image
+    return stack
+
+
 class Measured(NamedTuple):
     """Depth that is known of the pixels of an image, apart from any field.
 

@@ -234,7 +234,7 @@ def test_exchanged_photographs_are_named(evidence):
     [
         (lambda points: points[:, [1, 2, 0]] * [1, -1, -1], None),
         (lambda points: np.random.default_rng(0).uniform(0, 3, points.shape), ("points=none",)),
-        (lambda points: points + [0, 0, 50], ("points=none",)),  # where nobody looks
+        (lambda points: points + np.array([0, 0, 50]), ("points=none",)),  # where nobody looks
     ],
 )
 def test_points_in_another_world_are_found(copy, corner, judged, change, instead):

@@ -1,7 +1,7 @@
 """Multi-view stereo against NumPy in float64, and on walls drawn by ray casting."""
 
-import functools
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp

@@ -47,7 +47,7 @@ def plan_run(preset: Preset, scene: Scene, to_run: Sequence[str]) -> dict[str, f
     """Return typical seconds of the parts of a run by name, in order."""
     method = METHODS[preset.method]
     steps = {"baseline": preset.baseline_steps}
-    parts = ["stereo"] if preset.stereo is not None else []
+    parts = ["stereo"] if preset.stereo is not None and preset.stereo.pixels else []
     parts += ["coarse_baseline", "refine_baseline"] if preset.coarse is not None else []
     if preset.coarse is not None:
         steps["coarse_baseline"] = preset.coarse.steps

@@ -9,14 +9,13 @@ import numpy as np
 
 from jaxcloseup.app import progress
 from jaxcloseup.app.methods.method import StereoTraining
-from jaxcloseup.captures.photo_files import pad_images
 from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_points
 from jaxcloseup.geometry.numerics import safe_divide
 from jaxcloseup.native import library
 from jaxcloseup.photos.depth_maps import GatherSources, join_maps
 from jaxcloseup.photos.pyramids import Pyramid
 from jaxcloseup.photos.scene import Scene
-from jaxcloseup.photos.views import Views, camera_at, to_float
+from jaxcloseup.photos.views import Views, camera_at, pad_images, to_float
 from jaxcloseup.stereo import StereoConfig, StereoMaps, choose_neighbors, estimate_depths
 
 
