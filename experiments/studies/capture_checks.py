@@ -207,7 +207,7 @@ def _vary(folder: pathlib.Path, kind: str, rng: np.random.Generator) -> Checked:
         shutil.copytree(folder, copy)
         listed = list_photographs(copy)
         frames = listed.frames[rng.integers(2) :: -(-len(listed.frames) // _MOST)]
-        for file in {frame.file for frame in frames}:
+        for file in sorted({frame.file for frame in frames}):
             _HARMLESS[kind](file, rng)
         listed = list_photographs(copy)
         kept = {frame.file for frame in frames}

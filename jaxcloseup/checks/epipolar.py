@@ -28,7 +28,8 @@ class Fit(NamedTuple):
     fitting: float  # the same of matches that fit; NaN if none does
     by_view: np.ndarray  # `[V]` share of each photograph's matches that fit; NaN without matches
     # `[V]` the same of the best of the photographs that it matches; NaN if there are less than two,
-    # or half as many matches as usual, because a repeated pattern may match a photograph wrongly
+    # half as many matches as usual, or three quarters as many in the pair that has most, because a
+    # repeated pattern may match a photograph wrongly
     by_best: np.ndarray
     # `[V]` whether some pair of the photograph has many precise matches and hardly any that are
     # nearly so: poses put the others far off, as a repeated pattern does, and no wrong pose
@@ -84,11 +85,19 @@ def fit(matches: Matches, cameras: Cameras) -> Fit:
     nearly = _shares(place, (errors > FITTING) & (errors <= _NEARLY))
     precise = np.zeros(count, bool)
     precise[pairs[(narrow >= _MANY) & (nearly <= narrow / 4)]] = True
-    few = total < np.median(total[total > 0]) / 2 if total.any() else total == 0
+    largest = np.zeros(count)
+    for side in range(2):
+        np.maximum.at(largest, pairs[:, side], np.bincount(place))
+    few = (total < _usual(total) / 2) | (largest < 0.75 * _usual(largest))
     by_best[few | (np.bincount(pairs.ravel(), minlength=count) < 2)] = np.nan
     fitting = float(np.median(errors[inside])) if inside.any() else np.nan
     median = float(np.median(errors))
     return Fit(float(inside.mean()), median, fitting, by_view, by_best, precise)
+
+
+def _usual(counts: np.ndarray) -> float:
+    """Return the median of the counts of photographs that have matches."""
+    return float(np.median(counts[counts > 0])) if counts.any() else 1.0
 
 
 def _shares(group: np.ndarray, true: np.ndarray) -> np.ndarray:

@@ -116,8 +116,8 @@ def _judge_poses(
         )
         return LOOSE, off, ()
     if most:
-        first = ", ".join(bad[:3])
-        return LOOSE, f"{fits}, but not those of {len(bad)} photographs, such as {first}", ()
+        some = f"{len(bad)} photographs, such as " if len(bad) > 3 else ""
+        return LOOSE, f"{fits}, but not those of {some}{', '.join(bad[:3])}", ()
     return MISFIT, f"{said}, and no known mistake explains it", ()
 
 
