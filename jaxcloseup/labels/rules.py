@@ -46,7 +46,8 @@ def add_label_loss(
     """Return (1 - w) L_c + w L_pl, each a mean over its own pixels; w = 1/2 in the paper.
 
     Args:
-      loss_of: `(batch, key) -> (loss, metrics)`.
+      loss_of: `(batch, key) -> (loss, metrics)`; the loss may be a tree, such as of a loss and its
+        gradients.
       photographs: pixels of photographs, and a key.
       labels: labeled pixels, and a key.
       weight: `[]` w.
@@ -57,7 +58,12 @@ def add_label_loss(
     photograph_loss, metrics = loss_of(*photographs)
     label_loss, label_metrics = loss_of(*labels)
     named = {f"label_{name}": value for name, value in label_metrics.items()}
-    return (1 - weight) * photograph_loss + weight * label_loss, metrics | named
+    return _mix(weight, photograph_loss, label_loss), metrics | named
+
+
+@jax.jit
+def _mix(weight: jax.Array, photograph_loss: Any, label_loss: Any) -> Any:
+    return jax.tree.map(lambda a, b: (1 - weight) * a + weight * b, photograph_loss, label_loss)
 
 
 def pool_label_loss(

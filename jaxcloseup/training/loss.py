@@ -1,6 +1,7 @@
 """The loss of a rendering, with its gradient taken in the same program, at once or in chunks."""
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -88,6 +89,24 @@ def rendered_gradient(
     if chunk is None or _is_one_chunk(chunk, batch):
         return _at_once_forward(field, params, buffers, batch, key)
     return _chunked_forward(field, chunk, sequential, params, buffers, batch, key)
+
+
+def bind_gradient(field: RadianceField, *, sequential: bool) -> Callable[..., Any]:
+    """Return `(params, buffers, batch, key) -> (loss, gradients), metrics`, for rules of labels.
+
+    Outside `jax.jit`, `jax.value_and_grad` of a sum of losses would trace them in every step.
+    """
+
+    def gradient_of(params: Any, buffers: Any, batch: Batch, key: jax.Array | None) -> Any:
+        (loss, metrics), gradients = rendered_gradient(
+            *(params, buffers, batch, key),
+            field=field,
+            chunk=field.gradient_chunk,
+            sequential=sequential,
+        )
+        return (loss, gradients), metrics
+
+    return gradient_of
 
 
 def _is_one_chunk(chunk: int, batch: Batch) -> bool:

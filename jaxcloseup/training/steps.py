@@ -20,7 +20,7 @@ from jaxcloseup.labels.rules import LABEL_RULES, add_label_loss
 from jaxcloseup.photos.views import Batch, Views
 from jaxcloseup.photos.windows import Windows
 from jaxcloseup.training.config import TrainConfig
-from jaxcloseup.training.loss import Loss, rendered_gradient, rendered_loss
+from jaxcloseup.training.loss import Loss, bind_gradient, rendered_gradient
 from jaxcloseup.training.parallel import Spread, in_a_loop
 from jaxcloseup.training.sampling import DrawKeys, sample_batch, sample_closeup, sample_labels
 from jaxcloseup.training.state import DrawLoss, Metrics, TrainState, update_state
@@ -152,7 +152,7 @@ def closeup_step(
 def _closeup_loss(field: RadianceField, config: TrainConfig, sequential: bool) -> DrawLoss:
     """Return the loss of one draw of `closeup_step`."""
     rule, whole = LABEL_RULES[config.label_rule], config.num_label_rays is None
-    loss_of = _bind_loss(field, sequential=sequential)
+    gradient_of = bind_gradient(field, sequential=sequential)
     render = _render_pixels(field, sequential=sequential and not whole)
 
     def draw(keys: DrawKeys, data: Any) -> Any:
@@ -161,27 +161,25 @@ def _closeup_loss(field: RadianceField, config: TrainConfig, sequential: bool) -
         virtual = sample_closeup(keys.label, sources, settings, config.num_label_rays)
         return batch, keys.render, virtual, sources, settings
 
-    def loss(params: Any, buffers: Any, drawn: Any) -> Loss:
+    def gradient(params: Any, buffers: Any, drawn: Any) -> tuple[Loss, Any]:
         batch, key_render, virtual, sources, settings = drawn
         camera = virtual.camera
         key_depth = rule.depth_key(virtual.key_depth)
-        fixed = jax.lax.stop_gradient(params)
-        rendering = render(fixed, buffers, camera, virtual.pixels, key_depth)
+        rendering = render(params, buffers, camera, virtual.pixels, key_depth)
         depth, pixels = _depth(rendering, depth=rule.depth), virtual.pixels
         if pixels is None:
             pixels = pixel_grid(camera.height, camera.width)
         label = label_pixels(camera, pixels, depth, virtual.source_index, sources, settings)
         labeled = Batch(camera, virtual.pixels, label.rgb, label.weight)
         add = add_label_loss if whole else rule.loss
-        value, metrics = add(
-            lambda batch, key: loss_of(params, buffers, batch, key),
+        (value, gradients), metrics = add(
+            functools.partial(gradient_of, params, buffers),
             (batch, key_render),
             (labeled, virtual.key_render),
             settings.label_loss_weight,
         )
-        return value, metrics | {"label_coverage": jnp.mean(label.weight)}
+        return (value, metrics | {"label_coverage": jnp.mean(label.weight)}), gradients
 
-    gradient = jax.value_and_grad(loss, has_aux=True)
     return DrawLoss(draw, gradient, lambda drawn: (drawn[0].cameras, drawn[2].camera))
 
 
@@ -231,23 +229,23 @@ def labeled_step(
 
 def _labeled_loss(field: RadianceField, config: TrainConfig, sequential: bool) -> DrawLoss:
     """Return the loss of one draw of `labeled_step`."""
-    loss_of = _bind_loss(field, sequential=sequential)
+    gradient_of = bind_gradient(field, sequential=sequential)
 
     def draw(keys: DrawKeys, data: Any) -> Any:
         views, labels, settings = data
         photographs = sample_batch(keys.batch, views, config.num_rays), keys.render
         return photographs, sample_labels(keys.label, labels, config.num_label_rays), settings
 
-    def loss(params: Any, buffers: Any, drawn: Any) -> Loss:
+    def gradient(params: Any, buffers: Any, drawn: Any) -> tuple[Loss, Any]:
         photographs, labeled, settings = drawn
-        return add_label_loss(
-            lambda batch, key: loss_of(params, buffers, batch, key),
+        (loss, gradients), metrics = add_label_loss(
+            functools.partial(gradient_of, params, buffers),
             photographs,
             labeled,
             settings.label_loss_weight,
         )
+        return (loss, metrics), gradients
 
-    gradient = jax.value_and_grad(loss, has_aux=True)
     return DrawLoss(draw, gradient, lambda drawn: (drawn[0][0].cameras, drawn[1][0].cameras))
 
 
@@ -278,12 +276,6 @@ def run_steps(
 
     state, total = jax.lax.fori_loop(0, count, body, (state, total))
     return state, jax.tree.map(lambda leaf: leaf / jnp.asarray(count, leaf.dtype), total)
-
-
-def _bind_loss(field: RadianceField, *, sequential: bool) -> Callable[..., Loss]:
-    return functools.partial(
-        rendered_loss, field=field, chunk=field.gradient_chunk, sequential=sequential
-    )
 
 
 def _render_pixels(field: RadianceField, *, sequential: bool) -> Callable[..., Rendering]:
