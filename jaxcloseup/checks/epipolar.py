@@ -9,7 +9,8 @@ from jaxcloseup.checks.matches import Matches
 
 FITTING = 2.0  # pixels of epipolar error up to which a match fits the poses
 _PRECISE, _NEARLY = 0.7, 10.0  # pixels of errors of right poses, and of those of poses with noise
-_MANY = 0.15  # share of precise matches that no wrong pose has
+_MANY = 0.08  # share of precise matches that no wrong pose has
+_PAIRS = 3  # pairs that say whether a photograph's pose is right
 
 
 class Cameras(NamedTuple):
@@ -27,9 +28,9 @@ class Fit(NamedTuple):
     median: float  # median error in pixels
     fitting: float  # the same of matches that fit; NaN if none does
     by_view: np.ndarray  # `[V]` share of each photograph's matches that fit; NaN without matches
-    # `[V]` the same of the best of the photographs that it matches; NaN if there are less than two,
-    # half as many matches as usual, or three quarters as many in the pair that has most, because a
-    # repeated pattern may match a photograph wrongly
+    # `[V]` the same of the best of the photographs that it matches; NaN if it has half as many
+    # matches as usual, or fewer than three pairs that have, because a repeated pattern may match a
+    # photograph wrongly
     by_best: np.ndarray
     # `[V]` whether some pair of the photograph has many precise matches and hardly any that are
     # nearly so: poses put the others far off, as a repeated pattern does, and no wrong pose
@@ -85,19 +86,14 @@ def fit(matches: Matches, cameras: Cameras) -> Fit:
     nearly = _shares(place, (errors > FITTING) & (errors <= _NEARLY))
     precise = np.zeros(count, bool)
     precise[pairs[(narrow >= _MANY) & (nearly <= narrow / 4)]] = True
-    largest = np.zeros(count)
-    for side in range(2):
-        np.maximum.at(largest, pairs[:, side], np.bincount(place))
-    few = (total < _usual(total) / 2) | (largest < 0.75 * _usual(largest))
-    by_best[few | (np.bincount(pairs.ravel(), minlength=count) < 2)] = np.nan
+    # Pairs of each photograph that have half as many matches as usual.
+    matched = np.bincount(place)
+    strong = np.bincount(pairs[matched >= np.median(matched) / 2].ravel(), minlength=count)
+    few = total < np.median(total[total > 0]) / 2 if total.any() else total == 0
+    by_best[few | (strong < min(_PAIRS, count - 1))] = np.nan
     fitting = float(np.median(errors[inside])) if inside.any() else np.nan
     median = float(np.median(errors))
     return Fit(float(inside.mean()), median, fitting, by_view, by_best, precise)
-
-
-def _usual(counts: np.ndarray) -> float:
-    """Return the median of the counts of photographs that have matches."""
-    return float(np.median(counts[counts > 0])) if counts.any() else 1.0
 
 
 def _shares(group: np.ndarray, true: np.ndarray) -> np.ndarray:

@@ -124,6 +124,19 @@ def test_points_behind_a_camera_do_not_fit():
     assert fit(matches, behind).share < 0.05
 
 
+@pytest.mark.parametrize(("pairs", "judged"), [(3, True), (2, False)])
+def test_a_photograph_is_judged_by_three_pairs(pairs, judged):
+    """Two pairs may both be of a pattern that repeats, and lie anywhere."""
+    matches, cameras = seen_together()
+    last = (matches.views == 3).any(1)
+    pixels = np.where(last[:, None, None], matches.pixels[:, ::-1], matches.pixels)
+    kept = ~last | (matches.views[:, 1] < pairs)
+    found = fit(matches._replace(pixels=pixels).take(kept), cameras)
+    np.testing.assert_array_equal(np.isfinite(found.by_best), [True, True, judged, judged])
+    assert found.by_best[0] == 1 and not found.precise[3]
+    assert not judged or found.by_best[3] < 0.3
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_any_order_of_poses_is_found(evidence, seed):
     order = np.random.default_rng(seed).permutation(len(evidence.frames))
