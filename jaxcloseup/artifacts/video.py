@@ -4,6 +4,7 @@ import contextlib
 import itertools
 import os
 import pathlib
+import threading
 from collections.abc import Iterable, Iterator
 
 import cv2
@@ -114,17 +115,21 @@ class _WebM:
         self._writer.release()
 
 
+_one_at_a_time = threading.Lock()  # two threads would put back each other's output
+
+
 @contextlib.contextmanager
 def _silent() -> Iterator[None]:
     """Keep what C++ prints from the terminal: OpenCV warns of VP8 in WebM, which is right."""
-    held, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nothing, 2)
-    try:
-        yield
-    finally:
-        os.dup2(held, 2)
-        os.close(held)
-        os.close(nothing)
+    with _one_at_a_time:
+        held, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nothing, 2)
+        try:
+            yield
+        finally:
+            os.dup2(held, 2)
+            os.close(held)
+            os.close(nothing)
 
 
 def _even(frames: Iterable[Image]) -> Iterator[np.ndarray]:

@@ -7,6 +7,7 @@ import cv2
 import jax
 import numpy as np
 
+from jaxcloseup.app import progress
 from jaxcloseup.app.run.fine_tuning import fine_tune, tuned_detail
 from jaxcloseup.app.run.kept_detail import detail_getter, detail_path
 from jaxcloseup.app.run.keys import run_keys
@@ -113,8 +114,11 @@ def render_run(
 
 def write_videos(shots: Shots, folders: list[pathlib.Path], *, fps: float) -> None:
     """Write each folder of images as a video beside it."""
-    for folder in folders:
-        path = write_video(folder, _images(folder, shots), fps=fps)
+
+    def write(folder: pathlib.Path) -> pathlib.Path:
+        return write_video(folder, _images(folder, shots), fps=fps)
+
+    for path in progress.each(write, folders, "writing videos"):
         print(f"video: {path}")
     if path.suffix != ".mp4":
         print('MP4 videos need imageio-ffmpeg: install jaxcloseup with the extra "video"')
