@@ -154,8 +154,8 @@ def _judge_points(
         )
     if found.shown < _OUT_OF_VIEW:
         return (
-            f"; {len(points):,} points lie where no two photographs look (but for "
-            f"{100 * found.shown:.0f} %)"
+            f"; only {100 * found.shown:.0f} % of {len(points):,} points are in view of two "
+            "photographs"
         ), ("points=none",)
     if not found.known:
         return f"; {len(points):,} points are not checked: photographs show too few of them", ()

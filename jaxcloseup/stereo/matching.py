@@ -73,22 +73,26 @@ def match_planes(
     others = camera_at(photographs.cameras, jnp.maximum(neighbors, 0))
     matrix, offset = relative_transforms(camera, others)
     transforms = jnp.concatenate([matrix, offset[..., None]], axis=-1)
-    arrays = photographs, reference, neighbors, transforms, planes
+    arrays = _Arrays(photographs, reference, neighbors, transforms, planes)
     natively = functools.partial(_match_natively, config=config)
     in_jax = functools.partial(_match_in_jax, config=config)
     if native is None and library.available():
-        return jax.lax.platform_dependent(*arrays, cpu=natively, default=in_jax)
-    return natively(*arrays) if native else in_jax(*arrays)
+        return jax.lax.platform_dependent(arrays, cpu=natively, default=in_jax)
+    return natively(arrays) if native else in_jax(arrays)
 
 
-def _match_in_jax(
-    photographs: Photographs,
-    reference: jax.Array,
-    neighbors: jax.Array,
-    transforms: jax.Array,
-    planes: jax.Array,
-    config: StereoConfig,
-) -> jax.Array:
+class _Arrays(NamedTuple):
+    """What is matched: arguments of `match_planes`, and `[N, 3, 4]` maps into the neighbors."""
+
+    photographs: Photographs
+    reference: jax.Array
+    neighbors: jax.Array
+    transforms: jax.Array
+    planes: jax.Array
+
+
+def _match_in_jax(arrays: _Arrays, config: StereoConfig) -> jax.Array:
+    photographs, reference, neighbors, transforms, planes = arrays
     patches = _read_patches(photographs, reference, config)
     best = min(config.best, neighbors.shape[0])
 
@@ -103,14 +107,8 @@ def _match_in_jax(
     return jax.lax.map(match, planes)
 
 
-def _match_natively(
-    photographs: Photographs,
-    reference: jax.Array,
-    neighbors: jax.Array,
-    transforms: jax.Array,
-    planes: jax.Array,
-    config: StereoConfig,
-) -> jax.Array:
+def _match_natively(arrays: _Arrays, config: StereoConfig) -> jax.Array:
+    photographs, reference, neighbors, transforms, planes = arrays
     costs = jax.ShapeDtypeStruct((planes.shape[0], *planes.shape[2:]), jnp.float32)
     function = jax.ffi.ffi_call("jaxcloseup_stereo", costs, vmap_method="sequential")
     gray, pixel, noise = _scales(config)
