@@ -27,14 +27,13 @@ from jaxcloseup.app.methods.shared.splat_training import extent, make_field
 from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.states import FEWEST_POINTS, initial_points, initial_state, state_shapes
-from jaxcloseup.artifacts.surfel_ply import read_surfels
+from jaxcloseup.artifacts.surfel_ply import read_surfels, write_surfels
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.fields.splats.adaptive import with_image_offset
 from jaxcloseup.fields.splats.filters import SMOOTHING_VARIANCE, sampling_intervals, smoothed
 from jaxcloseup.fields.splats.spherical_harmonics import sh_to_rgb
 from jaxcloseup.geometry.cameras import points_to_pixels
-from jaxcloseup.io.placement import UNMOVED
 from jaxcloseup.photos.pyramids import scene_pyramid
 from jaxcloseup.photos.views import camera_at
 from jaxcloseup.training.state import TrainState
@@ -120,8 +119,8 @@ def test_refinement_and_exports_keep_the_shapes_that_the_filter_made(capture_fol
     np.testing.assert_allclose(after[:100], before + added, rtol=1e-4)
     np.testing.assert_allclose(kept.interval[:100], buffers.interval / 2, rtol=1e-5)
     assert kept.alive.all() and finer.log_scales.shape == (600, 3)
-    METHODS["mip_gaussians"].export(tmp_path, "baseline", finer, kept, UNMOVED)
-    found = read_surfels(tmp_path / "splats" / "baseline.ply", num_scales=3)
+    write_surfels(tmp_path / "finer.ply", *METHODS["mip_gaussians"].splats(finer, kept))
+    found = read_surfels(tmp_path / "finer.ply", num_scales=3)
     expected = smoothed(finer, kept.interval)
     np.testing.assert_allclose(found.log_scales, expected.log_scales, rtol=1e-6)
     np.testing.assert_allclose(found.opacity_logits, expected.opacity_logits, rtol=1e-5)

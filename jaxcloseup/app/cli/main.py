@@ -14,6 +14,7 @@ from jaxcloseup.app.cli.invocation import program_name
 
 
 PROGRAMS = {
+    "closeup": "from photographs to close-ups and a page that shows them, in one command",
     "run": "train on one scene, fine-tune on pseudo-labeled close-ups, evaluate, report",
     "sweep": "the same for several arms, seeds and scenes, and compare them",
     "render": "render a camera path of a run, or fine-tune for target cameras",

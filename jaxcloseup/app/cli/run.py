@@ -8,6 +8,7 @@ what the photographs show beyond them; `test_time` learns labels of the very clo
 scored. The scene is a built-in one or a folder.
 """
 
+import pathlib
 from typing import TYPE_CHECKING
 
 from absl import flags
@@ -19,11 +20,17 @@ from jaxcloseup.app.cli.flags import (
     names_from_flags,
     preset_from_flags,
 )
-from jaxcloseup.app.cli.output_folder import choose_output_dir, lock_output_dir, prepare_to_stop
+from jaxcloseup.app.cli.output_folder import (
+    CHECKPOINTS,
+    choose_output_dir,
+    lock_output_dir,
+    prepare_to_stop,
+)
 from jaxcloseup.app.cli.start import in_one_sentence, loading, set_up
 from jaxcloseup.app.cli.topics import share
 from jaxcloseup.app.methods.method import Preset
 from jaxcloseup.app.run.stage_names import STAGES
+from jaxcloseup.io.files import read_object
 
 
 if TYPE_CHECKING:
@@ -48,7 +55,7 @@ flags.DEFINE_float(
     "minutes",
     None,
     "train stage 1 for about so many minutes on this computer: steps are timed first, and the "
-    "settings that repeat the training are printed",
+    "settings that repeat the training are printed; --resume goes on with these settings",
     lower_bound=0.1,
 )
 flags.DEFINE_list("stages", list(STAGES), "stages to run; baseline always runs")
@@ -82,7 +89,7 @@ def main(_: list[str]) -> None:
                 scene = load(FLAGS.scene, load_options)
         scene.metadata["check"] = found
         if FLAGS.minutes is not None:
-            preset = _fitted(preset, scene)
+            preset = _resumed(output_dir) if FLAGS.resume else _fitted(preset, scene)
         perceptual = find_perceptual(FLAGS.lpips_weights)
         lock = lock_output_dir(output_dir)
     expected = (TrainingError, CheckpointError, SceneError, OSError)
@@ -103,6 +110,13 @@ def main(_: list[str]) -> None:
     print(f"report: {output_dir / 'report.html'}")
 
 
+def _resumed(output_dir: pathlib.Path) -> Preset:
+    """Return the preset with the settings that were found when the run began."""
+    from jaxcloseup.app.store.stored_config import preset_from_config
+
+    return preset_from_config(read_object(output_dir / CHECKPOINTS / "run.json")["config"])[0]
+
+
 def _fitted(preset: Preset, scene: "Scene") -> Preset:
     from jaxcloseup.app import progress
     from jaxcloseup.app.run.minutes import fit_minutes
@@ -112,14 +126,6 @@ def _fitted(preset: Preset, scene: "Scene") -> Preset:
     repeat = " ".join(f"--set={text}" for text in given)
     print(f"{FLAGS.minutes:g} minutes of training, as {repeat} repeats it")
     return preset
-
-
-@flags.multi_flags_validator(
-    ["minutes"],
-    message="--resume needs the settings that --minutes printed: give them instead of it",
-)
-def _new(values: dict[str, float | None]) -> bool:
-    return values["minutes"] is None or not FLAGS.resume
 
 
 @flags.multi_flags_validator(["stages"], message=f"--stages takes names of {', '.join(STAGES)}")

@@ -1,7 +1,6 @@
 """What a method is, and what its presets hold: plain numbers that print and serialize."""
 
 import dataclasses
-import pathlib
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -11,11 +10,11 @@ from jaxcloseup.training.config import TrainConfig
 
 
 if TYPE_CHECKING:  # flags read presets, and must not wait for JAX
+    import jax
     import optax
 
-    from jaxcloseup.artifacts.viewer_gaussians import Gaussians
     from jaxcloseup.fields.contract import RadianceField
-    from jaxcloseup.io.placement import Placement
+    from jaxcloseup.fields.splats.surfels import Surfels
     from jaxcloseup.photos.scene import Scene
     from jaxcloseup.training.state import TrainState
 
@@ -143,12 +142,9 @@ class Method:
     # `(buffers, expected) -> buffers` of a field that renders its expected depth (true) or its
     # median depth (false) as depth; None for fields without a choice.
     with_expected_depth: Callable[[Any, bool], Any] | None = None
-    # `(folder, stage, params, buffers, placement) -> None` writes a stage's state for other
-    # programs, in the capture's coordinates.
-    export: "Callable[[pathlib.Path, str, Any, Any, Placement], None]" = lambda *state: None
-    # `(params, buffers, position) -> Gaussians`, what viewers draw, with the colors that are seen
-    # from `position[3]`; None: they draw the scene's points.
-    gaussians: "Callable[[Any, Any, Any], Gaussians] | None" = None
+    # `(params, buffers) -> (surfels, alive)`, splats that other programs draw, and which are
+    # alive; None: viewers draw the scene's points.
+    splats: "Callable[[Any, Any], tuple[Surfels, jax.Array]] | None" = None
     # `(config) -> float`, gray level in [0, 1] behind the scene.
     background: Callable[[Any], float] = lambda config: 0.0
     # `(key, config, params, buffers, render, scene, pyramid) -> (params, buffers)` gives what

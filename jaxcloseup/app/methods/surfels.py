@@ -179,8 +179,7 @@ METHOD = Method(
     with_expected_depth=lazy_function(
         "jaxcloseup.fields.splats.splat_field", "with_expected_depth"
     ),
-    export=lazy_function(TRAINING, "export"),
-    gaussians=lazy_function(TRAINING, "viewer_gaussians"),
+    splats=lazy_function(TRAINING, "splats"),
     background=lambda config: config.background or 0.0,
     refine=lazy_function(TRAINING, "refine"),
     add_for_targets=lazy_function(TRAINING, "add_for_targets"),

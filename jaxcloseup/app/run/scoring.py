@@ -11,6 +11,7 @@ import numpy as np
 from jaxcloseup.app.run.labels import LabelStart
 from jaxcloseup.app.run.loop import Training
 from jaxcloseup.app.run.programs import Programs
+from jaxcloseup.app.run.splat_files import write_splats
 from jaxcloseup.app.run.timers import timed
 from jaxcloseup.app.score.ladder import describe_ladder, ladder_targets
 from jaxcloseup.app.score.metrics_text import REDUCED, describe_split
@@ -82,8 +83,7 @@ class Scorer:
         programs, log = self._training.programs, self._training.log
         if render is None:
             render = functools.partial(programs.render, state)
-            placement = programs.scene.placement
-            programs.method.export(self._folder, stage, state.params, state.buffers, placement)
+            write_splats(self._folder / "splats", stage, programs, state)
         targets, ladder = self.held_out.targets, self.held_out.ladder
         with timed(self._training.seconds, f"{stage}_evaluation"):
             scores: dict[str, Any] = {}

@@ -26,7 +26,7 @@ from jaxcloseup.app.view.orientation import up_direction
 from jaxcloseup.app.view.picking import rank_views, ray_camera
 from jaxcloseup.app.view.server import Server
 from jaxcloseup.artifacts.images import color_counts, color_errors, to_uint8
-from jaxcloseup.artifacts.viewer_gaussians import Gaussians
+from jaxcloseup.artifacts.viewer_gaussians import Gaussians, as_gaussians
 from jaxcloseup.detail.add import Detail
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.labels.rules import label_depth
@@ -261,15 +261,15 @@ class Viewer:
 
     def drawn(self, position: np.ndarray | None = None) -> Gaussians | None:
         """Return the Gaussians that represent the state, colored as seen from a position `[3]`."""
-        gaussians = self.programs.method.gaussians
-        if gaussians is None:
+        splats = self.programs.method.splats
+        if splats is None:
             return None
-        return gaussians(self.state.params, self.state.buffers, position)
+        return as_gaussians(*splats(self.state.params, self.state.buffers), position)
 
     def background(self) -> np.ndarray | None:
         """Return what is behind the drawn scene, as the run's own renderer has it."""
         method = self.programs.method
-        if method.gaussians is None:
+        if method.splats is None:
             return None
         return to_uint8(np.full((1, 1), method.background(self.programs.preset.field)))
 

@@ -1,8 +1,7 @@
-"""Fields, optimizers, refinement and exports of surfels and volumetric Gaussians."""
+"""Fields, optimizers and refinement of surfels and volumetric Gaussians."""
 
 import dataclasses
 import functools
-import pathlib
 from collections.abc import Callable
 from typing import Any
 
@@ -14,8 +13,6 @@ import optax
 from jaxcloseup.app import progress
 from jaxcloseup.app.methods.gaussians import GaussianTrainingConfig
 from jaxcloseup.app.methods.surfels import SurfelTrainingConfig
-from jaxcloseup.artifacts.surfel_ply import write_surfels
-from jaxcloseup.artifacts.viewer_gaussians import Gaussians, as_gaussians
 from jaxcloseup.fields.contract import RadianceField, Rendering
 from jaxcloseup.fields.splats.config import RasterizeConfig
 from jaxcloseup.fields.splats.control import replace_surfels
@@ -31,7 +28,6 @@ from jaxcloseup.fields.splats.splat_field import (
 from jaxcloseup.fields.splats.splat_optimizer import surfel_optimizer
 from jaxcloseup.fields.splats.surfels import Surfels, pad_rows
 from jaxcloseup.geometry.cameras import Camera
-from jaxcloseup.io.placement import Placement
 from jaxcloseup.labels.rules import label_depth
 from jaxcloseup.native import library
 from jaxcloseup.photos.depth_maps import GatherSources, read_depths
@@ -110,18 +106,9 @@ def extent(scene: Scene) -> float:
     return reach if reach > 1e-4 * scene.far else 0.5 * scene.far
 
 
-def export(
-    folder: pathlib.Path, stage: str, surfels: Surfels, buffers: SurfelBuffers, placement: Placement
-) -> None:
-    """Write `splats/<stage>.ply`, for viewers of Gaussian splats, in the capture's coordinates."""
-    surfels = smoothed(surfels, buffers.interval)
-    file = folder / "splats" / f"{stage}.ply"
-    write_surfels(file, surfels, buffers.alive, placement=placement)
-
-
-def viewer_gaussians(surfels: Surfels, buffers: SurfelBuffers, position: np.ndarray) -> Gaussians:
-    """Return what viewers draw, with the colors that are seen from `position[3]`."""
-    return as_gaussians(smoothed(surfels, buffers.interval), buffers.alive, position)
+def splats(surfels: Surfels, buffers: SurfelBuffers) -> tuple[Surfels, jax.Array]:
+    """Return what other programs draw, and which of it is alive, `[N]` bool."""
+    return smoothed(surfels, buffers.interval), buffers.alive
 
 
 def refine(

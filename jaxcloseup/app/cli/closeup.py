@@ -1,0 +1,164 @@
+"""Look closer: from photographs, a video, a capture or a run to close-ups and a page to send.
+
+    jaxcloseup closeup photographs
+    jaxcloseup closeup photographs --at=IMG_0003:2000,1300
+
+finds poses if there are none, checks the capture, trains, renders close-ups with the photographs'
+detail, and writes share/index.html, a page with the scene to turn and the close-ups pinned to it.
+The same command goes on where it was stopped; with another --at it adds a close-up in seconds.
+"""
+
+import pathlib
+import re
+import shlex
+import subprocess
+import sys
+import time
+
+from absl import flags
+
+from jaxcloseup.app.cli.flags import OUTPUT
+from jaxcloseup.app.cli.interrupt import when_stopped
+from jaxcloseup.app.cli.invocation import program_command, program_name
+from jaxcloseup.app.cli.output_folder import CHECKPOINTS, lock_output_dir, remove_unfinished
+from jaxcloseup.app.cli.start import in_one_sentence, loading, set_up
+from jaxcloseup.app.cli.topics import share
+
+
+FLAGS = flags.FLAGS
+OPERANDS = 1  # what to look at
+share(OUTPUT)
+flags.DEFINE_multi_string(
+    "at",
+    [],
+    "PHOTOGRAPH:x,y, a pixel at the photograph's own size to look at; repeatable; default: the "
+    "three places where photographs show most",
+)
+flags.DEFINE_float(
+    "near", 4.0, "how many times nearer than the photograph", lower_bound=1, upper_bound=1000
+)
+flags.DEFINE_float("minutes", 10.0, "how long to train, without what comes before and after")
+flags.DEFINE_bool("single_file", False, "write the page as one file that holds everything")
+flags.DEFINE_bool("mesh", False, "also write the surface as a mesh; needs the extra mesh")
+
+
+def main(arguments: list[str]) -> None:
+    """Make the close-ups and the page that the command line asks for."""
+    name = program_name("closeup")
+    if len(arguments) != 2:
+        sys.exit(f"{name}: name photographs, a video, a capture or a run, as in {name} photographs")
+    with in_one_sentence("closeup", ValueError, OSError):
+        asked = [_parse_place(text) for text in FLAGS.at]
+        source, kind = arguments[1], _kind(arguments[1])
+        folder = _folder(source, kind)
+    when_stopped(lambda: _say_stopped(folder))
+    with in_one_sentence("closeup", OSError):
+        lock = lock_output_dir(folder)
+    with lock:
+        began = time.perf_counter()
+        run = _trained(source, kind, folder)
+        _present(folder, run, asked)
+        if FLAGS.mesh and not (folder / "mesh").exists():
+            _start("mesh", f"--run={run}", f"--output_dir={folder / 'mesh'}")
+    minutes, seconds = divmod(round(time.perf_counter() - began), 60)
+    print(f"took {minutes}:{seconds:02} minutes")
+    print(f"open {folder / 'share' / 'index.html'} in a browser, or send the folder it lies in")
+
+
+def _present(
+    folder: pathlib.Path, run: pathlib.Path, asked: list[tuple[str, tuple[float, float]]]
+) -> None:
+    with loading():
+        from jaxcloseup.app import progress
+        from jaxcloseup.app.run.loop import TrainingError
+        from jaxcloseup.app.share.present import present
+        from jaxcloseup.app.store.stored_run import RunError, choose_stage, read_run
+        from jaxcloseup.app.view.camera_paths import CameraError
+        from jaxcloseup.artifacts.checkpoints import CheckpointError
+        from jaxcloseup.photos.scene import SceneError
+    set_up()
+    expected = (RunError, CameraError, SceneError, CheckpointError, TrainingError)
+    with in_one_sentence("closeup", *expected, ValueError, OSError), progress.showing():
+        record = read_run(run)
+        stage = choose_stage(record, None)
+        paths = present(
+            folder, record, stage, asked, near=FLAGS.near, single_file=FLAGS.single_file
+        )
+    print("\n".join(f"wrote {path}" for path in paths[:-1]))
+
+
+def _trained(source: str, kind: str, folder: pathlib.Path) -> pathlib.Path:
+    """Return the folder of the run; find poses and train first, as far as that is not done."""
+    if kind == "run":
+        return pathlib.Path(source)
+    run, capture = folder / "run", source
+    if (run / "results.json").exists():
+        return run
+    if kind in ("photographs", "video"):
+        flag = "images" if kind == "photographs" else "video"
+        capture = str(folder / "capture")
+        print(f"{source}: {kind} without poses, so these are found first; then {_training()}")
+        _start("process", f"--{flag}={source}", f"--output_dir={capture}")
+    else:
+        print(f"{source}: a {kind}; {_training()}")
+    resume = ["--resume"] if (run / CHECKPOINTS).is_dir() else []
+    given = f"--scene={capture}", f"--output_dir={run}", f"--minutes={FLAGS.minutes:g}"
+    _start("run", *given, "--stages=detail", *resume)
+    return run
+
+
+def _training() -> str:
+    return (
+        f"training for about {FLAGS.minutes:g} minutes, and about 3 for depth, detail, close-ups "
+        "and the page"
+    )
+
+
+def _start(program: str, *given: str) -> None:
+    """Run another program of this package, and end with it if it fails: it says why."""
+    print(shlex.join([*program_command(program), *given]), flush=True)
+    done = subprocess.run([sys.executable, "-m", "jaxcloseup", program, *given])
+    if done.returncode:
+        sys.exit(done.returncode)
+
+
+def _kind(source: str) -> str:
+    """Return what a path holds: scene, video, run, capture or photographs."""
+    from jaxcloseup.captures.detection import detect
+    from jaxcloseup.captures.load import DRAWN_SCENES
+    from jaxcloseup.photos.scene import SceneError
+
+    path = pathlib.Path(source)
+    if source in DRAWN_SCENES:
+        return "scene"
+    if not path.exists():
+        raise FileNotFoundError(f"{source} does not exist: name a folder or a video")
+    if path.is_file():
+        return "video"
+    if (path / CHECKPOINTS).is_dir():
+        return "run"
+    try:
+        detect(path, None)
+    except SceneError:
+        return "photographs"
+    return "capture"
+
+
+def _folder(source: str, kind: str) -> pathlib.Path:
+    if FLAGS.output_dir is not None:
+        return pathlib.Path(FLAGS.output_dir)
+    path = pathlib.Path(source)
+    return path if kind == "run" else pathlib.Path("outputs", path.resolve().name, "closeup")
+
+
+def _parse_place(text: str) -> tuple[str, tuple[float, float]]:
+    found = re.fullmatch(r"(.+):(\d+(?:\.\d+)?),(\d+(?:\.\d+)?)", text)
+    if found is None:
+        raise ValueError(f"--at={text} must be PHOTOGRAPH:x,y, as in --at=IMG_0003:2000,1300")
+    return found[1], (float(found[2]), float(found[3]))
+
+
+def _say_stopped(folder: pathlib.Path) -> str:
+    remove_unfinished(folder)
+    command = [*program_command("closeup"), *sys.argv[1:]]
+    return f"stopped: go on with {shlex.join(command)}"

@@ -1,0 +1,1 @@
+"""Close-ups of a trained run, and a page that shows them to others."""

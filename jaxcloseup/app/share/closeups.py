@@ -1,0 +1,84 @@
+"""Close-ups at pixels of photographs: cameras, pictures, and what can be said of them."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcloseup.app import progress
+from jaxcloseup.app.run.kept_detail import detailed
+from jaxcloseup.app.run.programs import Programs
+from jaxcloseup.app.share.places import Place
+from jaxcloseup.app.view.camera_paths import CameraError
+from jaxcloseup.app.view.picking import closeup_camera
+from jaxcloseup.artifacts.images import color_errors, to_uint8
+from jaxcloseup.detail.add import Detail
+from jaxcloseup.geometry.cameras import Camera, pixels_to_points
+from jaxcloseup.labels.rules import label_depth
+from jaxcloseup.training.state import TrainState
+
+
+class CloseUp(NamedTuple):
+    """A finished close-up."""
+
+    name: str  # of its files: the photograph and the pixel
+    camera: Camera
+    point: np.ndarray  # `[3]` surface at the pixel, which is in the middle
+    picture: np.ndarray  # uint8 `[H, W, 3]`
+    error: np.ndarray  # uint8 `[H, W, 3]`, colors of the expected error
+    said: str  # where it is
+    said_of_error: str  # by how much colors may be off
+
+
+def make_closeups(
+    programs: Programs, state: TrainState, detail: Detail, places: Sequence[Place], *, near: float
+) -> list[CloseUp]:
+    """Render close-ups with detail, as large as the photographs whose pixels they are of.
+
+    Args:
+      programs: the run's compiled programs.
+      state: the state to render.
+      detail: of the state.
+      places: pixels of photographs.
+      near: how many times nearer than the photograph.
+
+    Raises:
+      CameraError: the state shows no surface at a pixel.
+    """
+
+    def make(place: Place) -> CloseUp:
+        return _closeup(programs, state, detail, place, near)
+
+    return list(progress.each(make, places, "close-ups"))
+
+
+def _closeup(
+    programs: Programs, state: TrainState, detail: Detail, place: Place, near: float
+) -> CloseUp:
+    scene = programs.scene
+    photograph, name = scene.own_camera("train", place.view), scene.names["train"][place.view]
+    x, y = int(place.x * photograph.width), int(place.y * photograph.height)
+    seen = label_depth(programs.render(state, photograph), near=0, far=scene.far)
+    depth = seen[y, x]
+    if not depth > 0:
+        raise CameraError(
+            f"--at={name}:{x},{y}: there is no surface at this pixel: choose another pixel"
+        )
+    point = np.asarray(pixels_to_points(photograph, jnp.array([x + 0.5, y + 0.5]), depth))
+    camera = closeup_camera(photograph, point, near)
+    sharper = detailed(programs, detail, camera, programs.render(state, camera))
+    error = np.asarray(sharper.error)
+    shown = np.isfinite(error)
+    said = f"{near:g} times nearer than {name}, at its pixel {x}, {y}"
+    off = f"{np.mean(error[shown]):.3f}" if shown.any() else "unknown"
+    return CloseUp(
+        f"{name}_{x}_{y}".replace("/", "_"),
+        camera,
+        point,
+        to_uint8(sharper.rgb),
+        color_errors(sharper.error)[0],
+        said,
+        f"Expected error of colors: {off} of 1 on average; photographs show {shown.mean():.0%} of "
+        "the picture",
+    )

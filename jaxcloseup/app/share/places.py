@@ -1,0 +1,97 @@
+"""Places of a scene that are worth a close-up, found in its photographs."""
+
+from typing import NamedTuple
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcloseup.detail.add import Detail
+from jaxcloseup.geometry.cameras import pixels_to_points
+from jaxcloseup.photos.views import camera_at
+
+
+_WIDTH = 480  # pixels, about, of the photographs that are searched
+_STEPS = 12  # windows along each side of a photograph
+_APART = 0.3  # of the median depth, between two places
+_ENOUGH = 0.6  # mean trust in the depth of a window
+
+
+class Place(NamedTuple):
+    """A pixel of a photograph, in shares of its width and height."""
+
+    view: int
+    x: float
+    y: float
+
+
+class _Found(NamedTuple):
+    score: float
+    place: Place
+    point: np.ndarray
+
+
+def best_places(detail: Detail, *, count: int, near: float) -> list[Place]:
+    """Return where the photographs show most contrast in fine structures, and depth is trusted.
+
+    Each place is that of a window which a close-up shows whole, and no two are near each other.
+
+    Args:
+      detail: of a trained state.
+      count: largest number of places.
+      near: how many times nearer close-ups are.
+    """
+    found: list[_Found] = []
+    depths: list[float] = []
+    for view in range(detail.sources.maps.shape[0]):
+        here, depth = _windows_of(detail, view, near)
+        found += here
+        depths.append(depth)
+    apart = _APART * float(np.nanmedian(depths))
+    chosen: list[_Found] = []
+    for one in sorted(found, key=lambda one: -one.score):
+        if len(chosen) == count:
+            break
+        if all(
+            one.place.view != other.place.view and np.linalg.norm(one.point - other.point) > apart
+            for other in chosen
+        ):
+            chosen.append(one)
+    return [one.place for one in chosen]
+
+
+def _windows_of(detail: Detail, view: int, near: float) -> tuple[list[_Found], float]:
+    """Return the windows of a photograph whose depth is trusted, and its median depth."""
+    shown, sources = detail.shown, detail.sources
+    colors = np.asarray(shown.image(view, shown.level_near(_WIDTH)), np.float32)[..., 3:6]
+    rows, columns = colors.shape[:2]
+    # Depth maps are padded to one size, images are not.
+    of_maps = shown.sizes.index(sources.trust.shape[1:])
+    height, width = np.asarray(shown.extents)[view, of_maps]
+    trust, inverse = (
+        cv2.resize(np.asarray(maps[view])[:height, :width], (columns, rows), interpolation=how)
+        for maps, how in (
+            (sources.trust, cv2.INTER_AREA),
+            (sources.inverse_depth, cv2.INTER_NEAREST),
+        )
+    )
+    gray = colors.mean(axis=-1)
+    fine = np.abs(gray - cv2.GaussianBlur(gray, (0, 0), 2))
+    size = max(3, round(columns / near)), max(3, round(rows / near))
+    contrast, trusted = (cv2.blur(values, size) for values in (fine * trust, trust))
+    # Centers of windows that lie in the photograph.
+    x, y = (
+        np.linspace(side // 2, whole - 1 - side // 2, _STEPS).astype(int)
+        for side, whole in zip(size, (columns, rows), strict=True)
+    )
+    x, y = (axis.ravel() for axis in np.meshgrid(x, y))
+    kept = (trusted[y, x] >= _ENOUGH) & (inverse[y, x] > 0)
+    x, y = x[kept], y[kept]
+    shares = (np.stack([x, y], axis=-1) + 0.5) / [columns, rows]
+    depth = 1 / inverse[y, x]
+    camera, pixels = camera_at(sources.cameras, view), shares * [width, height]
+    points = np.asarray(pixels_to_points(camera, jnp.asarray(pixels, jnp.float32), depth))
+    places = [Place(view, *share) for share in shares.tolist()]
+    scores = contrast[y, x].tolist()
+    found = [_Found(*each) for each in zip(scores, places, points, strict=True)]
+    return found, float(np.median(depth)) if len(depth) else float("nan")

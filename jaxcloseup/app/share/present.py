@@ -1,0 +1,138 @@
+"""Make a run's close-ups, a dolly and the page that shows them."""
+
+import pathlib
+from collections.abc import Iterable, Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcloseup.app import progress
+from jaxcloseup.app.run.kept_detail import detail_getter, detail_path, detailed
+from jaxcloseup.app.run.programs import Programs
+from jaxcloseup.app.share.closeups import CloseUp, make_closeups
+from jaxcloseup.app.share.kept import keep_closeup, kept_closeups
+from jaxcloseup.app.share.page import write_page
+from jaxcloseup.app.share.places import Place, best_places
+from jaxcloseup.app.store.stored_run import StoredRun, load_run_scene, restore
+from jaxcloseup.app.view.camera_paths import (
+    check_pixel,
+    dolly,
+    find_view,
+    focus_point,
+    named_cameras,
+    resized_shots,
+)
+from jaxcloseup.app.view.orientation import up_direction
+from jaxcloseup.artifacts.images import to_uint8
+from jaxcloseup.artifacts.spz import pack_spz
+from jaxcloseup.artifacts.video import write_video
+from jaxcloseup.detail.add import Detail
+from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.photos.scene import Scene
+from jaxcloseup.training.state import TrainState
+
+
+BEST = 3  # close-ups where none is asked for
+_FRAMES, _FPS, _WIDEST = 48, 24, 960  # of the dolly
+
+
+def present(
+    folder: pathlib.Path,
+    record: StoredRun,
+    stage: str,
+    asked: Sequence[tuple[str, tuple[float, float]]],
+    *,
+    near: float,
+    single_file: bool,
+) -> list[pathlib.Path]:
+    """Make close-ups of a stored run, and a page of these and of earlier ones in the folder.
+
+    Args:
+      folder: gets `closeups/`, `dolly.*` unless it has one, and `share/`.
+      record: the run, of a field of splats.
+      stage: whose state is shown.
+      asked: names of photographs and pixels (x, y) at their own size; none: the best places.
+      near: how many times nearer than the photograph.
+      single_file: whether the page is one file.
+
+    Returns:
+      The pictures of the new close-ups, the dolly if it is new, and the page.
+
+    Raises:
+      CameraError: a photograph or a pixel does not exist, or shows no surface.
+      ValueError: an earlier close-up is damaged.
+    """
+    scene = load_run_scene(record)
+    places = [_place(scene, *one) for one in asked]
+    programs, state = restore(record, scene, stage)
+    detail, _ = detail_getter(programs, state, detail_path(record.folder, stage))()
+    if not places:
+        with progress.saying("choosing what to look at"):
+            places = best_places(detail, count=BEST, near=near)
+    made = make_closeups(programs, state, detail, places, near=near)
+    for closeup in made:
+        keep_closeup(folder / "closeups", closeup)
+    paths = [folder / "closeups" / f"{closeup.name}.png" for closeup in made]
+    if places and not list(folder.glob("dolly.*")):
+        frames = _dolly(programs, state, detail, made[0], near)
+        paths.append(write_video(folder / "dolly", frames, fps=_FPS))
+    with progress.saying("writing the page"):
+        paths.append(_write_page(folder, programs, state, single_file=single_file))
+    return paths
+
+
+def _place(scene: Scene, name: str, pixel: tuple[float, float]) -> Place:
+    view = find_view(scene, name)
+    camera = scene.own_camera("train", view)
+    check_pixel(camera, pixel)
+    return Place(view, pixel[0] / camera.width, pixel[1] / camera.height)
+
+
+def _write_page(
+    folder: pathlib.Path, programs: Programs, state: TrainState, *, single_file: bool
+) -> pathlib.Path:
+    scene = programs.scene
+    assert programs.method.splats is not None
+    splats, _ = pack_spz(*programs.method.splats(state.params, state.buffers))
+    cameras = scene.train.cameras
+    positions, rotations = (np.asarray(a) for a in (cameras.position, cameras.rotation))
+    center = focus_point(positions, rotations[..., 2], near=scene.near, far=scene.far)
+    distances = np.linalg.norm(positions - center, axis=1)
+    farthest = int(distances.argmax())
+    return write_page(
+        folder / "share",
+        kept_closeups(folder / "closeups"),
+        title=scene.name,
+        splats=splats,
+        overview=scene.own_camera("train", farthest),
+        distance=float(distances[farthest]),
+        up=up_direction(scene),
+        single_file=single_file,
+    )
+
+
+def _dolly(
+    programs: Programs, state: TrainState, detail: Detail, closeup: CloseUp, near: float
+) -> Iterable[np.ndarray]:
+    """Render frames, uint8 `[H, W, 3]`, whose camera ends at a close-up's."""
+    end, point = closeup.camera, closeup.point
+    ahead = (np.asarray(end.position) - point) @ np.asarray(end.rotation)[:, 2]
+    begin = np.column_stack(
+        [np.asarray(end.rotation), point + near * (np.asarray(end.position) - point)]
+    )
+    shots = dolly(
+        end.replace(camtoworld=jnp.asarray(begin, jnp.float32)),
+        (float(end.intrinsics[2]), float(end.intrinsics[3])),
+        -near * float(ahead),
+        magnification=near,
+        frames=_FRAMES,
+    )
+    if end.width > _WIDEST:
+        shots = resized_shots(shots, _WIDEST, None)
+
+    def frame(camera: Camera) -> np.ndarray:
+        seen = programs.render(state, camera)
+        return to_uint8(detailed(programs, detail, camera, seen).rgb)
+
+    cameras = [camera for _, camera in named_cameras(shots)]
+    return progress.each(frame, cameras, "frames of the dolly")
