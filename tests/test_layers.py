@@ -39,8 +39,10 @@ ROOMS = {
     "report": {"methods", "score", "progress", "run", "store", "view", "process"},
     "view": {"methods", "score", "progress", "run", "store"},
     "process": {"progress"},
+    "share": {"progress", "run", "store", "view"},
     "cli": {
-        *("methods", "score", "progress", "run", "report", "view", "process", "store", "sweep")
+        *("methods", "score", "progress", "run", "report", "view", "process", "share", "store"),
+        "sweep",
     },
 }
 LIBRARIES_OF_GEOMETRY = {"jax", "chex", "flax", "typing", "collections", "jaxcloseup"}

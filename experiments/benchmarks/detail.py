@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.benchmarks.timing import interleaved_medians
-from experiments.trained_run import newest_run
+from experiments.studies.trained_run import newest_run
 from jaxcloseup.app.run.kept_detail import detailed
 from jaxcloseup.app.view.camera_paths import dolly, resized
 from jaxcloseup.detail.add import SETTINGS

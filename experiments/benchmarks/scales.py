@@ -7,7 +7,7 @@ agree, the field is right at both scales.
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.trained_run import newest_run
+from experiments.studies.trained_run import newest_run
 from jaxcloseup.app.view.camera_paths import resized
 from jaxcloseup.metrics.image_metrics import psnr
 from jaxcloseup.photos.views import camera_at, to_float

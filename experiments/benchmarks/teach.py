@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.trained_run import open_run
+from experiments.studies.trained_run import open_run
 from jaxcloseup.app.score.expected_errors import error_tenths
 from jaxcloseup.detail.add import find_candidates
 from jaxcloseup.detail.learn import PIXELS, Evidence, learn_weights, make_evidence, sample_evidence

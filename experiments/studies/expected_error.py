@@ -12,7 +12,7 @@ import numpy as np
 from absl import app, flags
 
 from experiments.studies.pictures import closeup_camera, render_detailed, render_truth, write_rows
-from experiments.trained_run import open_run
+from experiments.studies.trained_run import open_run
 from jaxcloseup.app.report.showcase import best_middle_worst
 from jaxcloseup.artifacts.images import colorize_expected_error
 from jaxcloseup.io.files import read_object

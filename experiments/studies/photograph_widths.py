@@ -28,7 +28,7 @@ from absl import app, flags
 
 from experiments.studies.pictures import render_detailed
 from experiments.studies.tables import print_table
-from experiments.trained_run import open_run
+from experiments.studies.trained_run import open_run
 from jaxcloseup.app import progress
 from jaxcloseup.app.score.targets import score_divisor
 from jaxcloseup.artifacts.images import to_uint8

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import imageio.v3 as imageio
 import numpy as np
 
-from experiments.trained_run import TrainedRun
+from experiments.studies.trained_run import TrainedRun
 from jaxcloseup.app.run.kept_detail import detailed
 from jaxcloseup.app.view.camera_paths import resized
 from jaxcloseup.artifacts.images import side_by_side, to_uint8

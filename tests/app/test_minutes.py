@@ -1,6 +1,7 @@
 """`--minutes`: the steps that fit, the settings that repeat them."""
 
 import dataclasses
+import types
 
 import jax
 import pytest
@@ -9,6 +10,7 @@ from tiny_runs import TINY, TINY_SURFELS
 from jaxcloseup.app.methods.method import CoarseConfig, WindowConfig
 from jaxcloseup.app.methods.settings import with_settings
 from jaxcloseup.app.run import minutes
+from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.captures.load import load_scene
 
 
@@ -20,7 +22,8 @@ def test_steps_and_schedules_follow_from_the_time_of_a_step(monkeypatch, wanted)
         TINY_SURFELS, coarse=coarse, field=field, windows=WindowConfig(), baseline_steps=100
     )
     monkeypatch.setattr(minutes, "_time_steps", lambda *_: (6.0, 0.01))
-    fitted, given = minutes.fit_minutes(preset, None, wanted)
+    monkeypatch.setattr(minutes, "Programs", lambda *_: types.SimpleNamespace(read=None))
+    fitted, given, _ = minutes.fit_minutes(preset, None, wanted)
     assert fitted.baseline_steps == 6000 * wanted - 600
     assert fitted.field.means_lr_steps == pytest.approx(0.9 * fitted.baseline_steps, abs=10)
     assert fitted.field.capacity == pytest.approx(20_000 * (wanted / 5) ** 0.5, abs=500)
@@ -33,8 +36,9 @@ def test_steps_are_timed_on_the_scene(capture_folder, monkeypatch):
     monkeypatch.setattr(minutes, "_FEWEST", 1)
     scene = load_scene(str(capture_folder), downscale=2)
     with jax.numpy_dtype_promotion("standard"):
-        before, step = minutes._time_steps(dataclasses.replace(TINY, downscale=2), scene)
-        fitted, given = minutes.fit_minutes(dataclasses.replace(TINY, downscale=2), scene, 0.1)
+        programs = Programs(dataclasses.replace(TINY, downscale=2), scene)
+        before, step = minutes._time_steps(programs)
+        fitted, given, _ = minutes.fit_minutes(dataclasses.replace(TINY, downscale=2), scene, 0.1)
     assert 0 <= before < 0.1 and 0 < step < 5
     assert fitted.baseline_steps >= 1
     assert given[0] == f"baseline_steps={fitted.baseline_steps}"

@@ -17,7 +17,7 @@ import time
 
 from absl import flags
 
-from jaxcloseup.app.cli.flags import OUTPUT
+from jaxcloseup.app.cli.flags import OUTPUT, TIME
 from jaxcloseup.app.cli.interrupt import when_stopped
 from jaxcloseup.app.cli.invocation import program_command, program_name
 from jaxcloseup.app.cli.output_folder import CHECKPOINTS, lock_output_dir, remove_unfinished
@@ -26,8 +26,9 @@ from jaxcloseup.app.cli.topics import share
 
 
 FLAGS = flags.FLAGS
+_PLAIN = "images", "photographs", "photos", "pictures"  # names of folders that say nothing
 OPERANDS = 1  # what to look at
-share(OUTPUT)
+share(TIME, OUTPUT)
 flags.DEFINE_multi_string(
     "at",
     [],
@@ -37,7 +38,6 @@ flags.DEFINE_multi_string(
 flags.DEFINE_float(
     "near", 4.0, "how many times nearer than the photograph", lower_bound=1, upper_bound=1000
 )
-flags.DEFINE_float("minutes", 10.0, "how long to train, without what comes before and after")
 flags.DEFINE_bool("single_file", False, "write the page as one file that holds everything")
 flags.DEFINE_bool("mesh", False, "also write the surface as a mesh; needs the extra mesh")
 
@@ -102,14 +102,18 @@ def _trained(source: str, kind: str, folder: pathlib.Path) -> pathlib.Path:
     else:
         print(f"{source}: a {kind}; {_training()}")
     resume = ["--resume"] if (run / CHECKPOINTS).is_dir() else []
-    given = f"--scene={capture}", f"--output_dir={run}", f"--minutes={FLAGS.minutes:g}"
+    given = f"--scene={capture}", f"--output_dir={run}", f"--minutes={_minutes():g}"
     _start("run", *given, "--stages=detail", *resume)
     return run
 
 
+def _minutes() -> float:
+    return 10.0 if FLAGS.minutes is None else FLAGS.minutes
+
+
 def _training() -> str:
     return (
-        f"training for about {FLAGS.minutes:g} minutes, and about 3 for depth, detail, close-ups "
+        f"training for about {_minutes():g} minutes, and about 3 for depth, detail, close-ups "
         "and the page"
     )
 
@@ -147,8 +151,9 @@ def _kind(source: str) -> str:
 def _folder(source: str, kind: str) -> pathlib.Path:
     if FLAGS.output_dir is not None:
         return pathlib.Path(FLAGS.output_dir)
-    path = pathlib.Path(source)
-    return path if kind == "run" else pathlib.Path("outputs", path.resolve().name, "closeup")
+    path = pathlib.Path(source).resolve()
+    name = path.parent.name if path.name.lower() in _PLAIN else path.stem
+    return pathlib.Path(source) if kind == "run" else pathlib.Path("outputs", name, "closeup")
 
 
 def _parse_place(text: str) -> tuple[str, tuple[float, float]]:

@@ -60,6 +60,15 @@ with topic("What is trained") as _SET:
         "name=value changes a setting of the preset, as in --set label_loss_weight=0.1 or --set "
         "magnification=2:4; repeatable; --set=help lists all settings and their values",
     )
+with topic("What is trained") as TIME:
+    flags.DEFINE_float(
+        "minutes",
+        None,
+        "train stage 1 for about so many minutes on this computer: steps are timed first, and the "
+        "settings that repeat the training are printed; --resume goes on with these settings; "
+        "default: as the preset says, and 10 of closeup",
+        lower_bound=0.1,
+    )
 with topic("The capture") as _CAPTURE:
     flags.DEFINE_enum(
         "format",

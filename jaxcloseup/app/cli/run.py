@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from absl import flags
 
 from jaxcloseup.app.cli.flags import (
+    TIME,
     TRAINING,
     checked_from_flags,
     load_options_from_flags,
@@ -34,10 +35,11 @@ from jaxcloseup.io.files import read_object
 
 
 if TYPE_CHECKING:
+    from jaxcloseup.app.run.read_photographs import ReadPhotographs
     from jaxcloseup.photos.scene import Scene
 
 FLAGS = flags.FLAGS
-share(TRAINING)
+share(TRAINING, TIME)
 flags.DEFINE_string(
     "scene", "table", "a built-in scene (counter, table, room, bench, stairs, statue) or a folder"
 )
@@ -50,13 +52,6 @@ flags.DEFINE_integer(
 )
 flags.DEFINE_integer(
     "save_every", 1000, "steps between checkpoints; each stage's end is kept too", lower_bound=1
-)
-flags.DEFINE_float(
-    "minutes",
-    None,
-    "train stage 1 for about so many minutes on this computer: steps are timed first, and the "
-    "settings that repeat the training are printed; --resume goes on with these settings",
-    lower_bound=0.1,
 )
 flags.DEFINE_list("stages", list(STAGES), "stages to run; baseline always runs")
 
@@ -87,9 +82,9 @@ def main(_: list[str]) -> None:
             load_options, found = checked_from_flags(FLAGS.scene, load_options)
             with progress.saying(f"loading {FLAGS.scene}"):
                 scene = load(FLAGS.scene, load_options)
-        scene.metadata["check"] = found
+        scene.metadata["check"], read = found, None
         if FLAGS.minutes is not None:
-            preset = _resumed(output_dir) if FLAGS.resume else _fitted(preset, scene)
+            preset, read = _resumed(output_dir) if FLAGS.resume else _fitted(preset, scene)
         perceptual = find_perceptual(FLAGS.lpips_weights)
         lock = lock_output_dir(output_dir)
     expected = (TrainingError, CheckpointError, SceneError, OSError)
@@ -105,27 +100,30 @@ def main(_: list[str]) -> None:
             perceptual=perceptual,
             load_options=load_options,
             tensorboard=FLAGS.tensorboard,
+            read=read,
         )
     print_results(results)
     print(f"report: {output_dir / 'report.html'}")
 
 
-def _resumed(output_dir: pathlib.Path) -> Preset:
+def _resumed(output_dir: pathlib.Path) -> "tuple[Preset, ReadPhotographs | None]":
     """Return the preset with the settings that were found when the run began."""
     from jaxcloseup.app.store.stored_config import preset_from_config
 
-    return preset_from_config(read_object(output_dir / CHECKPOINTS / "run.json")["config"])[0]
+    identity = read_object(output_dir / CHECKPOINTS / "run.json")
+    return preset_from_config(identity["config"])[0], None
 
 
-def _fitted(preset: Preset, scene: "Scene") -> Preset:
+def _fitted(preset: Preset, scene: "Scene") -> "tuple[Preset, ReadPhotographs | None]":
+    """Return the preset that takes so many minutes, and what timing made of the photographs."""
     from jaxcloseup.app import progress
     from jaxcloseup.app.run.minutes import fit_minutes
 
     with progress.showing(), progress.saying("timing steps"):
-        preset, given = fit_minutes(preset, scene, FLAGS.minutes)
-    repeat = " ".join(f"--set={text}" for text in given)
+        fitted = fit_minutes(preset, scene, FLAGS.minutes)
+    repeat = " ".join(f"--set={text}" for text in fitted.given)
     print(f"{FLAGS.minutes:g} minutes of training, as {repeat} repeats it")
-    return preset
+    return fitted.preset, fitted.read
 
 
 @flags.multi_flags_validator(["stages"], message=f"--stages takes names of {', '.join(STAGES)}")

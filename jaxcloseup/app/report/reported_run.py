@@ -24,6 +24,7 @@ from jaxcloseup.app.run.manifest import (
 from jaxcloseup.app.run.photograph_sizes import describe_training
 from jaxcloseup.app.run.plan import in_words, plan_run
 from jaxcloseup.app.run.programs import Programs
+from jaxcloseup.app.run.read_photographs import ReadPhotographs
 from jaxcloseup.app.run.stage_names import STAGES
 from jaxcloseup.app.run.stages import Outcome, run_stages
 from jaxcloseup.app.run.timers import timed, timed_compiling
@@ -45,6 +46,7 @@ def run(
     perceptual: Perceptual = NO_PERCEPTUAL,
     load_options: Mapping[str, Any] | None = None,
     tensorboard: bool = False,
+    read: ReadPhotographs | None = None,
 ) -> dict[str, Any]:
     """Run the stages on one scene, write everything under `output_dir`, and return the results.
 
@@ -59,11 +61,12 @@ def run(
       perceptual: networks of LPIPS.
       load_options: what `load_scene` took, to load the scene again; for the manifest.
       tensorboard: whether to write event files, beside `stats/train.jsonl`.
+      read: what other programs made of the scene's photographs; default: it is made.
     """
     scene = dataclasses.replace(scene, train=jax.device_put(scene.train))
     print(describe_training(preset, scene))
     training = Training(
-        Programs(preset, scene),
+        Programs(preset, scene, read=read),
         Checkpoints(output_dir / "checkpoints", identity_of(scene, preset, names) | {"seed": seed}),
         TrainLog(output_dir, tensorboard=tensorboard),
         save_every,

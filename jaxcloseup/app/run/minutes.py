@@ -1,8 +1,9 @@
 """A preset that trains for a given time on this computer: steps are timed before the run."""
 
 import math
+import statistics
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
@@ -10,17 +11,26 @@ from jaxcloseup.app.methods.method import Preset
 from jaxcloseup.app.methods.settings import settings_of, with_settings
 from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.programs import Programs
+from jaxcloseup.app.run.read_photographs import ReadPhotographs
 from jaxcloseup.app.run.states import initial_state, refine_state
 from jaxcloseup.app.run.step_data import TrainData
 from jaxcloseup.photos.scene import Scene
 
 
 _USUAL = 5.0  # minutes for which a preset's number of surfels was chosen
-_WARMING, _TIMED = 15, 60  # steps: the first compile programs
+_WARMING, _TIMED, _TIMES = 15, 20, 3  # steps: the first compile programs; how often to time
 _FEWEST = 100  # steps
 
 
-def fit_minutes(preset: Preset, scene: Scene, minutes: float) -> tuple[Preset, list[str]]:
+class Fitted(NamedTuple):
+    """A preset that takes a given time."""
+
+    preset: Preset
+    given: list[str]  # the settings that make it
+    read: ReadPhotographs  # what timing it made of the photographs
+
+
+def fit_minutes(preset: Preset, scene: Scene, minutes: float) -> Fitted:
     """Return the preset whose stage 1 takes so many minutes here, and the settings that make it.
 
     The number of steps follows from their time on this computer, the schedules of learning rates
@@ -37,10 +47,11 @@ def fit_minutes(preset: Preset, scene: Scene, minutes: float) -> tuple[Preset, l
         times = math.sqrt(minutes / _USUAL)
         given.append(f"capacity={max(1000, 1000 * round(preset.field.capacity * times / 1000))}")
         preset = with_settings(preset, given)
-    before, step = _time_steps(preset, scene)
+    programs = Programs(preset, scene)
+    before, step = _time_steps(programs)
     steps = max(_FEWEST, 10 * round((60 * minutes - before) / step / 10))
     given += [f"baseline_steps={steps}", *_schedules(preset, steps)]
-    return with_settings(preset, given), given
+    return Fitted(with_settings(preset, given), given, programs.read)
 
 
 def _schedules(preset: Preset, steps: int) -> list[str]:
@@ -53,9 +64,9 @@ def _schedules(preset: Preset, steps: int) -> list[str]:
     ]
 
 
-def _time_steps(preset: Preset, scene: Scene) -> tuple[float, float]:
+def _time_steps(programs: Programs) -> tuple[float, float]:
     """Return the seconds before the first step of stage 1, and those of a step."""
-    programs, keys, start = Programs(preset, scene), run_keys(0), time.perf_counter()
+    preset, keys, start = programs.preset, run_keys(0), time.perf_counter()
     stereo = programs.stereo
     before = time.perf_counter() - start
     if preset.coarse is None:
@@ -71,8 +82,11 @@ def _time_steps(preset: Preset, scene: Scene) -> tuple[float, float]:
 
 
 def _steps(programs: Programs, state: Any, data: TrainData) -> tuple[Any, float]:
-    """Return the state after some steps, and the seconds of one of the later ones."""
+    """Return the state after some steps, and the median seconds of one of the later ones."""
     state, _ = programs.run(state, data, count=_WARMING)
-    start = time.perf_counter()
-    state, _ = programs.run(state, data, count=_TIMED)
-    return state, (time.perf_counter() - start) / _TIMED
+    each = []
+    for _ in range(_TIMES):
+        start = time.perf_counter()
+        state, _ = programs.run(state, data, count=_TIMED)
+        each.append((time.perf_counter() - start) / _TIMED)
+    return state, statistics.median(each)

@@ -24,13 +24,13 @@ from jaxcloseup.app.run.devices import (
     place,
 )
 from jaxcloseup.app.run.photograph_sizes import describe_photographs, finest_read
+from jaxcloseup.app.run.read_photographs import ReadPhotographs
 from jaxcloseup.app.run.step_data import ArmsData, StepData
-from jaxcloseup.app.run.stereo_depths import StereoDepths, can_match, match_photographs
+from jaxcloseup.app.run.stereo_depths import StereoDepths
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
-from jaxcloseup.io.memory import give_back_memory
-from jaxcloseup.photos.pyramids import Pyramid, photograph_pyramid, scene_pyramid
-from jaxcloseup.photos.scene import Scene, SceneError
+from jaxcloseup.photos.pyramids import Pyramid, photograph_pyramid
+from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.views import Views, unpadded
 from jaxcloseup.photos.windows import Windows, in_quarters, photograph_windows
 from jaxcloseup.training.arms import arm_specs, run_arms
@@ -52,15 +52,25 @@ class Programs:
     truncated image, and no render shows one.
     """
 
-    def __init__(self, preset: Preset, scene: Scene, *, width: int | None = None) -> None:
-        """Compile for a preset on a scene, for images as large as its photographs or `width`."""
+    def __init__(
+        self,
+        preset: Preset,
+        scene: Scene,
+        *,
+        width: int | None = None,
+        read: ReadPhotographs | None = None,
+    ) -> None:
+        """Compile for a preset on a scene, for images as large as its photographs or `width`.
+
+        `read` is what other programs of the scene made of its photographs.
+        """
         self.preset, self.scene, self.method = preset, scene, METHODS[preset.method]
         self.optimizer = self.method.make_optimizer(preset.field, scene)
         self.growth = 1
         self._growing = threading.Lock()
         self._width = width or scene.train.cameras.width
         self._larger: dict[int, Programs] = {}
-        self._pyramids: dict[int, tuple[Pyramid, int]] = {}
+        self.read = read or ReadPhotographs(scene)
         self._compile()
 
     def _compile(self) -> None:
@@ -106,26 +116,12 @@ class Programs:
 
         They are read once. `finest` is the smallest divisor of their size.
         """
-        if finest not in self._pyramids:
-            scene = self.scene
-            with progress.saying("reading photographs at their own size, or drawing them"):
-                try:
-                    read = scene_pyramid(scene, finest=finest)
-                except SceneError as error:  # such as full-size photographs that were not kept
-                    print(f"only the photographs reduced for training are read: {error}")
-                    read = scene_pyramid(dataclasses.replace(scene, photographs_at=None))
-            self._pyramids[finest] = read
-            give_back_memory()  # of the photographs
-        return self._pyramids[finest]
+        return self.read.pyramid(finest)
 
-    @functools.cached_property
+    @property
     def stereo(self) -> StereoDepths | None:
         """Return depth of the photographs by stereo; None without, or with too few to confirm."""
-        config = self.preset.stereo
-        if config is None or not config.pixels or not can_match(self.scene):
-            return None
-        finest = finest_read(self.preset, self.scene)
-        return match_photographs(self.scene, self.pyramid(finest)[0], config)
+        return self.read.stereo(self.preset)
 
     @functools.cached_property
     def coarse(self) -> "Programs":

@@ -11,8 +11,8 @@ from jaxcloseup.app.run.kept_detail import detail_getter, detail_path, detailed
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.share.closeups import CloseUp, make_closeups
 from jaxcloseup.app.share.kept import keep_closeup, kept_closeups
-from jaxcloseup.app.share.page import write_page
 from jaxcloseup.app.share.places import Place, best_places
+from jaxcloseup.app.share.scene_page import write_page
 from jaxcloseup.app.store.stored_run import StoredRun, load_run_scene, restore
 from jaxcloseup.app.view.camera_paths import (
     check_pixel,

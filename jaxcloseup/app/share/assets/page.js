@@ -1,5 +1,5 @@
 // The scene as splats, free to turn, with finished close-ups pinned to where they are: a click flies
-// there and fades to the picture. DATA is written by page.py, SPLATS is three.js and Spark.
+// there and fades to the picture. DATA is written by scene_page.py, SPLATS is three.js and Spark.
 "use strict";
 
 (async () => {

@@ -1,0 +1,48 @@
+"""What is made of a scene's photographs before any step: pyramids, and depth by stereo."""
+
+import dataclasses
+
+from jaxcloseup.app import progress
+from jaxcloseup.app.methods.method import Preset
+from jaxcloseup.app.run.photograph_sizes import finest_read
+from jaxcloseup.app.run.stereo_depths import StereoDepths, can_match, match_photographs
+from jaxcloseup.io.memory import give_back_memory
+from jaxcloseup.photos.pyramids import Pyramid, scene_pyramid
+from jaxcloseup.photos.scene import Scene, SceneError
+
+
+class ReadPhotographs:
+    """A scene's photographs as programs read them, each kind once."""
+
+    def __init__(self, scene: Scene) -> None:
+        """Read nothing yet."""
+        self._scene = scene
+        self._pyramids: dict[int, tuple[Pyramid, int]] = {}
+        self._matched: dict[int, StereoDepths] = {}
+
+    def pyramid(self, finest: int = 1) -> tuple[Pyramid, int]:
+        """Return the training photographs from the finest size that fits, and its divisor.
+
+        `finest` is the smallest divisor of their size.
+        """
+        if finest not in self._pyramids:
+            scene = self._scene
+            with progress.saying("reading photographs at their own size, or drawing them"):
+                try:
+                    read = scene_pyramid(scene, finest=finest)
+                except SceneError as error:  # such as full-size photographs that were not kept
+                    print(f"only the photographs reduced for training are read: {error}")
+                    read = scene_pyramid(dataclasses.replace(scene, photographs_at=None))
+            self._pyramids[finest] = read
+            give_back_memory()  # of the photographs
+        return self._pyramids[finest]
+
+    def stereo(self, preset: Preset) -> StereoDepths | None:
+        """Return depth of the photographs by stereo; None without, or with too few to confirm."""
+        config = preset.stereo
+        if config is None or not config.pixels or not can_match(self._scene):
+            return None
+        if config.pixels not in self._matched:
+            pyramid, _ = self.pyramid(finest_read(preset, self._scene))
+            self._matched[config.pixels] = match_photographs(self._scene, pyramid, config)
+        return self._matched[config.pixels]

@@ -1,0 +1,188 @@
+"""The program closeup: what it starts, what it writes, and its page in a browser."""
+
+import json
+import shutil
+
+import cv2
+import jax
+import numpy as np
+import plane
+import pytest
+from absl import flags
+from absl.testing import flagsaver
+from browser import open_browser, wait
+
+from jaxcloseup.app.cli import closeup as program
+
+
+@pytest.fixture
+def closeup(tmp_path, monkeypatch):
+    """Run the program on a source with flags; returns its output folder."""
+    monkeypatch.chdir(tmp_path)
+    flags.FLAGS(["closeup"])
+
+    def call(source, **given):
+        given = {"output_dir": str(tmp_path / "out")} | given
+        promotion = jax.numpy_dtype_promotion("standard")
+        with promotion, flagsaver.flagsaver(compilation_cache="", **given):
+            program.main(["closeup", str(source)])
+        return tmp_path / "out"
+
+    return call
+
+
+@pytest.fixture
+def started(monkeypatch):
+    """The programs that the command starts, which leave what they would make."""
+    commands = []
+
+    def start(name, *given):
+        commands.append([name, *given])
+
+    monkeypatch.setattr(program, "_start", start)
+    monkeypatch.setattr(program, "_present", lambda folder, run, asked: commands.append(run))
+    return commands
+
+
+def write_photographs(folder):
+    folder.mkdir()
+    for name in ("a.png", "b.png"):
+        cv2.imwrite(str(folder / name), np.zeros((4, 4, 3), np.uint8))
+    return folder
+
+
+def data_of(page):
+    """What a page says of its scene."""
+    text = (page / "data.js").read_text()
+    return json.loads(text.removeprefix("const DATA = ").removesuffix(";\n"))
+
+
+def test_photographs_get_poses_and_are_trained_on_as_far_as_that_is_not_done(
+    closeup, started, tmp_path, capsys
+):
+    photographs = write_photographs(tmp_path / "photographs")
+    out = closeup(photographs, minutes=3.0)
+    find, train, shown = started
+    assert find == ["process", f"--images={photographs}", f"--output_dir={out / 'capture'}"]
+    assert train[:3] == ["run", f"--scene={out / 'capture'}", f"--output_dir={out / 'run'}"]
+    assert "--minutes=3" in train and "--resume" not in train and shown == out / "run"
+    assert "photographs without poses" in capsys.readouterr().out
+    # Stopped while it trained, then finished.
+    (out / "run" / "checkpoints").mkdir(parents=True)
+    closeup(photographs)
+    assert started[4][-1] == "--resume"
+    (out / "run" / "results.json").write_text("{}")
+    closeup(photographs)
+    assert started[6:] == [out / "run"]
+
+
+def test_captures_and_videos_are_told_from_photographs(closeup, started, capture_folder, tmp_path):
+    closeup(capture_folder)
+    assert started[0][:2] == ["run", f"--scene={capture_folder}"]
+    video = tmp_path / "walk.mp4"
+    video.write_bytes(b"")
+    closeup(video, output_dir=None)
+    assert started[2][:2] == ["process", f"--video={video}"]
+    assert started[4] == program.pathlib.Path("outputs/walk/closeup/run")
+
+
+@pytest.mark.parametrize(
+    ("source", "given", "said"),
+    [
+        ("nothing", {}, "nothing does not exist"),
+        ("table", {"at": ["train_001"]}, "--at=train_001 must be PHOTOGRAPH:x,y"),
+    ],
+)
+def test_a_mistake_is_one_sentence_before_anything_is_written(
+    closeup, started, tmp_path, source, given, said
+):
+    with pytest.raises(SystemExit, match=said):
+        closeup(source, **given)
+    assert not started and not (tmp_path / "out").exists()
+
+
+@pytest.fixture(scope="module")
+def presented(kept, tmp_path_factory):
+    """The output of two calls for one run: a pixel of a photograph, then another."""
+    run = shutil.copytree(kept, tmp_path_factory.mktemp("run") / "kept")
+    flags.FLAGS(["closeup"])
+    with jax.numpy_dtype_promotion("standard"), pytest.MonkeyPatch.context() as patch:
+        patch.setattr("jaxcloseup.app.share.present._FRAMES", 2)
+        for at, single in (("2:16,12", False), ("0:20,10", True), ("1:18,12", False)):
+            with flagsaver.flagsaver(compilation_cache="", at=[at], near=2.0, single_file=single):
+                program.main(["closeup", str(run)])
+    return run
+
+
+def test_closeups_are_nearer_and_the_page_keeps_earlier_ones(presented, capture_folder):
+    data = data_of(presented / "share")
+    assert [one["name"] for one in data["closeups"]] == ["2_16_12", "0_20_10", "1_18_12"]
+    assert len(list(presented.glob("dolly.*"))) == 1
+    picture = cv2.imread(str(presented / "closeups" / "2_16_12.png")).astype(float)
+    photograph = cv2.imread(str(capture_folder / "train" / "2.png")).astype(float)
+    assert picture.shape == photograph.shape
+    # The middle of the close-up is the pixel of the photograph, which is half as large.
+    part = photograph[12 - 4 : 12 + 5, 16 - 6 : 16 + 7]
+    half = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    found = half[6 - 4 : 6 + 5, 8 - 6 : 8 + 7]
+    assert np.abs(found - part).mean() < 0.5 * np.abs(part - part.mean(axis=(0, 1))).mean()
+    # As three.js has it: the camera looks along -z at the point.
+    first = data["closeups"][0]
+    matrix = np.array(first["matrix"]).reshape(4, 4).T
+    ahead = np.array(first["point"]) - matrix[:3, 3]
+    np.testing.assert_allclose(ahead / np.linalg.norm(ahead), -matrix[:3, 2], atol=1e-5)
+    np.testing.assert_allclose(first["target"], first["point"], atol=1e-5)
+
+
+def test_an_empty_pixel_is_one_sentence(closeup, kept):
+    with pytest.raises(SystemExit, match=r"--pixel=500,1 is outside the view"):
+        closeup(kept, at=["2:500,1"])
+
+
+def test_a_page_of_one_file_needs_no_other(closeup, presented):
+    out = closeup(presented, at=["0:20,10"], near=2.0, single_file=True)
+    text = (out / "share" / "index.html").read_text()
+    assert "<script src" not in text and "<link" not in text and "data:image/webp" in text
+    assert sorted(path.name for path in (out / "share").iterdir()) == ["index.html", "licenses.txt"]
+
+
+def differ(image, expected):
+    return np.abs(image.astype(float) - expected).mean()
+
+
+def screenshot(driver):
+    return cv2.imdecode(np.frombuffer(driver.get_screenshot_as_png(), np.uint8), 1)
+
+
+STATE = "return document.body.dataset.state === arguments[0]"
+
+
+def test_the_page_flies_to_a_closeup_and_shows_it_without_a_network(presented):
+    with open_browser() as driver:
+        driver.execute_cdp_cmd("Network.enable", {})
+        driver.execute_cdp_cmd("Network.setBlockedURLs", {"urls": ["http*", "ws*"]})
+        driver.get((presented / "share" / "index.html").as_uri())
+        wait(driver, STATE, "free")
+        names = driver.execute_script(
+            "return performance.getEntriesByType('resource').map((entry) => entry.name)"
+        )
+        assert all(name.startswith(("file:", "data:", "blob:")) for name in names)
+        driver.find_element("css selector", "#strip button").click()
+        wait(driver, STATE, "shown")
+        picture = "const p = document.getElementById('picture'); return p.complete && "
+        wait(driver, picture + "getComputedStyle(p).opacity === '1' && p.naturalWidth")
+        shown = screenshot(driver)
+        assert driver.execute_script(picture + "p.naturalWidth") == plane.WIDTH
+        # The scene behind the picture, drawn by the browser, shows the same from the same place.
+        driver.execute_script("document.getElementById('picture').style.visibility = 'hidden'")
+        height = shown.shape[0]
+        middle = np.s_[height // 4 : height // 2, 300:600]
+        off = [differ(screenshot(driver)[middle], shown[middle])]
+        while off[-1] > 25 and len(off) < 60:
+            off.append(differ(screenshot(driver)[middle], shown[middle]))
+        assert off[-1] < 25
+        assert differ(shown[middle], shown[middle].mean(axis=(0, 1))) > 10
+        driver.find_element("id", "back").click()
+        wait(driver, STATE, "free")
+        logs = [entry["message"] for entry in driver.get_log("browser")]
+    assert not [message for message in logs if "Error" in message]
