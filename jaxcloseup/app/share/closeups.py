@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import cv2
 import jax.numpy as jnp
 import numpy as np
 
@@ -10,13 +11,17 @@ from jaxcloseup.app import progress
 from jaxcloseup.app.run.kept_detail import detailed
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.share.places import Place
-from jaxcloseup.app.view.camera_paths import CameraError
+from jaxcloseup.app.view.camera_paths import CameraError, resized
 from jaxcloseup.app.view.picking import closeup_camera
 from jaxcloseup.artifacts.images import color_errors, to_uint8
 from jaxcloseup.detail.add import Detail
 from jaxcloseup.geometry.cameras import Camera, pixels_to_points
 from jaxcloseup.labels.rules import label_depth
 from jaxcloseup.training.state import TrainState
+
+
+_SMALL = 480  # width in pixels of close-ups that are compared
+_UNKNOWN = 0.3  # error of what no photograph shows
 
 
 class CloseUp(NamedTuple):
@@ -53,20 +58,49 @@ def make_closeups(
     return list(progress.each(make, places, "close-ups"))
 
 
+def choose_places(
+    programs: Programs,
+    state: TrainState,
+    detail: Detail,
+    places: Sequence[Place],
+    *,
+    near: float,
+    count: int,
+) -> list[Place]:
+    """Return the places whose small close-ups have most contrast beside their expected error.
+
+    Arguments are as for `make_closeups`; places without a surface are left out.
+    """
+
+    def merit(place: Place) -> float:
+        photograph = programs.scene.own_camera("train", place.view)
+        photograph = resized(photograph, min(_SMALL, photograph.width), None)
+        try:
+            camera, _ = _look(programs, state, photograph, place, near)
+        except CameraError:
+            return 0.0
+        sharper = detailed(programs, detail, camera, programs.render(state, camera))
+        gray = np.asarray(sharper.rgb).mean(axis=-1)
+        fine = np.abs(gray - cv2.GaussianBlur(gray, (0, 0), 2)).mean()
+        return float(fine / np.mean(np.nan_to_num(np.asarray(sharper.error), nan=_UNKNOWN)))
+
+    merits = list(progress.each(merit, places, "places to look at"))
+    best = sorted(range(len(places)), key=lambda i: -merits[i])[:count]
+    return [places[i] for i in best if merits[i] > 0]
+
+
 def _closeup(
     programs: Programs, state: TrainState, detail: Detail, place: Place, near: float
 ) -> CloseUp:
     scene = programs.scene
     photograph, name = scene.own_camera("train", place.view), scene.names["train"][place.view]
     x, y = int(place.x * photograph.width), int(place.y * photograph.height)
-    seen = label_depth(programs.render(state, photograph), near=0, far=scene.far)
-    depth = seen[y, x]
-    if not depth > 0:
+    try:
+        camera, point = _look(programs, state, photograph, place, near)
+    except CameraError:
         raise CameraError(
             f"--at={name}:{x},{y}: there is no surface at this pixel: choose another pixel"
-        )
-    point = np.asarray(pixels_to_points(photograph, jnp.array([x + 0.5, y + 0.5]), depth))
-    camera = closeup_camera(photograph, point, near)
+        ) from None
     sharper = detailed(programs, detail, camera, programs.render(state, camera))
     error = np.asarray(sharper.error)
     shown = np.isfinite(error)
@@ -82,3 +116,20 @@ def _closeup(
         f"Expected error of colors: {off} of 1 on average; photographs show {shown.mean():.0%} of "
         "the picture",
     )
+
+
+def _look(
+    programs: Programs, state: TrainState, photograph: Camera, place: Place, near: float
+) -> tuple[Camera, np.ndarray]:
+    """Return the camera of a close-up, and the point `[3]` in its middle.
+
+    Raises:
+      CameraError: the state shows no surface there.
+    """
+    pixel = place.x * photograph.width, place.y * photograph.height
+    seen = label_depth(programs.render(state, photograph), near=0, far=programs.scene.far)
+    depth = seen[int(pixel[1]), int(pixel[0])]
+    if not depth > 0:
+        raise CameraError("no surface")
+    point = np.asarray(pixels_to_points(photograph, jnp.array(pixel, jnp.float32), depth))
+    return closeup_camera(photograph, point, near), point

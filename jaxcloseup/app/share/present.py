@@ -9,7 +9,7 @@ import numpy as np
 from jaxcloseup.app import progress
 from jaxcloseup.app.run.kept_detail import detail_getter, detail_path, detailed
 from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.share.closeups import CloseUp, make_closeups
+from jaxcloseup.app.share.closeups import CloseUp, choose_places, make_closeups
 from jaxcloseup.app.share.kept import keep_closeup, kept_closeups
 from jaxcloseup.app.share.places import Place, best_places
 from jaxcloseup.app.share.scene_page import write_page
@@ -33,6 +33,7 @@ from jaxcloseup.training.state import TrainState
 
 
 BEST = 3  # close-ups where none is asked for
+_CANDIDATES = 12
 _FRAMES, _FPS, _WIDEST = 48, 24, 960  # of the dolly
 
 
@@ -68,7 +69,8 @@ def present(
     detail, _ = detail_getter(programs, state, detail_path(record.folder, stage))()
     if not places:
         with progress.saying("choosing what to look at"):
-            places = best_places(detail, count=BEST, near=near)
+            candidates = best_places(detail, count=_CANDIDATES, near=near)
+        places = choose_places(programs, state, detail, candidates, near=near, count=BEST)
     made = make_closeups(programs, state, detail, places, near=near)
     for closeup in made:
         keep_closeup(folder / "closeups", closeup)
