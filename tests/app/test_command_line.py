@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 
+import jax
 import numpy as np
 import pytest
 from absl import flags
@@ -15,10 +16,10 @@ from absl.testing import flagsaver
 from tiny_capture import paper_capture, write_image
 from tiny_runs import TINY
 
+from jaxcloseup.app.cli import doctor, sweep, topics
 from jaxcloseup.app.cli import flags as shared
 from jaxcloseup.app.cli import main as command
 from jaxcloseup.app.cli import run as program
-from jaxcloseup.app.cli import sweep, topics
 from jaxcloseup.app.cli.output_folder import LOCK, check_unused, choose_output_dir, lock_output_dir
 from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.methods.settings import plain_config, settings_of
@@ -64,8 +65,21 @@ def test_the_command_knows_all_programs(monkeypatch, capsys):
         said = capsys.readouterr().out
         assert all(f"  {name} " in said for name in found)
     monkeypatch.setattr("sys.argv", ["jaxcloseup", "train"])
-    with pytest.raises(SystemExit, match="jaxcloseup: train is not a program: choose run, sweep"):
+    with pytest.raises(SystemExit, match="jaxcloseup: train is not a program: choose closeup, run"):
         command.main()
+
+
+def test_the_doctor_says_what_is_missing_and_what_to_do(monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["jaxcloseup", "doctor"])
+    command.main()
+    said = capsys.readouterr().out
+    assert re.search(rf"^jax +{re.escape(jax.__version__)}$", said, re.MULTILINE)
+    monkeypatch.setattr(doctor.library, "missing", lambda: "the native library was not built")
+    monkeypatch.setattr(doctor.shutil, "which", lambda name: None)
+    monkeypatch.setitem(doctor.EXTRAS, "viewer", ("no-such-package", "the viewer"))
+    said = doctor.describe()
+    assert "not built; surfels on CPUs take several times as long: install g++, then" in said
+    assert re.search(r'extra "viewer" +not installed; it would add: the viewer', said)
 
 
 @pytest.mark.parametrize("name", command.PROGRAMS)

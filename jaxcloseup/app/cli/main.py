@@ -33,6 +33,11 @@ def main() -> None:
     if name in ("-h", "--help", "help"):
         _print_usage()
         return
+    if name == "doctor":
+        from jaxcloseup.app.cli.doctor import describe
+
+        print(describe())
+        return
     if name not in PROGRAMS:
         sys.exit(f"jaxcloseup: {name} is not a program: choose {', '.join(PROGRAMS)}")
     end_at_ctrl_c(program_name(name))
@@ -46,7 +51,8 @@ def main() -> None:
 def _print_usage() -> None:
     width = max(map(len, PROGRAMS))
     usage = "usage: jaxcloseup PROGRAM [--flag=value ...]; `jaxcloseup PROGRAM --help` has flags\n"
-    programs = [f"  {program:{width}}  {what}" for program, what in PROGRAMS.items()]
+    listed = PROGRAMS | {"doctor": "print versions, devices, the native library and the extras"}
+    programs = [f"  {program:{width}}  {what}" for program, what in listed.items()]
     try:
         print("\n".join([usage, *programs]), flush=True)
     except BrokenPipeError:  # `--help | head`: Python would write the rest when it ends
