@@ -117,14 +117,24 @@ def fit_colors(
     mean = jnp.sum(share * image, axis=(0, 1), keepdims=True)
     target_mean = jnp.sum(share * target, axis=(0, 1), keepdims=True)
     # Centered colors take the offset out of the system and keep its condition number low.
-    colors, targets = (image - mean).reshape(-1, 3), (target - target_mean).reshape(-1, 3)
-    weighted = colors.T * share.reshape(1, -1)
+    colors, targets = image - mean, target - target_mean
     towards = ridge * jnp.eye(3, dtype=image.dtype)
-    inverse = jnp.linalg.pinv(matmul(weighted, colors) + towards, rtol=1e-5, hermitian=True)
-    matrix = matmul(inverse, matmul(weighted, targets) + towards)
+    own, shared = (_sum_of_products(share * colors, other) for other in (colors, targets))
+    inverse = jnp.linalg.pinv(own + towards, rtol=1e-5, hermitian=True)
+    matrix = matmul(inverse, shared + towards)
     mean, target_mean = mean[0, 0], target_mean[0, 0]
     reached = mean + (target_mean - mean) / (1 + ridge)
     return matrix, reached - matmul(mean[None], matrix)[0]
+
+
+def _sum_of_products(left: jax.Array, right: jax.Array) -> jax.Array:
+    """Return `[3, 3]` sums over the pixels of two images `[H, W, 3]` of all products of channels.
+
+    Rows are summed first. In one loop over half a million pixels, a sum of 32 bits loses what tells
+    the colors of a nearly gray image from gray, and XLA would make it one loop.
+    """
+    rows = jnp.einsum("hwi,hwj->hij", left, right, precision=jax.lax.Precision.HIGHEST)
+    return jnp.sum(jax.lax.optimization_barrier(rows), axis=0)
 
 
 def change_colors(image: jax.Array, matrix: jax.Array, offset: jax.Array) -> jax.Array:

@@ -107,6 +107,21 @@ def test_a_ridge_holds_colors_back(pair, weight, ridge):
     np.testing.assert_allclose(offset, fit[3] - mean @ fit[:3], atol=2e-4)
 
 
+def test_cc_psnr_of_a_large_image_is_that_of_64_bits():
+    """Naive sums of 32 bits over areas of one nearly gray color lose what tells it from gray."""
+    rng = np.random.default_rng(0)
+    palette = rng.uniform(0.1, 0.95, (12, 1)) + 0.01 * rng.standard_normal((12, 3))
+    chosen = np.kron(rng.integers(0, 12, (9, 16)), np.ones((60, 60), int))
+    chosen[:, :480] = 0
+    image = palette[chosen]
+    target = np.clip(image + 0.02 * rng.standard_normal(image.shape), 0, 1)
+    columns = np.column_stack([image.reshape(-1, 3), np.ones(540 * 960)])
+    change = np.linalg.lstsq(columns, target.reshape(-1, 3), rcond=None)[0]
+    error = np.clip(columns @ change, 0, 1) - target.reshape(-1, 3)
+    found = jax.jit(cc_psnr)(jnp.asarray(image, jnp.float32), jnp.asarray(target, jnp.float32))
+    assert found == pytest.approx(-10 * np.log10(np.mean(error**2)), abs=0.01)
+
+
 def test_cc_psnr_of_degenerate_colors(pair):
     gray = jnp.repeat(pair[0][..., :1], 3, axis=-1)
     assert cc_psnr(gray, 0.5 * gray) > 100  # nothing but rounding is left

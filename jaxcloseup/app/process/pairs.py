@@ -12,6 +12,7 @@ from jaxcloseup.app.process.options import MOST_EXHAUSTIVE
 
 
 _NEIGHBORS = 10  # on each side in a video
+_TOGETHER = 8  # photographs on each side of the pairs that are matched one after the other
 _SIMILAR = {"sequential": 5, "retrieval": 30}  # photographs for each
 _WORDS, _SAMPLES, _ROUNDS = 64, 50_000, 10  # of the vocabulary: words, descriptors, iterations
 
@@ -38,16 +39,18 @@ def pairs_to_match(pairing: str, descriptors: Sequence[np.ndarray]) -> list[tupl
     """
     count = len(descriptors)
     if pairing == "exhaustive" or count - 1 <= _SIMILAR[pairing]:
-        return [(i, j) for i in range(count) for j in range(i + 1, count)]
+        pairs = ((i, j) for i in range(count) for j in range(i + 1, count))
+        # Some at a time need features of few photographs, which take time to prepare.
+        return sorted(pairs, key=lambda pair: (pair[0] // _TOGETHER, pair[1] // _TOGETHER, pair))
     near = [1]
     if pairing == "sequential":
         near = [*range(1, _NEIGHBORS + 1), *(2**k for k in range(4, count.bit_length()))]
-    pairs = {(i, i + step) for step in near for i in range(count - step)}
+    chosen = {(i, i + step) for step in near for i in range(count - step)}
     likeness = similarity(descriptors)
     np.fill_diagonal(likeness, -np.inf)
     best = np.argsort(-likeness, axis=1, kind="stable")[:, : _SIMILAR[pairing]]
-    pairs |= {(min(i, j), max(i, j)) for i in range(count) for j in best[i].tolist()}
-    return sorted(pairs)
+    chosen |= {(min(i, j), max(i, j)) for i in range(count) for j in best[i].tolist()}
+    return sorted(chosen)
 
 
 def similarity(descriptors: Sequence[np.ndarray]) -> np.ndarray:

@@ -29,10 +29,11 @@ from jaxcloseup.app.process.pairs import pairs_to_match
 
 
 SEED = 0
-_LONGEST_SIDE = 2400  # pixels; features of larger photographs are found in reduced ones
+_LONGEST_SIDE = 3200  # pixels; features of larger photographs are found in reduced ones
+_LARGE = 1600  # pixels of the longer side, from which photographs are not enlarged for features
 _MOST_FEATURES = 8192  # in a photograph
 _AT_ONCE = 2  # photographs for each thread between two lines of progress
-_SECONDS = 2.0  # between two lines of progress on matches
+_SECONDS = 6.0  # between two lines of progress on matches
 _ENOUGH = 30  # photographs of a lens, for eight parameters instead of four
 _RICHER = {"SIMPLE_RADIAL": "OPENCV", "SIMPLE_RADIAL_FISHEYE": "OPENCV_FISHEYE"}
 Say = Callable[[int, int], None]  # takes the count that is done and the total
@@ -54,10 +55,6 @@ def find_features(
       The number of features of each photograph.
     """
     reader = pycolmap.ImageReaderOptions(camera_model=model)
-    options = pycolmap.FeatureExtractionOptions(
-        num_threads=_threads(), max_image_size=_LONGEST_SIDE
-    )
-    options.sift.max_num_features = _MOST_FEATURES
     names = [name for lens in lenses for name in lens]
     with _opened(database) as opened:
         listed = {image.name for image in opened.read_all_images()}
@@ -71,20 +68,38 @@ def find_features(
     with _opened(database) as opened:
         ids = {image.name: image.image_id for image in opened.read_all_images()}
         missing = [name for name in names if not opened.exists_descriptors(ids[name])]
-    say(len(names) - len(missing), len(names))
-    step = _AT_ONCE * _threads()
-    for start in range(0, len(missing), step):
-        pycolmap.extract_features(
-            database,
-            images,
-            missing[start : start + step],
-            pycolmap.CameraMode.PER_IMAGE,  # each has its camera already, shared or not
-            reader,
-            options,
-        )
-        say(len(names) - len(missing) + min(start + step, len(missing)), len(names))
+        lens_of = {image.name: image.camera_id for image in opened.read_all_images()}
+        sides = {one.camera_id: max(one.width, one.height) for one in opened.read_all_cameras()}
+    done, step = len(names) - len(missing), _AT_ONCE * _threads()
+    say(done, len(names))
+    for large in (False, True):
+        some = [name for name in missing if (sides[lens_of[name]] >= _LARGE) == large]
+        for start in range(0, len(some), step):
+            part = some[start : start + step]
+            pycolmap.extract_features(
+                database,
+                images,
+                part,
+                pycolmap.CameraMode.PER_IMAGE,  # each has its camera already, shared or not
+                reader,
+                _extraction(large),
+            )
+            done += len(part)
+            say(done, len(names))
     with _opened(database) as opened:
         return {name: opened.num_keypoints_for_image(ids[name]) for name in names}
+
+
+def _extraction(large: bool) -> pycolmap.FeatureExtractionOptions:
+    """Return how features of large photographs are found, or of small ones."""
+    options = pycolmap.FeatureExtractionOptions(
+        num_threads=_threads(), max_image_size=_LONGEST_SIDE
+    )
+    options.sift.max_num_features = _MOST_FEATURES
+    # Large photographs have thousands of features without those of single pixels, which are most of
+    # the time of finding, matching and mapping.
+    options.sift.first_octave = 0 if large else -1
+    return options
 
 
 def match(say: Say, *, database: str, pairing: str, names: Sequence[str]) -> dict[str, int]:
