@@ -39,7 +39,7 @@ ROOMS = {
     "report": {"methods", "score", "progress", "run", "store", "view", "process"},
     "view": {"methods", "score", "progress", "run", "store"},
     "process": {"progress"},
-    "share": {"progress", "run", "store", "view"},
+    "share": {"methods", "progress", "run", "store", "view"},
     "cli": {
         *("methods", "score", "progress", "run", "report", "view", "process", "share", "store"),
         "sweep",

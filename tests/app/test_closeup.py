@@ -1,5 +1,6 @@
 """The program closeup: what it starts, what it writes, and its page in a browser."""
 
+import dataclasses
 import json
 import shutil
 
@@ -13,6 +14,7 @@ from absl.testing import flagsaver
 from browser import open_browser, wait
 
 from jaxcloseup.app.cli import closeup as program
+from jaxcloseup.app.methods.registry import METHODS
 
 
 @pytest.fixture
@@ -77,8 +79,9 @@ def test_photographs_get_poses_and_are_trained_on_as_far_as_that_is_not_done(
 
 
 def test_captures_and_videos_are_told_from_photographs(closeup, started, capture_folder, tmp_path):
-    closeup(capture_folder)
+    closeup(capture_folder, fix=True, check=False)
     assert started[0][:2] == ["run", f"--scene={capture_folder}"]
+    assert started[0][-2:] == ["--nocheck", "--fix"]
     video = tmp_path / "walk.mp4"
     video.write_bytes(b"")
     closeup(video, output_dir=None)
@@ -132,6 +135,13 @@ def test_closeups_are_nearer_and_the_page_keeps_earlier_ones(presented, capture_
     ahead = np.array(first["point"]) - matrix[:3, 3]
     np.testing.assert_allclose(ahead / np.linalg.norm(ahead), -matrix[:3, 2], atol=1e-5)
     np.testing.assert_allclose(first["target"], first["point"], atol=1e-5)
+
+
+def test_a_field_without_splats_is_one_sentence(closeup, kept, monkeypatch):
+    without = dataclasses.replace(METHODS["surfels"], splats=None)
+    monkeypatch.setitem(METHODS, "surfels", without)
+    with pytest.raises(SystemExit, match="--method=surfels, which has no splats for a page: make"):
+        closeup(kept)
 
 
 def test_an_empty_pixel_is_one_sentence(closeup, kept):

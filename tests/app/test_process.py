@@ -272,7 +272,10 @@ def test_pairs():
     assert len(pairs) < 160 * 32
     pairs = set(pairs_to_match("sequential", descriptors))
     assert {(i, i + step) for step in (*range(1, 11), 16, 32, 64) for i in range(96)} <= pairs
-    assert len(pairs_to_match("exhaustive", descriptors)) == 160 * 159 // 2
+    pairs = pairs_to_match("exhaustive", descriptors)
+    assert len(pairs) == len(set(pairs)) == 160 * 159 // 2 and all(i < j for i, j in pairs)
+    # Pairs that follow each other are of few photographs.
+    assert max(len(set(sum(pairs[at : at + 64], ()))) for at in range(0, len(pairs), 64)) <= 32
     assert choose_pairing("auto", 100, video=False) == "exhaustive"
     assert choose_pairing("auto", 101, video=False) == "retrieval"
     assert choose_pairing("auto", 10, video=True) == "sequential"

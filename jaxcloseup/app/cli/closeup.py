@@ -17,7 +17,7 @@ import time
 
 from absl import flags
 
-from jaxcloseup.app.cli.flags import OUTPUT, TIME
+from jaxcloseup.app.cli.flags import CHECK, OUTPUT, TIME
 from jaxcloseup.app.cli.interrupt import when_stopped
 from jaxcloseup.app.cli.invocation import program_command, program_name
 from jaxcloseup.app.cli.output_folder import CHECKPOINTS, lock_output_dir, remove_unfinished
@@ -28,7 +28,7 @@ from jaxcloseup.app.cli.topics import share
 FLAGS = flags.FLAGS
 _PLAIN = "images", "photographs", "photos", "pictures"  # names of folders that say nothing
 OPERANDS = 1  # what to look at
-share(TIME, OUTPUT)
+share(TIME, CHECK, OUTPUT)
 flags.DEFINE_multi_string(
     "at",
     [],
@@ -103,7 +103,9 @@ def _trained(source: str, kind: str, folder: pathlib.Path) -> pathlib.Path:
         print(f"{source}: a {kind}; {_training()}")
     resume = ["--resume"] if (run / CHECKPOINTS).is_dir() else []
     given = f"--scene={capture}", f"--output_dir={run}", f"--minutes={_minutes():g}"
-    _start("run", *given, "--stages=detail", *resume)
+    changed = [FLAGS[name] for name in CHECK if FLAGS[name].value != FLAGS[name].default]
+    checking = [f"--{'' if flag.value else 'no'}{flag.name}" for flag in changed]
+    _start("run", *given, "--stages=detail", *checking, *resume)
     return run
 
 

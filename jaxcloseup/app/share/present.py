@@ -7,13 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcloseup.app import progress
+from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.run.kept_detail import detail_getter, detail_path, detailed
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.share.closeups import CloseUp, choose_places, make_closeups
 from jaxcloseup.app.share.kept import keep_closeup, kept_closeups
 from jaxcloseup.app.share.places import Place, best_places
 from jaxcloseup.app.share.scene_page import write_page
-from jaxcloseup.app.store.stored_run import StoredRun, load_run_scene, restore
+from jaxcloseup.app.store.stored_run import RunError, StoredRun, load_run_scene, restore
 from jaxcloseup.app.view.camera_paths import (
     check_pixel,
     dolly,
@@ -60,9 +61,15 @@ def present(
       The pictures of the new close-ups, the dolly if it is new, and the page.
 
     Raises:
+      RunError: the field has no splats.
       CameraError: a photograph or a pixel does not exist, or shows no surface.
       ValueError: an earlier close-up is damaged.
     """
+    if METHODS[record.preset.method].splats is None:
+        raise RunError(
+            f"{record.folder} was trained with --method={record.preset.method}, which has no splats "
+            "for a page: make its close-ups with the program render"
+        )
     scene = load_run_scene(record)
     places = [_place(scene, *one) for one in asked]
     programs, state = restore(record, scene, stage)
