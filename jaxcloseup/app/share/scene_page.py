@@ -7,6 +7,7 @@ scene and all that is said of it are a script too.
 import base64
 import json
 import pathlib
+import urllib.parse
 from collections.abc import Sequence
 from typing import Any
 
@@ -117,7 +118,7 @@ def _picture(folder: pathlib.Path, name: str, image: np.ndarray, single_file: bo
         return uri
     file = f"{name}.webp"
     write_file(folder / "closeups" / file, base64.b64decode(uri.split(",", 1)[1]))
-    return f"closeups/{file}"
+    return f"closeups/{urllib.parse.quote(file)}"  # photographs may be named "a#1"
 
 
 def _camera(camera: Camera, ahead: float) -> dict[str, Any]:
