@@ -3,11 +3,12 @@
 from typing import NamedTuple
 
 import cv2
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxcloseup.detail.add import Detail
-from jaxcloseup.geometry.cameras import pixels_to_points
+from jaxcloseup.geometry.cameras import pixels_to_points, points_to_pixels
 from jaxcloseup.photos.views import camera_at
 
 
@@ -32,9 +33,10 @@ class _Found(NamedTuple):
 
 
 def best_places(detail: Detail, *, count: int, near: float) -> list[Place]:
-    """Return where the photographs show most contrast in fine structures, and depth is trusted.
+    """Return where many photographs look and show contrast in fine structures.
 
-    Each place is that of a window which a close-up shows whole, and no two are near each other.
+    Each place is that of a window that a close-up shows whole, and in which depth is trusted. No
+    two are near each other.
 
     Args:
       detail: of a trained state.
@@ -47,6 +49,10 @@ def best_places(detail: Detail, *, count: int, near: float) -> list[Place]:
         here, depth = _windows_of(detail, view, near)
         found += here
         depths.append(depth)
+    if not found:
+        return []
+    share = _looked_at(detail, np.stack([one.point for one in found]))
+    found = [one._replace(score=one.score * part) for one, part in zip(found, share, strict=True)]
     apart = _APART * float(np.nanmedian(depths))
     chosen: list[_Found] = []
     for one in sorted(found, key=lambda one: -one.score):
@@ -58,6 +64,15 @@ def best_places(detail: Detail, *, count: int, near: float) -> list[Place]:
         ):
             chosen.append(one)
     return [one.place for one in chosen]
+
+
+def _looked_at(detail: Detail, points: np.ndarray) -> np.ndarray:
+    """Return the share `[N]` of the photographs that have points `[N, 3]` in their middle half."""
+    cameras = detail.sources.cameras
+    pixels, depth = jax.vmap(points_to_pixels, in_axes=(0, None))(cameras, jnp.asarray(points))
+    size = np.array([cameras.width, cameras.height])
+    inside = np.all(np.abs(np.asarray(pixels) / size - 0.5) < 0.25, axis=-1)
+    return np.mean(inside & (np.asarray(depth) > 0), axis=0)
 
 
 def _windows_of(detail: Detail, view: int, near: float) -> tuple[list[_Found], float]:

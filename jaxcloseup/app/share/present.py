@@ -67,8 +67,8 @@ def present(
     """
     if METHODS[record.preset.method].splats is None:
         raise RunError(
-            f"{record.folder} was trained with --method={record.preset.method}, which has no splats "
-            "for a page: make its close-ups with the program render"
+            f"{record.folder} was trained with --method={record.preset.method}, which has no "
+            "splats for a page: make its close-ups with the program render"
         )
     scene = load_run_scene(record)
     places = [_place(scene, *one) for one in asked]
