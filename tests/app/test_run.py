@@ -55,7 +55,7 @@ def run_tiny(capture_folder, output_dir):
     # Libraries under a run (optax's schedules) mix integers and floats.
     with jax.numpy_dtype_promotion("standard"), pytest.MonkeyPatch.context() as patch:
         programs = programs_of(TINY, capture_folder)  # compiled once for all
-        patch.setattr(reported_run, "Programs", lambda preset, scene: programs)
+        patch.setattr(reported_run, "Programs", lambda preset, scene, read: programs)
         names = {"method": "nerf", "preset": "tiny"}
         scene = load_scene(str(capture_folder))
         return run(scene, TINY, 0, output_dir, names=names, save_every=3)
