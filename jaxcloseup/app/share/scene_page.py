@@ -16,6 +16,7 @@ import jinja2
 import numpy as np
 
 from jaxcloseup.app.share.closeups import CloseUp
+from jaxcloseup.app.view.camera_paths import OPENGL
 from jaxcloseup.app.view.picking import vertical_fov
 from jaxcloseup.artifacts.images import color_errors, webp_data_uri
 from jaxcloseup.geometry.cameras import Camera
@@ -25,7 +26,6 @@ from jaxcloseup.io.files import write_file
 _ASSETS = pathlib.Path(__file__).parent / "assets"
 _QUALITY = 92  # of WebP
 _THUMBNAIL = 152  # height in pixels, for screens with two pixels to a unit of length
-_FLIP = np.diag([1.0, -1, -1])  # between y down, z ahead and y up, z back
 
 
 def write_page(
@@ -57,7 +57,7 @@ def write_page(
     data = {
         "title": title,
         "said": "Drag to turn, scroll to come nearer; a number leads to a close-up.",
-        "up": (_FLIP @ up).tolist(),
+        "up": (OPENGL @ up).tolist(),
         "overview": _camera(overview, distance) | {"distance": distance},
         "closeups": [_describe(folder, one, single_file) for one in closeups],
         "legend": webp_data_uri(color_errors(np.zeros((1, 1)))[1], quality=100),
@@ -101,7 +101,7 @@ def _describe(folder: pathlib.Path, closeup: CloseUp, single_file: bool) -> dict
         "name": closeup.name,
         "said": closeup.said,
         "said_of_error": closeup.said_of_error,
-        "point": (_FLIP @ closeup.point).tolist(),
+        "point": (OPENGL @ closeup.point).tolist(),
         "thumbnail": webp_data_uri(small),
         **_camera(closeup.camera, ahead),
         **{
@@ -125,10 +125,10 @@ def _camera(camera: Camera, ahead: float) -> dict[str, Any]:
     """Return a camera as three.js has it, and the point `ahead` of it that it turns around."""
     rotation, position = (np.asarray(a, np.float64) for a in (camera.rotation, camera.position))
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = _FLIP @ rotation @ _FLIP, _FLIP @ position
+    matrix[:3, :3], matrix[:3, 3] = OPENGL @ rotation @ OPENGL, OPENGL @ position
     return {
         "matrix": matrix.T.ravel().tolist(),
         "fov": float(np.degrees(vertical_fov(camera))),
         "aspect": camera.width / camera.height,
-        "target": (_FLIP @ (position + ahead * rotation[:, 2])).tolist(),
+        "target": (OPENGL @ (position + ahead * rotation[:, 2])).tolist(),
     }
