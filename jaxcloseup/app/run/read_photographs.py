@@ -3,7 +3,7 @@
 import dataclasses
 
 from jaxcloseup.app import progress
-from jaxcloseup.app.methods.method import Preset
+from jaxcloseup.app.methods.method import Preset, StereoTraining
 from jaxcloseup.app.run.photograph_sizes import finest_read
 from jaxcloseup.app.run.stereo_depths import StereoDepths, can_match, match_photographs
 from jaxcloseup.io.memory import give_back_memory
@@ -18,7 +18,7 @@ class ReadPhotographs:
         """Read nothing yet."""
         self._scene = scene
         self._pyramids: dict[int, tuple[Pyramid, int]] = {}
-        self._matched: dict[int, StereoDepths] = {}
+        self._matched: dict[int, StereoDepths | None] = {}
 
     def pyramid(self, finest: int = 1) -> tuple[Pyramid, int]:
         """Return the training photographs from the finest size that fits, and its divisor.
@@ -40,9 +40,14 @@ class ReadPhotographs:
     def stereo(self, preset: Preset) -> StereoDepths | None:
         """Return depth of the photographs by stereo; None without, or with too few to confirm."""
         config = preset.stereo
-        if config is None or not config.pixels or not can_match(self._scene):
+        if config is None or not config.pixels:
             return None
         if config.pixels not in self._matched:
-            pyramid, _ = self.pyramid(finest_read(preset, self._scene))
-            self._matched[config.pixels] = match_photographs(self._scene, pyramid, config)
+            self._matched[config.pixels] = self._match(preset, config)
         return self._matched[config.pixels]
+
+    def _match(self, preset: Preset, config: StereoTraining) -> StereoDepths | None:
+        if not can_match(self._scene):
+            return None
+        pyramid, _ = self.pyramid(finest_read(preset, self._scene))
+        return match_photographs(self._scene, pyramid, config)
