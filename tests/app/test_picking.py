@@ -9,10 +9,12 @@ from jaxcloseup.app.view.picking import (
     closeup_camera,
     rank_views,
     ray_camera,
+    surface_depth,
     vertical_fov,
     viewer_camera,
 )
-from jaxcloseup.geometry.cameras import points_to_pixels
+from jaxcloseup.fields.contract import Rendering
+from jaxcloseup.geometry.cameras import pixels_to_points, points_to_pixels
 
 
 @pytest.mark.parametrize("direction", [(0, 0, -2), (1, 0.5, -1), (0, 1, 0)])
@@ -23,6 +25,21 @@ def test_a_point_on_the_ray_is_at_the_center_pixel_at_its_distance(direction):
     pixel, depth = points_to_pixels(camera, jnp.asarray(point, jnp.float32))
     np.testing.assert_allclose([*pixel, depth], [1.5, 1.5, 7], atol=1e-4)
     assert (camera.height, camera.width) == (3, 3)
+
+
+@pytest.mark.parametrize("pixel", [(0.0, 0.0), (13.7, 20.2), (31.9, 23.9)])
+def test_the_depth_of_one_pixel_is_that_of_the_surface_there(pixel):
+    def render(camera):
+        rgb, depth, _ = plane.surface(camera)
+        return Rendering(rgb, depth, jnp.ones_like(depth))
+
+    camera = plane.camera_above(0.0, 0.0, 4.0, tilt=0.2)
+    center = jnp.floor(jnp.array(pixel)) + 0.5
+    depth = surface_depth(render, camera, pixel)
+    np.testing.assert_allclose(
+        pixels_to_points(camera, center, jnp.float32(depth))[2], 0, atol=1e-4
+    )
+    assert surface_depth(render, camera, pixel, far=0.9 * depth) == 0
 
 
 @pytest.mark.parametrize("magnification", [1.0, 4.0])

@@ -1,5 +1,6 @@
 """Close-ups at pixels of photographs: cameras, pictures, and what can be said of them."""
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -12,11 +13,10 @@ from jaxcloseup.app.run.kept_detail import detailed
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.share.places import Place
 from jaxcloseup.app.view.camera_paths import CameraError, resized
-from jaxcloseup.app.view.picking import closeup_camera
+from jaxcloseup.app.view.picking import closeup_camera, surface_depth
 from jaxcloseup.artifacts.images import color_errors, to_uint8
 from jaxcloseup.detail.add import Detail
 from jaxcloseup.geometry.cameras import Camera, pixels_to_points
-from jaxcloseup.labels.rules import label_depth
 from jaxcloseup.training.state import TrainState
 
 
@@ -55,7 +55,9 @@ def make_closeups(
     def make(place: Place) -> CloseUp:
         return _closeup(programs, state, detail, place, near)
 
-    return list(progress.each(make, places, "close-ups"))
+    cameras = [programs.scene.own_camera("train", place.view) for place in places]
+    pixels = max((camera.height * camera.width for camera in cameras), default=1)
+    return list(progress.each(make, places, "close-ups", pixels=pixels))
 
 
 def choose_places(
@@ -127,9 +129,10 @@ def _look(
       CameraError: the state shows no surface there.
     """
     pixel = place.x * photograph.width, place.y * photograph.height
-    seen = label_depth(programs.render(state, photograph), near=0, far=programs.scene.far)
-    depth = seen[int(pixel[1]), int(pixel[0])]
+    render = functools.partial(programs.render, state)
+    depth = surface_depth(render, photograph, pixel, far=programs.scene.far)
     if not depth > 0:
         raise CameraError("no surface")
-    point = np.asarray(pixels_to_points(photograph, jnp.array(pixel, jnp.float32), depth))
+    at = jnp.array(pixel, jnp.float32)
+    point = np.asarray(pixels_to_points(photograph, at, jnp.float32(depth)))
     return closeup_camera(photograph, point, near), point

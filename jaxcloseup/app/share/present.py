@@ -35,7 +35,7 @@ from jaxcloseup.training.state import TrainState
 
 BEST = 3  # close-ups where none is asked for
 _CANDIDATES = 12
-_FRAMES, _FPS, _WIDEST = 48, 24, 960  # of the dolly
+_FRAMES, _FPS, _LONGEST = 48, 24, 960  # of the dolly, and its longer side in pixels
 
 
 def present(
@@ -136,8 +136,7 @@ def _dolly(
         magnification=near,
         frames=_FRAMES,
     )
-    if end.width > _WIDEST:
-        shots = resized_shots(shots, _WIDEST, None)
+    shots = resized_shots(shots, None, None, min(1.0, _LONGEST / max(end.height, end.width)))
 
     def frame(camera: Camera) -> np.ndarray:
         seen = programs.render(state, camera)

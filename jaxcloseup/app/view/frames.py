@@ -55,8 +55,11 @@ def render_shots(
     scene = programs.scene
     cameras = named_cameras(shots)
     # Three frames set the depth colors of all frames, so that videos do not flicker.
-    some = [programs.render(state, cameras[i][1]) for i in {0, len(cameras) // 2, len(cameras) - 1}]
-    limits = depth_range([label_depth(one, near=0, far=scene.far) for one in some], scene)
+    some = {0, len(cameras) // 2, len(cameras) - 1}
+    depths = [
+        label_depth(programs.render(state, cameras[i][1]), near=0, far=scene.far) for i in some
+    ]
+    limits = depth_range(depths, scene)
     sizes = shots.sizes or [(shots.cameras.width, shots.cameras.height)] * len(cameras)
     images: dict[str, Image] = {}
     empty = 0
@@ -74,7 +77,9 @@ def render_shots(
         return name, images, not solid.any()
 
     frames = list(zip(cameras, sizes, strict=True))
-    for name, images, shows_nothing in progress.each(draw, frames, "rendering frames"):
+    largest = max(width * height for width, height in sizes)
+    drawn = progress.each(draw, frames, "rendering frames", pixels=largest)
+    for name, images, shows_nothing in drawn:
         empty += shows_nothing
         for kind, image in images.items():
             write_png(output_dir / kind / f"{name}.png", image)

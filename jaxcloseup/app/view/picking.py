@@ -1,15 +1,45 @@
-"""Choose a close-up camera for a point that a visitor clicks on."""
+"""Find the surface at a pixel, and choose a close-up camera for it."""
+
+import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxcloseup.app.view.camera_paths import look_at
-from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.fields.contract import Rendering
+from jaxcloseup.geometry.cameras import Camera, crop_camera
 from jaxcloseup.geometry.numerics import safe_divide, safe_norm
 from jaxcloseup.geometry.poses import closeup_position
 from jaxcloseup.geometry.visibility import sample_where_visible
+from jaxcloseup.labels.rules import label_depth
 from jaxcloseup.photos.views import Views
+
+
+_AROUND = 16  # pixels of an image's part that is rendered for the depth of one of them
+
+
+def surface_depth(
+    render: Callable[[Camera], Rendering],
+    camera: Camera,
+    pixel: tuple[float, float],
+    *,
+    far: float = math.inf,
+) -> float:
+    """Return the z-depth of the surface at a pixel, in world units; 0 where there is none.
+
+    A few pixels around it are rendered, not the whole image.
+
+    Args:
+      render: renders a whole image of a field.
+      camera: one camera.
+      pixel: (x, y) in its image.
+      far: largest z-depth of a surface, world units.
+    """
+    corner = np.floor(np.asarray(pixel)) - _AROUND // 2
+    part = crop_camera(camera, jnp.asarray(corner), height=_AROUND, width=_AROUND)
+    return float(label_depth(render(part), near=0, far=far)[_AROUND // 2, _AROUND // 2])
 
 
 def ray_camera(origin: np.ndarray, direction: np.ndarray, focal: float) -> Camera:

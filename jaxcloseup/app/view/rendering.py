@@ -1,5 +1,6 @@
 """Frames and videos of a stored run, in folders."""
 
+import functools
 import pathlib
 from collections.abc import Callable, Iterator
 
@@ -16,8 +17,8 @@ from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.store.stored_run import StoredRun, restore
 from jaxcloseup.app.view.camera_paths import CameraError, Shots, check_pixel, dolly, find_view
 from jaxcloseup.app.view.frames import render_shots
+from jaxcloseup.app.view.picking import surface_depth
 from jaxcloseup.artifacts.video import write_video
-from jaxcloseup.labels.rules import label_depth
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.training.steps import TrainState
 
@@ -46,13 +47,13 @@ def dolly_towards(
         state shows no surface at the pixel.
     """
     camera = scene.own_camera("train", find_view(scene, view))
-    row, column = check_pixel(camera, pixel)
+    check_pixel(camera, pixel)
     # Refuses what is too large.
     resize(Shots(jax.tree.map(lambda leaf: leaf[None], camera), [view]))
 
     def make(programs: Programs, state: TrainState) -> Shots:
-        seen = label_depth(programs.render(state, camera), near=0, far=scene.far)
-        depth = float(seen[row, column])
+        render = functools.partial(programs.render, state)
+        depth = surface_depth(render, camera, pixel, far=scene.far)
         if depth <= 0:
             x, y = pixel
             raise CameraError(
