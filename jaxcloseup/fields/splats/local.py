@@ -21,7 +21,8 @@ from jaxcloseup.geometry.cameras import Camera
 
 _LARGEST, _SMALLEST = 128, 32  # surfels of a chunk
 _STEP = 2  # parts are compiled for this many times more chunks, and for all
-_FEWEST = 16  # chunks of the smallest part
+_FEWEST = 64  # chunks of the smallest part; smaller ones would save less than they compile
+_SAMPLED = 4096  # surfels, about, of which quantiles are taken: more would only take longer
 # Pixels by which an image grows on each side: filters draw a splat farther out than it reaches.
 _MARGIN = 4.0
 _CUTOFF = 3.34  # standard deviations at which the most opaque splat falls to `ALPHA_MIN`
@@ -217,10 +218,11 @@ def _morton_order(surfels: Surfels, alive: jax.Array) -> jax.Array:
     Large surfels lie apart from small ones: one of them would make its chunk visible from anywhere.
     """
     largest = jnp.max(surfels.log_scales, axis=-1)
-    typical = jnp.nanmedian(jnp.where(alive, largest, jnp.nan))
+    some = slice(None, None, max(1, len(largest) // _SAMPLED))
+    typical = jnp.nanmedian(jnp.where(alive, largest, jnp.nan)[some])
     size = jnp.clip(jnp.floor((largest - typical) / jnp.log(4.0)), 0, 3)
     # Most surfels, without the few that are far out.
-    living = jnp.where(alive[:, None], surfels.means, jnp.nan)
+    living = jnp.where(alive[:, None], surfels.means, jnp.nan)[some]
     low, high = jnp.nanquantile(living, jnp.array([0.02, 0.98]), axis=0)
     # Cells are cubes: a thin layer is not cut across its thickness.
     share = (surfels.means - low[None]) / jnp.maximum(jnp.max(high - low), 1e-12)

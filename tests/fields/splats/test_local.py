@@ -20,7 +20,7 @@ from jaxcloseup.training.steps import train_step
 
 
 CONFIG = SurfelConfig(
-    capacity=8192,
+    capacity=2**14,
     sh_degree=1,
     sh_every=1,
     regularize_from=0,
