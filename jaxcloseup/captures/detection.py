@@ -60,8 +60,8 @@ def _no_capture(path: pathlib.Path, format: str | None) -> SceneError:
         target = shlex.quote(f"{path.resolve().name}_capture")
         return SceneError(
             f"{path} holds no capture but photographs: find their poses with jaxcloseup "
-            f"process --images={shlex.quote(str(pictures))} --output_dir={target}, or "
-            f"{files}"
+            f"process --images={shlex.quote(str(pictures))} --output_dir={target}, let jaxcloseup "
+            f"closeup {shlex.quote(str(pictures))} do all up to a page of close-ups, or {files}"
         )
     return SceneError(f"{path} holds no capture{kind}: {files}")
 

@@ -63,7 +63,7 @@ def test_photographs_get_poses_and_are_trained_on_as_far_as_that_is_not_done(
     closeup, started, tmp_path, capsys
 ):
     photographs = write_photographs(tmp_path / "photographs")
-    out = closeup(photographs, minutes=3.0)
+    out = closeup(photographs, minutes=3.0, at=["best"])
     find, train, shown = started
     assert find == ["process", f"--images={photographs}", f"--output_dir={out / 'capture'}"]
     assert train[:3] == ["run", f"--scene={out / 'capture'}", f"--output_dir={out / 'run'}"]

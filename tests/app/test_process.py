@@ -33,7 +33,12 @@ from posing import (
 from wrong_input import HEIC, put
 
 from jaxcloseup.app.process import solver_process
-from jaxcloseup.app.process.pairs import choose_pairing, pairs_to_match, similarity
+from jaxcloseup.app.process.pairs import (
+    choose_pairing,
+    expected_seconds,
+    pairs_to_match,
+    similarity,
+)
 from jaxcloseup.app.process.photo_folder import copy_photographs, list_files
 from jaxcloseup.app.process.video_frames import choose_frames
 from jaxcloseup.artifacts import video as video_writer
@@ -276,6 +281,9 @@ def test_pairs():
     assert len(pairs) == len(set(pairs)) == 160 * 159 // 2 and all(i < j for i, j in pairs)
     # Pairs that follow each other are of few photographs.
     assert max(len(set(sum(pairs[at : at + 64], ()))) for at in range(0, len(pairs), 64)) <= 32
+    # What was measured on two cores.
+    assert expected_seconds([(800, 600)] * 97, "exhaustive", 2) == pytest.approx(86, rel=0.2)
+    assert expected_seconds([(3024, 4032)] * 45, "exhaustive", 2) == pytest.approx(374, rel=0.2)
     assert choose_pairing("auto", 100, video=False) == "exhaustive"
     assert choose_pairing("auto", 101, video=False) == "retrieval"
     assert choose_pairing("auto", 10, video=True) == "sequential"

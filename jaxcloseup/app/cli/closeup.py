@@ -32,8 +32,8 @@ share(TIME, CHECK, OUTPUT)
 flags.DEFINE_multi_string(
     "at",
     [],
-    "PHOTOGRAPH:x,y, a pixel at the photograph's own size to look at; repeatable; default: the "
-    "three places where photographs show most",
+    "PHOTOGRAPH:x,y, a pixel at the photograph's own size to look at; repeatable; or best: the "
+    "three places where photographs show most, which is the default",
 )
 flags.DEFINE_float(
     "near", 4.0, "how many times nearer than the photograph", lower_bound=1, upper_bound=1000
@@ -48,7 +48,7 @@ def main(arguments: list[str]) -> None:
     if len(arguments) != 2:
         sys.exit(f"{name}: name photographs, a video, a capture or a run, as in {name} photographs")
     with in_one_sentence("closeup", ValueError, OSError):
-        asked = [_parse_place(text) for text in FLAGS.at]
+        asked = [] if FLAGS.at == ["best"] else [_parse_place(text) for text in FLAGS.at]
         source, kind = arguments[1], _kind(arguments[1])
         folder = _folder(source, kind)
     when_stopped(lambda: _say_stopped(folder))
@@ -161,7 +161,9 @@ def _folder(source: str, kind: str) -> pathlib.Path:
 def _parse_place(text: str) -> tuple[str, tuple[float, float]]:
     found = re.fullmatch(r"(.+):(\d+(?:\.\d+)?),(\d+(?:\.\d+)?)", text)
     if found is None:
-        raise ValueError(f"--at={text} must be PHOTOGRAPH:x,y, as in --at=IMG_0003:2000,1300")
+        raise ValueError(
+            f"--at={text} must be PHOTOGRAPH:x,y, as in --at=IMG_0003:2000,1300, or best, alone"
+        )
     return found[1], (float(found[2]), float(found[3]))
 
 

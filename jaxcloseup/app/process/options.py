@@ -6,3 +6,4 @@ PAIRINGS = ("exhaustive", "sequential", "retrieval")
 MOST_EXHAUSTIVE = 100  # photographs; with more, `auto` matches similar ones only
 FEWEST = 3  # photographs that a model needs
 COUNT = 100  # frames of a video
+LONGEST_SIDE = 3200  # pixels; features of larger photographs are found in reduced ones

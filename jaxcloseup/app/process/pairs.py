@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxcloseup.app.process.options import MOST_EXHAUSTIVE
+from jaxcloseup.app.process.options import LONGEST_SIDE, MOST_EXHAUSTIVE
 
 
 _NEIGHBORS = 10  # on each side in a video
@@ -24,6 +24,26 @@ def choose_pairing(pairing: str, count: int, *, video: bool) -> str:
     if video:
         return "sequential"
     return "exhaustive" if count <= MOST_EXHAUSTIVE else "retrieval"
+
+
+def expected_seconds(sizes: Sequence[tuple[int, int]], pairing: str, cores: int) -> float:
+    """Return about how long features, matches and poses take together.
+
+    Measured on two cores: 97 photographs of 800 x 600, 86 s; 45 of 4032 x 3024, 374 s.
+
+    Args:
+      sizes: width and height of each photograph in pixels.
+      pairing: one of `choices.PAIRINGS`.
+      cores: of the computer.
+    """
+    shrink = (min(1.0, LONGEST_SIDE / max(size)) for size in sizes)
+    pixels = [part**2 * size[0] * size[1] for part, size in zip(shrink, sizes, strict=True)]
+    partners = len(sizes) - 1
+    if pairing != "exhaustive":
+        partners = min(partners, 2 * _SIMILAR["retrieval"])
+    alone = 0.1 * len(sizes) + 0.63e-6 * sum(pixels)
+    together = 2.04e-8 * sum(pixels) * partners / 2
+    return 2 / cores * (alone + together)
 
 
 def pairs_to_match(pairing: str, descriptors: Sequence[np.ndarray]) -> list[tuple[int, int]]:

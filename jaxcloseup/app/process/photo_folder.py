@@ -45,6 +45,12 @@ class Copied(NamedTuple):
     # identifies the lens: folder, size in pixels and, if EXIF has them, camera and focal length
     lens: list[Any]
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Return width and height in pixels, the only integers that identify the lens."""
+        width, height = (value for value in self.lens if isinstance(value, int))
+        return width, height
+
 
 def list_files(folder: pathlib.Path) -> tuple[list[pathlib.Path], dict[str, str]]:
     """List the photographs of a folder and its subfolders, and why other files are left out.

@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import importlib.metadata
+import os
 import pathlib
 import shutil
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ from jaxcloseup.app.process.capture_stages import Stages
 from jaxcloseup.app.process.capture_summary import other_models, why_left_out
 from jaxcloseup.app.process.from_above import draw_cameras
 from jaxcloseup.app.process.options import LENSES
-from jaxcloseup.app.process.pairs import choose_pairing
+from jaxcloseup.app.process.pairs import choose_pairing, expected_seconds
 from jaxcloseup.app.process.photo_folder import Copied, copy_photographs, list_files
 from jaxcloseup.app.process.solver_process import ProcessingError, run_job
 from jaxcloseup.app.process.video_frames import extract_frames
@@ -85,13 +86,15 @@ def make_capture(request: Request, folder: pathlib.Path, stages: Stages) -> dict
     if request.video is not None:
         print(f"took {len(names)} of the video's {gathered['frames']} frames")
 
+    pairing = choose_pairing(request.pairs, len(names), video=request.video is not None)
+
     def find_features() -> dict[str, int]:
+        _say_time(copied, pairing)
         lenses, model = _by_lens(copied), LENSES[request.lens]
         given = {"database": database, "images": images, "lenses": lenses, "model": model}
         return run_job("features", "finding features", "photographs", log, **given)
 
     features = stages.run("features", _DATABASE, find_features)
-    pairing = choose_pairing(request.pairs, len(names), video=request.video is not None)
 
     def match() -> dict[str, int]:
         given = {"database": database, "pairing": pairing, "names": names}
@@ -125,6 +128,12 @@ def make_capture(request: Request, folder: pathlib.Path, stages: Stages) -> dict
     stages.keep("summary", summary)
     _draw_from_above(folder)
     return summary
+
+
+def _say_time(copied: Sequence[Copied], pairing: str) -> None:
+    cores = os.cpu_count() or 1
+    seconds = expected_seconds([each.size for each in copied], pairing, cores)
+    print(f"finding poses takes about {max(1, round(seconds / 60))} minutes with {cores} cores")
 
 
 def _draw_from_above(folder: pathlib.Path) -> None:

@@ -24,12 +24,11 @@ from typing import Any
 
 import pycolmap
 
-from jaxcloseup.app.process.options import FEWEST
+from jaxcloseup.app.process.options import FEWEST, LONGEST_SIDE
 from jaxcloseup.app.process.pairs import pairs_to_match
 
 
 SEED = 0
-_LONGEST_SIDE = 3200  # pixels; features of larger photographs are found in reduced ones
 _LARGE = 1600  # pixels of the longer side, from which photographs are not enlarged for features
 _MOST_FEATURES = 8192  # in a photograph
 _AT_ONCE = 2  # photographs for each thread between two lines of progress
@@ -92,9 +91,7 @@ def find_features(
 
 def _extraction(large: bool) -> pycolmap.FeatureExtractionOptions:
     """Return how features of large photographs are found, or of small ones."""
-    options = pycolmap.FeatureExtractionOptions(
-        num_threads=_threads(), max_image_size=_LONGEST_SIDE
-    )
+    options = pycolmap.FeatureExtractionOptions(num_threads=_threads(), max_image_size=LONGEST_SIDE)
     options.sift.max_num_features = _MOST_FEATURES
     # Large photographs have thousands of features without those of single pixels, which are most of
     # the time of finding, matching and mapping.
