@@ -77,7 +77,7 @@ def make_capture(request: Request, folder: pathlib.Path, stages: Stages) -> dict
       OSError: a file cannot be written.
     """
     (folder / _WORK).mkdir(exist_ok=True)
-    images, database = str(folder / IMAGES), str(folder / _DATABASE)
+    at = {"images": str(folder / IMAGES), "database": str(folder / _DATABASE)}
     log = folder / _WORK / "log.txt"
 
     gathered = stages.run("photographs", IMAGES, lambda: _gather(request, folder / IMAGES))
@@ -90,14 +90,13 @@ def make_capture(request: Request, folder: pathlib.Path, stages: Stages) -> dict
 
     def find_features() -> dict[str, int]:
         _say_time(copied, pairing)
-        lenses, model = _by_lens(copied), LENSES[request.lens]
-        given = {"database": database, "images": images, "lenses": lenses, "model": model}
+        given = {"lenses": _by_lens(copied), "model": LENSES[request.lens]} | at
         return run_job("features", "finding features", "photographs", log, **given)
 
     features = stages.run("features", _DATABASE, find_features)
 
     def match() -> dict[str, int]:
-        given = {"database": database, "pairing": pairing, "names": names}
+        given = {"database": at["database"], "pairing": pairing, "names": names}
         return run_job("matches", f"matching ({pairing})", "pairs", log, **given)
 
     partners = stages.run("matches", _DATABASE, match)
@@ -105,8 +104,7 @@ def make_capture(request: Request, folder: pathlib.Path, stages: Stages) -> dict
     def solve() -> list[dict[str, Any]]:
         shutil.rmtree(part := folder / _WORK / "model", ignore_errors=True)
         part.mkdir()
-        given = {"database": database, "images": images, "folder": str(part)}
-        models = run_job("mapping", "finding poses", "photographs", log, **given)
+        models = run_job("mapping", "finding poses", "photographs", log, folder=str(part), **at)
         if models:
             shutil.rmtree(model := folder / MODEL, ignore_errors=True)
             model.parent.mkdir(exist_ok=True)
@@ -116,14 +114,14 @@ def make_capture(request: Request, folder: pathlib.Path, stages: Stages) -> dict
     models = stages.run("mapping", MODEL, solve)
     if not models:
         raise ProcessingError(_why_no_model(features, partners))
-    source = {each.name: each.source for each in copied}
     reasons = why_left_out(names, features, partners, models)
+    left_out = {each.source: reasons[each.name] for each in copied if each.name in reasons}
     summary = {
         "photographs": len(names),
         "registered": len(models[0]["photographs"]),
         **{key: value for key, value in models[0].items() if key != "photographs"},
         "other_models": other_models(models),
-        "left_out": {source[name]: why for name, why in reasons.items()} | gathered["left_out"],
+        "left_out": left_out | gathered["left_out"],
     }
     stages.keep("summary", summary)
     _draw_from_above(folder)
