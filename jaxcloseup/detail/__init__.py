@@ -17,6 +17,7 @@ __all__, __getattr__, __dir__ = lazy_names(
         "learn": "Evidence learn_weights make_evidence sample_evidence",
         "residuals": "Residuals make_detail render_residuals reproduced",
         "features": "blur_images pixel_features",
+        "smoothing": "smooth_depth",
         "holes": "find_empty fill_holes",
     },
 )

@@ -17,10 +17,11 @@ from flax import struct
 
 from jaxcloseup.detail.features import pixel_features
 from jaxcloseup.detail.holes import OPAQUE, fill_holes, find_empty
+from jaxcloseup.detail.smoothing import smooth_depth
 from jaxcloseup.detail.strips import predict_by_strips
 from jaxcloseup.detail.weights import DetailWeights, mix
 from jaxcloseup.fields.contract import Rendering
-from jaxcloseup.geometry.cameras import Camera, pixel_grid
+from jaxcloseup.geometry.cameras import Camera, mean_focal, pixel_grid
 from jaxcloseup.geometry.numerics import safe_divide
 from jaxcloseup.labels.rules import label_depth
 from jaxcloseup.photos.depth_maps import GatherSources
@@ -44,12 +45,14 @@ class Detail(struct.PyTreeNode):
       weights: networks that predict how far to trust what is gathered.
       finer: `[]` log2 of how much finer the finest level is than the photographs that the model
         learned from.
+      grain: `[]` typical radius of the model's splats, world units; 0 of a model without.
     """
 
     shown: Pyramid
     sources: GatherSources
     weights: DetailWeights
     finer: jax.Array
+    grain: jax.Array
 
 
 class Detailed(NamedTuple):
@@ -107,6 +110,7 @@ def add_detail(
       alpha: `[H, W]` rendered opacity.
       depth: `[H, W]` rendered z-depth; 0 is undefined and gets no detail.
     """
+    depth = _smooth(detail.grain, camera, depth)
     gathered = gather_parts(camera, pixels, depth, detail.sources, detail.shown, SETTINGS)
     sharper = _add(detail.weights, detail.finer, gathered, rgb, alpha, depth)
     seen = gathered[0].weight > 0
@@ -159,6 +163,15 @@ def label_with_detail(
     views = list(each(label, range(cameras.intrinsics.shape[0])))
     rgb, weight = ([getattr(view, name) for view in views] for name in ("rgb", "weight"))
     return Views(cameras, jnp.stack(rgb), jnp.stack(weight))
+
+
+@jax.jit
+def _smooth(grain: jax.Array, camera: Camera, depth: jax.Array) -> jax.Array:
+    """Smooth the depth `[H, W]` of a view over as many pixels as a splat covers in it."""
+    some = depth[:: max(1, depth.shape[0] // 64), :: max(1, depth.shape[1] // 64)]
+    typical = jnp.nanmedian(jnp.where(some > 0, some, jnp.nan))
+    radius = jnp.nan_to_num(grain * mean_focal(camera.intrinsics) / typical)
+    return smooth_depth(depth, radius)
 
 
 @jax.jit

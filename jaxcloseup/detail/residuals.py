@@ -51,6 +51,7 @@ def make_detail(
     *,
     near: float = 0.0,
     far: float = np.inf,
+    grain: float = 0.0,
 ) -> Detail:
     """Return the detail of photographs beyond a model that renders every level of a pyramid.
 
@@ -61,11 +62,12 @@ def make_detail(
       weights: such as `known_weights()`.
       near: smallest z-depth of a surface, world units.
       far: largest one.
+      grain: typical radius of the model's splats, world units; 0 of a model without.
     """
     found = render_residuals(render, views.cameras, pyramid, near=near, far=far)
     sources = trusted_depths(found, views.weight * reproduced(found.shown))
     finer = jnp.float32(np.log2(pyramid.sizes[0][1] / views.cameras.width))
-    return Detail(found.shown, sources, weights, finer)
+    return Detail(found.shown, sources, weights, finer, jnp.float32(grain))
 
 
 def trusted_depths(found: Residuals, trust: jax.Array) -> GatherSources:

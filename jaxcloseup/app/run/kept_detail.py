@@ -34,7 +34,7 @@ from jaxcloseup.photos.views import Views
 from jaxcloseup.training.state import TrainState
 
 
-_RECIPE = 12  # a change of how detail is made raises it, so that kept detail is made again
+_RECIPE = 13  # a change of how detail is made raises it, so that kept detail is made again
 
 
 def detailed(programs: Programs, detail: Detail, camera: Camera, rendering: Rendering) -> Detailed:
@@ -99,13 +99,23 @@ def make_detail(programs: Programs, state: TrainState) -> tuple[Detail, dict[str
     print(f"   detail of {describe_photographs(pyramid, divisor)}", flush=True)
     found = render_residuals(programs, state, pyramid)
     finer = jnp.float32(np.log2(pyramid.sizes[0][1] / scene.train.cameras.width))
-    detail = Detail(found.shown, _sources(scene.train, found), _weights(scene), finer)
+    sources, weights = _sources(scene.train, found), _weights(scene)
+    detail = Detail(found.shown, sources, weights, finer, _grain(programs, state))
     return detail, {"divisor": divisor, "sizes": list(map(list, pyramid.sizes))}
 
 
 def _weights(scene: Scene) -> DetailWeights:
     # A built-in scene is judged without its own held-out views.
     return known_weights(scene.name if scene.surface else None)
+
+
+def _grain(programs: Programs, state: TrainState) -> jax.Array:
+    """Return the median radius of the splats, `[]`; 0 of a field without."""
+    if programs.method.splats is None:
+        return jnp.float32(0)
+    splats, alive = programs.method.splats(state.params, state.buffers)
+    radius = jnp.exp(jnp.max(splats.log_scales, axis=-1))
+    return jnp.nan_to_num(jnp.nanmedian(jnp.where(alive, radius, jnp.nan)))
 
 
 def _sources(views: Views, found: Residuals) -> GatherSources:
@@ -143,6 +153,7 @@ def _pack(made: tuple[Detail, dict[str, Any]]) -> Stored:
         "inverse_depth": detail.sources.inverse_depth,
         "trust": detail.sources.trust,
         "finer": detail.finer,
+        "grain": detail.grain,
     }
     return Stored({name: np.asarray(array) for name, array in arrays.items()}, about)
 
@@ -157,7 +168,7 @@ def _unpack(scene: Scene, stored: Stored) -> tuple[Detail, dict[str, Any]]:
     shown = Pyramid(arrays["values"], arrays["intrinsics"], arrays["extents"])
     cameras = shown.cameras(cameras, level)
     sources = join_maps(cameras, arrays["inverse_depth"], arrays["trust"])
-    return Detail(shown, sources, _weights(scene), arrays["finer"]), about
+    return Detail(shown, sources, _weights(scene), arrays["finer"], arrays["grain"]), about
 
 
 def _check(stored: Stored, sizes: tuple[tuple[int, int], ...], cameras: Camera) -> None:
@@ -171,6 +182,7 @@ def _check(stored: Stored, sizes: tuple[tuple[int, int], ...], cameras: Camera) 
         "inverse_depth": (depths, np.dtype(np.float32)),
         "trust": (depths, np.dtype(np.float32)),
         "finer": ((), np.dtype(np.float32)),
+        "grain": ((), np.dtype(np.float32)),
     }
     if {name: (array.shape, array.dtype) for name, array in stored.arrays.items()} != expected:
         raise ValueError("other arrays")
