@@ -11,7 +11,7 @@ import socket
 import subprocess
 import sys
 
-import constant_color
+import color_sweep
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,11 +19,10 @@ import pytest
 from absl import flags
 from absl.testing import flagsaver
 from conftest import QUICKLY
-from tiny_runs import TINY, TINY_MIP, TINY_SURFELS, programs_of
+from tiny_runs import TINY, TINY_SURFELS, programs_of
 from tiny_training import assert_same_step
 
 from jaxcloseup.app.cli import sweep
-from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.report.pictures import comparisons
 from jaxcloseup.app.report.sweep_tables import paired_bootstrap, rows, write_sweep
 from jaxcloseup.app.run.keys import run_keys
@@ -63,14 +62,7 @@ TINY_SMOOTH = dataclasses.replace(
 )
 
 
-TINY_SMOOTH_MIP = dataclasses.replace(
-    TINY_MIP, field=dataclasses.replace(TINY_MIP.field, ssim_weight=0.0)
-)
-
-
-@pytest.mark.parametrize(
-    "preset", [TINY_STEPS, TINY_SMOOTH, TINY_SMOOTH_MIP], ids=lambda p: p.method
-)
+@pytest.mark.parametrize("preset", [TINY_STEPS, TINY_SMOOTH], ids=lambda p: p.method)
 def test_an_arm_is_the_run_alone(preset, capture_folder):
     with jax.numpy_dtype_promotion("standard"):
         programs, start, arms = begin(preset, capture_folder)
@@ -261,50 +253,17 @@ def test_an_arm_may_have_labels_from_the_other_depth(capture_folder, tmp_path):
     assert as_ever != expected
 
 
-HOSTS = """
-jax.distributed.initialize("127.0.0.1:" + sys.argv[2], 2, int(sys.argv[3]))
-assert len(jax.devices()) == 2 * len(jax.local_devices())
-folder = pathlib.Path(sys.argv[1])
-scene = test_sweep.load_scene(str(folder / "capture"))
-found = test_sweep.sweep_colors(scene, folder / "sweep")
-(folder / ("host" + sys.argv[3] + ".json")).write_text(json.dumps(found))
-"""
-
-
-def sweep_colors(scene, folder):
-    """Scores of two arms of a method that compiles in seconds."""
-    METHODS["constant_color"] = constant_color.METHOD
-    names = {"method": "constant_color", "preset": "quick"}
-    arms = "control", "diverse"
-    try:
-        with jax.numpy_dtype_promotion("standard"):
-            preset = constant_color.METHOD.presets["quick"]
-            return run_sweep(scene, preset, arms, 1, folder, names=names, max_parallel=3).scores
-    finally:
-        del METHODS["constant_color"]
-
-
-def start(script, *arguments):
+def start_host(*arguments):
     """A Python of its own, on one device, that has what is compiled already."""
-    own, tests = pathlib.Path(__file__).parent, pathlib.Path(__file__).parents[1]
+    tests = pathlib.Path(__file__).parents[1]
     environment = os.environ | {
         "JAX_PLATFORMS": "cpu",
         "XLA_FLAGS": f"{QUICKLY} --xla_force_host_platform_device_count=1",
-        "PYTHONPATH": os.pathsep.join(map(str, (tests.parent, tests, own))),
+        "PYTHONPATH": os.pathsep.join(map(str, (tests.parent, tests))),
         "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir,
     }
-    imports = "import json, pathlib, sys, jax, test_sweep; from tiny_runs import write_plane"
-    return subprocess.Popen(
-        [sys.executable, "-c", f"{imports}\n{script}", *map(str, arguments)],
-        env=environment,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-def finish(process):
-    _, error = process.communicate(timeout=600)
-    assert process.returncode == 0, error[-2000:]
+    command = [sys.executable, color_sweep.__file__, *map(str, arguments)]
+    return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
 
 
 def test_arms_are_spread_over_hosts(capture_folder, tmp_path):
@@ -314,9 +273,10 @@ def test_arms_are_spread_over_hosts(capture_folder, tmp_path):
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     scene = load_scene(str(capture_folder))
-    whole = sweep_colors(scene, tmp_path / "alone")
-    for process in [start(HOSTS, tmp_path, port, i) for i in range(2)]:
-        finish(process)
+    whole = color_sweep.sweep_colors(scene, tmp_path / "alone")
+    for process in [start_host(tmp_path, port, i) for i in range(2)]:
+        _, error = process.communicate(timeout=600)
+        assert process.returncode == 0, error[-2000:]
     hosts = [json.loads((tmp_path / f"host{i}.json").read_text()) for i in range(2)]
     assert hosts[0] == hosts[1]
     for arm, by_seed in whole.items():

@@ -53,8 +53,7 @@ def bind(step, way, **config):
     return compiled(functools.partial(step, **bound, spread=spread))
 
 
-@pytest.mark.parametrize("way", WAYS)
-@pytest.mark.parametrize("count", [64, None])
+@pytest.mark.parametrize(("count", "way"), [*((64, way) for way in WAYS), (None, "devices")])
 def test_a_step_moves_by_the_mean_gradient_of_its_draws(capture, count, way):
     views, _ = capture
     state = fresh_state()
