@@ -2,6 +2,7 @@
 
 import json
 
+import cv2
 import jax
 import numpy as np
 import PIL.Image
@@ -97,3 +98,12 @@ def save(path, rgb, *, turned=False):
     exif[0x0112] = 6 if turned else 1  # to be shown turned by 90 degrees clockwise
     exif.get_ifd(0x8769)[0xA405] = FOCAL_IN_EXIF
     image.save(path, quality=97, subsampling=0, exif=exif)
+
+
+def write_noise(folder, count):
+    """Small photographs without anything in common."""
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    for i in range(count):
+        picture = rng.integers(0, 255, (60, 80, 3)).astype(np.uint8)
+        cv2.imwrite(str(folder / f"{i}.png"), picture)

@@ -3,7 +3,6 @@
 import json
 import os
 import pathlib
-import re
 import shlex
 import signal
 import subprocess
@@ -14,7 +13,6 @@ import cv2
 import numpy as np
 import PIL.Image
 import pytest
-from absl import flags
 from posing import (
     FOCAL,
     FOCAL_IN_EXIF,
@@ -29,21 +27,11 @@ from posing import (
     save,
     summary_of,
     walk_around,
+    write_noise,
 )
-from wrong_input import HEIC, put
 
-from jaxcloseup.app.process import solver_process
-from jaxcloseup.app.process.pairs import (
-    choose_pairing,
-    expected_seconds,
-    pairs_to_match,
-    similarity,
-)
-from jaxcloseup.app.process.photo_folder import copy_photographs, list_files
-from jaxcloseup.app.process.video_frames import choose_frames
 from jaxcloseup.artifacts import video as video_writer
 from jaxcloseup.artifacts.video import write_video
-from jaxcloseup.captures.load import SceneError, load_scene
 
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -208,160 +196,6 @@ def test_the_same_command_continues_and_gives_the_same(walk, tmp_path):
         run_process(images=str(source), output_dir=str(whole), lens="fisheye")
 
 
-# Parts.
-
-
-def test_photographs_in_subfolders(tmp_path, capsys):
-    """Of two cameras, with equal names, beside what is no photograph of the scene."""
-    write_noise(tmp_path / "in", 2)
-    for i, name in enumerate(["left cam", "right", "masks", "images_2", ".hidden", "made"]):
-        write_noise(tmp_path / "in" / name, 2 + i)
-    (tmp_path / "in/made/process.json").write_text("{}")
-    names = ["0.png", "1.png", "left cam/0.png", "left cam/1.png"]
-    names += [f"right/{i}.png" for i in range(3)]
-    found, left_out = list_files(tmp_path / "in")
-    assert [path.as_posix() for path in found] == names and not left_out
-    for i, name in enumerate(names):  # none is a copy of another
-        image = np.random.default_rng(i).integers(0, 255, (60, 80, 3))
-        cv2.imwrite(str(tmp_path / "in" / name), image)
-    with pytest.raises(SystemExit, match="no two photographs show the same"):
-        run_process(images=str(tmp_path / "in"), output_dir=str(tmp_path / "out"))
-    assert "lie in 3 folders, each with a lens of its own" in capsys.readouterr().out
-    database = pycolmap.Database.open(str(tmp_path / "out/colmap/database.db"))
-    lenses = {image.name: image.camera_id for image in database.read_all_images()}
-    database.close()
-    assert set(lenses) == {name.replace(" ", "_") for name in names}
-    groups = {(pathlib.PurePath(name).parent, lens) for name, lens in lenses.items()}
-    assert len(groups) == len(set(lenses.values())) == 3
-
-
-def test_frames_are_sharp_and_evenly_spread():
-    """Equal steps along the path, not in time, and the sharpest near each."""
-    rng = np.random.default_rng(0)
-    sharpness = rng.uniform(size=400)
-    motion = np.where(np.arange(400) < 200, 1e-6, rng.uniform(0.01, 0.02, 400))  # first at rest
-    motion[0] = 0
-    chosen = choose_frames(sharpness, motion, 10)
-    assert len(chosen) == 10 and sum(i < 200 for i in chosen) <= 1
-    path, part = np.cumsum(motion), motion.sum() / 10
-    places = path[chosen] / part - np.arange(10)
-    assert (places > 0.25).all() and (places < 0.75).all()
-    for i, frame in enumerate(chosen[1:], 1):
-        near = np.flatnonzero(np.abs(path / part - i - 0.5) <= 0.25)
-        assert sharpness[frame] == sharpness[near].max()
-    assert choose_frames(sharpness, motion, 400) == list(range(400))
-
-
-def test_pairs():
-    rng = np.random.default_rng(0)
-    places = rng.integers(0, 255, (4, 60, 128))
-    # Photographs of four places in turn: descriptors of one place differ by noise.
-    descriptors = [
-        np.clip(places[i % 4] + rng.integers(-20, 20, (60, 128)), 0, 255).astype(np.uint8)
-        for i in range(160)
-    ]
-    descriptors[7] = np.zeros((0, 128), np.uint8)
-    likeness = similarity(descriptors)
-    kind = np.arange(160) % 4
-    same = (kind[:, None] == kind) & ~np.eye(160, dtype=bool)
-    seen = np.arange(160) != 7
-    assert (
-        likeness[same & seen & seen[:, None]].min()
-        > likeness[~same & (kind[:, None] != kind)].max()
-    )
-    pairs = pairs_to_match("retrieval", descriptors)
-    assert pairs == sorted(set(pairs)) and all(i < j for i, j in pairs)
-    assert {(i, i + 1) for i in range(159)} <= set(pairs)
-    others = [(i, j) for i, j in pairs if j != i + 1 and 7 not in (i, j)]
-    assert all(kind[i] == kind[j] for i, j in others)
-    assert len(pairs) < 160 * 32
-    pairs = set(pairs_to_match("sequential", descriptors))
-    assert {(i, i + step) for step in (*range(1, 11), 16, 32, 64) for i in range(96)} <= pairs
-    pairs = pairs_to_match("exhaustive", descriptors)
-    assert len(pairs) == len(set(pairs)) == 160 * 159 // 2 and all(i < j for i, j in pairs)
-    # Pairs that follow each other are of few photographs.
-    assert max(len(set(sum(pairs[at : at + 64], ()))) for at in range(0, len(pairs), 64)) <= 32
-    # What was measured on two cores.
-    assert expected_seconds([(800, 600)] * 97, "exhaustive", 2) == pytest.approx(86, rel=0.2)
-    assert expected_seconds([(3024, 4032)] * 45, "exhaustive", 2) == pytest.approx(374, rel=0.2)
-    assert choose_pairing("auto", 100, video=False) == "exhaustive"
-    assert choose_pairing("auto", 101, video=False) == "retrieval"
-    assert choose_pairing("auto", 10, video=True) == "sequential"
-    assert choose_pairing("exhaustive", 900, video=True) == "exhaustive"
-
-
-# Bad input.
-
-
-def write_noise(folder, count):
-    """Small photographs without anything in common."""
-    folder.mkdir()
-    rng = np.random.default_rng(0)
-    for i in range(count):
-        picture = rng.integers(0, 255, (60, 80, 3)).astype(np.uint8)
-        cv2.imwrite(str(folder / f"{i}.png"), picture)
-
-
-def test_flags_that_make_no_sense_are_one_sentence(tmp_path):
-    write_noise(tmp_path / "few", 2)
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "texts").mkdir()
-    for i in range(3):
-        (tmp_path / "texts" / f"{i}.txt").write_text("")
-        (tmp_path / "few" / f"{i}.heic").write_text("")
-        put(f"heic/{i}.HEIC", HEIC)(tmp_path)
-    (tmp_path / "video.mp4").write_bytes(b"no video" * 1000)
-    os.mkfifo(tmp_path / "pipe")
-    video, images, out = str(tmp_path / "video.mp4"), str(tmp_path / "few"), str(tmp_path / "out")
-    for given, message in (
-        ({}, "give either --images=FOLDER or --video=FILE"),
-        ({"images": images, "video": video}, "give either"),
-        ({"images": images}, "--output_dir is missing"),
-        ({"images": images, "count": 5, "output_dir": out}, "--count is for --video"),
-        ({"images": f"{images}/0.png", "output_dir": out}, "is not a folder: name a folder"),
-        ({"images": f"{images}/none", "output_dir": out}, "is not a folder"),
-        ({"images": images, "output_dir": out}, "holds 2 photographs .* beside 3 files"),
-        ({"images": str(tmp_path / "empty"), "output_dir": out}, "holds 0 photographs"),
-        ({"images": str(tmp_path / "texts"), "output_dir": out}, "holds 0 photographs .* 3 files"),
-        (
-            {"images": str(tmp_path / "heic"), "output_dir": out},
-            "holds 0 photographs .* and 0.HEIC is a HEIC photograph, which is not read: export it",
-        ),
-        ({"video": images, "output_dir": out}, "cannot be read .Is a directory.: name a video"),
-        ({"video": str(tmp_path / "pipe"), "output_dir": out}, "cannot be read .Not an ordinary"),
-        ({"video": f"{video}4", "output_dir": out}, "cannot be read .No such file"),
-    ):
-        with pytest.raises(SystemExit, match=message) as error:
-            run_process(**given)
-        assert "\n" not in error.value.code and error.value.code.startswith("jaxcloseup process: ")
-        assert not (tmp_path / "out").exists()
-    renamed = [pathlib.Path(f"heic/{i}.HEIC") for i in range(3)]
-    with pytest.raises(
-        solver_process.ProcessingError, match=r"only 0 .*0\.HEIC is a HEIC photograph, which"
-    ):
-        copy_photographs(renamed, tmp_path, tmp_path / "out")
-    with pytest.raises(flags.IllegalFlagValueError, match="count"):
-        run_process(video=video, count=2)
-    write_noise(tmp_path / "noise", 3)
-    with pytest.raises(SystemExit, match="already exists and is not empty"):
-        run_process(images=str(tmp_path / "noise"), output_dir=images)
-    assert len(list((tmp_path / "few").iterdir())) == 5
-
-
-def test_a_video_that_is_none_or_shows_no_motion_is_one_sentence(tmp_path):
-    (tmp_path / "video.mp4").write_bytes(b"no video" * 1000)
-    still = np.random.default_rng(0).integers(0, 255, (64, 96, 3)).astype(np.uint8)
-    for path, message in (
-        (tmp_path / "video.mp4", "is not a video that can be read"),
-        (write_video(tmp_path / "still", [still] * 12, fps=12), "hardly moves"),
-        (write_video(tmp_path / "short", [still] * 2, fps=12), "has 2 readable frames"),
-    ):
-        with pytest.raises(SystemExit, match=message) as error:
-            run_process(video=str(path), output_dir=str(tmp_path / "out"))  # the same again
-        assert "\n" not in error.value.code
-        assert not (tmp_path / "out" / "images").exists()
-
-
 def test_photographs_without_a_model_are_one_sentence(walk, tmp_path):
     """Of nothing in common; all the same file; all from one place."""
     write_noise(tmp_path / "noise", 4)
@@ -379,37 +213,3 @@ def test_photographs_without_a_model_are_one_sentence(walk, tmp_path):
         run_process(images=str(tmp_path / "same"), output_dir=str(tmp_path / "out2"))
     with pytest.raises(SystemExit, match="3 of 3 photographs overlap, but no poses fit them"):
         run_process(images=str(tmp_path / "place"), output_dir=str(tmp_path / "out3"))
-
-
-def test_pycolmap_is_not_installed(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pycolmap", None)
-    write_noise(tmp_path / "noise", 3)
-    with pytest.raises(SystemExit, match=r"needs pycolmap: .* 'jaxcloseup\[colmap\]'"):
-        run_process(images=str(tmp_path / "noise"), output_dir=str(tmp_path / "out"))
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_solver_that_dies_is_one_sentence(tmp_path, monkeypatch):
-    monkeypatch.setattr(solver_process.sys, "executable", "false")
-    message = r"pycolmap ended with code 1 in finding: .*log"
-    given = {"names": ["a"] * 9999}
-    with pytest.raises(solver_process.ProcessingError, match=message):
-        solver_process.run_job("features", "finding", "photographs", tmp_path / "log", **given)
-
-
-def test_a_run_on_photographs_names_the_command(tmp_path):
-    folder = tmp_path / "my photos"
-    write_noise(folder, 3)
-    command = f"jaxcloseup process --images='{folder}' --output_dir='my photos_capture'"
-    with pytest.raises(SceneError, match=re.escape(command)) as error:
-        load_scene(folder)
-    assert "\n" not in str(error.value) and "poses" in str(error.value)
-    (tmp_path / "two").mkdir()
-    folder.rename(tmp_path / "two" / "images")
-    with pytest.raises(
-        SceneError, match=r"process --images=\S*two/images --output_dir=two_capture"
-    ):
-        load_scene(tmp_path / "two")
-    (tmp_path / "none").mkdir()
-    with pytest.raises(SceneError, match=r"none holds no capture: add transforms_train\.json"):
-        load_scene(tmp_path / "none")
