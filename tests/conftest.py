@@ -43,7 +43,8 @@ def pytest_collection_modifyitems(items):
     """Begin with the files that take longest, so that no process waits for one at the end."""
     first = ["test_sweep", "test_run", "test_render", "test_drawn_scenes", "test_rasterize"]
     first += ["test_volume_methods", "test_process", "test_detail", "test_gpu_bench", "test_view"]
-    first += ["test_surfel_field", "test_process_real", "test_sanitizers"]
+    first += ["test_surfel_field", "test_process_real", "test_sanitizers", "test_interrupt"]
+    first += ["test_closeup", "test_parallel", "test_run_arms", "test_steps", "test_examples"]
     ranks = {name: rank for rank, name in enumerate(first)}
     items.sort(key=lambda item: ranks.get(item.path.stem, len(first)))
 

@@ -9,11 +9,11 @@ from posing import errors, poses_by_name, run_process
 
 pycolmap = pytest.importorskip("pycolmap")
 
-EVERY = 3  # of 97 photographs, which walk around a toy
+EVERY = 4  # of 97 photographs, which walk around a toy
 
 
 def test_poses_of_real_photographs_are_those_of_their_model(shared, tmp_path):
-    """A third of the photographs: positions to 1 % of the extent, most rotations to half a degree.
+    """Every fourth photograph: positions to 1 % of the extent, most rotations to half a degree.
 
     Both models have errors; of all photographs they agree to 0.5 degrees everywhere.
     """
@@ -29,7 +29,7 @@ def test_poses_of_real_photographs_are_those_of_their_model(shared, tmp_path):
         pathlib.Path(image.name).stem: image.cam_from_world().inverse().matrix()
         for image in model.images.values()
     }
-    assert len(found) > 30
+    assert len(found) > 22
     away, turned = errors(np.stack(list(found.values())), np.stack([known[n] for n in found]))
     assert away.max() < 0.01
     assert np.median(turned) < 0.5 and np.quantile(turned, 0.9) < 1
