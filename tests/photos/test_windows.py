@@ -231,7 +231,7 @@ def test_a_window_learns_as_that_part_of_a_whole_image():
     shifted = whole.intrinsics - jnp.array([0.0, 0.0, column, row])
     window = whole.replace(intrinsics=shifted, height=height, width=width)
     target = jax.random.uniform(jax.random.key(1), (height, width, 3))
-    config = dataclasses.replace(CONFIG, antialias=True)
+    config = dataclasses.replace(CONFIG, antialias=True, compositor="auto")
 
     @functools.partial(jax.jit, static_argnums=(2, 3))
     @functools.partial(jax.value_and_grad, has_aux=True)

@@ -339,7 +339,7 @@ def test_a_field_with_more_capacity_renders_what_overflowed(trained, capture):
     image = render_with(capacity)
     assert image.overflow > 0
     while int(image.overflow) > 0:
-        capacity *= 4
+        capacity *= 16
         image = render_with(capacity)
     assert 300 < capacity < CONFIG.raster.capacity
     jax.tree.map(np.testing.assert_array_equal, image, render_with(CONFIG.raster.capacity))
