@@ -19,9 +19,9 @@ from jaxcloseup.app.view.camera_paths import (
     check_pixel,
     dolly,
     find_view,
-    focus_point,
     named_cameras,
     resized_shots,
+    training_focus,
 )
 from jaxcloseup.app.view.orientation import up_direction
 from jaxcloseup.artifacts.images import to_uint8
@@ -103,10 +103,7 @@ def _write_page(
     scene = programs.scene
     assert programs.method.splats is not None
     splats, _ = pack_spz(*programs.method.splats(state.params, state.buffers))
-    cameras = scene.train.cameras
-    positions, rotations = (np.asarray(a) for a in (cameras.position, cameras.rotation))
-    center = focus_point(positions, rotations[..., 2], near=scene.near, far=scene.far)
-    distances = np.linalg.norm(positions - center, axis=1)
+    distances = np.linalg.norm(training_focus(scene)[1], axis=1)
     farthest = int(distances.argmax())
     return write_page(
         folder / "share",

@@ -72,17 +72,14 @@ def orbit(scene: Scene, frames: int, *, up: Sequence[float] | None = None) -> Sh
       frames: number of cameras.
       up: `[3]` up direction in the world; default: `up_direction` of the scene.
     """
-    cameras = scene.train.cameras
-    positions, rotations = (np.asarray(a, np.float64) for a in (cameras.position, cameras.rotation))
-    forward = rotations[..., 2]
-    center = focus_point(positions, forward, near=scene.near, far=scene.far)
+    center, offset = training_focus(scene)
     axis = up_direction(scene) if up is None else _unit(np.asarray(up, np.float64))
-    offset = positions - center
     height = np.median(offset @ axis)
     flat = offset - (offset @ axis)[:, None] * axis
     radius = np.median(np.linalg.norm(flat, axis=1))
     # Two axes perpendicular to `axis`; the first frame is as near as possible to the first view.
-    start = flat[0] if np.linalg.norm(flat[0]) > 1e-6 else np.cross(axis, forward[0])
+    ahead = np.asarray(scene.train.cameras.rotation, np.float64)[0, :, 2]
+    start = flat[0] if np.linalg.norm(flat[0]) > 1e-6 else np.cross(axis, ahead)
     east = _unit(start)
     north = np.cross(axis, east)
     poses = []
@@ -92,6 +89,14 @@ def orbit(scene: Scene, frames: int, *, up: Sequence[float] | None = None) -> Sh
     first = scene.own_camera("train", 0)
     intrinsics = np.tile(np.asarray(first.intrinsics), (frames, 1))
     return numbered_shots(poses, intrinsics, first.height, first.width)
+
+
+def training_focus(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Return the training cameras' focus point `[3]`, and positions `[V, 3]` relative to it."""
+    cameras = scene.train.cameras
+    positions, rotations = (np.asarray(a, np.float64) for a in (cameras.position, cameras.rotation))
+    center = focus_point(positions, rotations[..., 2], near=scene.near, far=scene.far)
+    return center, positions - center
 
 
 def focus_point(

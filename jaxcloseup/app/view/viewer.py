@@ -21,7 +21,7 @@ from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.labels import LabelStart, start_labels
 from jaxcloseup.app.run.loop import TrainingError
 from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.view.camera_paths import focus_point
+from jaxcloseup.app.view.camera_paths import training_focus
 from jaxcloseup.app.view.orientation import up_direction
 from jaxcloseup.app.view.picking import rank_views, ray_camera
 from jaxcloseup.app.view.server import Server
@@ -108,11 +108,8 @@ class Viewer:
         self._keys, self._find = run_keys(seed), detail_getter(programs, state, kept)
         self._jobs: queue.Queue[_Job] = queue.Queue(maxsize=1)
         self._queueing = threading.Lock()
-        cameras = self.scene.train.cameras
-        positions, rotations = (np.asarray(a) for a in (cameras.position, cameras.rotation))
-        near, far = self.scene.near, self.scene.far
-        center = focus_point(positions, rotations[..., 2], near=near, far=far)
-        self.distance = float(np.median(np.linalg.norm(positions - center, axis=1)))
+        _, positions = training_focus(self.scene)
+        self.distance = float(np.median(np.linalg.norm(positions, axis=1)))
         gaps = np.linalg.norm(positions[:, None] - positions, axis=-1)
         gap = np.median(np.sort(gaps)[:, 1]) if len(gaps) > 1 else np.inf
         self.size = float(min(0.2 * gap, 0.04 * self.distance)) or 0.01 * self.distance
