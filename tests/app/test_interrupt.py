@@ -9,6 +9,7 @@ import sys
 import time
 
 import pytest
+from conftest import QUICKLY
 
 from jaxcloseup.app.cli.main import PROGRAMS
 
@@ -28,7 +29,7 @@ def start():
         process = subprocess.Popen(
             [sys.executable, *arguments],
             cwd=ROOT,
-            env={**os.environ, "PYTHONUNBUFFERED": "1", "XLA_FLAGS": ""},
+            env={**os.environ, "PYTHONUNBUFFERED": "1", "XLA_FLAGS": QUICKLY},
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
