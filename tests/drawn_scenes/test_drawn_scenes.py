@@ -9,7 +9,7 @@ import pytest
 import reference
 
 from jaxcloseup.captures.load import load_scene
-from jaxcloseup.drawn_scenes import assembly, drawn, planning
+from jaxcloseup.drawn_scenes import assembly, drawn, lighting, planning
 from jaxcloseup.drawn_scenes.builtin import SCENES
 from jaxcloseup.drawn_scenes.raycast import PLANE, cast_rays
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points, points_to_pixels
@@ -26,6 +26,7 @@ def cache(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         root = tmp_path_factory.mktemp("cache")
         patch.setenv("XDG_CACHE_HOME", str(root))
+        patch.setattr(lighting, "_ROUNDS", 1)  # half of what baking takes longest for
         drawn._world.cache_clear()
         yield root / "jaxcloseup"
         drawn._world.cache_clear()
