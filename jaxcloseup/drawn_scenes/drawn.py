@@ -90,7 +90,6 @@ def draw_scene(name: str, *, downscale: int = 1) -> Scene:
         metadata={
             "downscale": downscale,
             "own_sizes": {split: [(WIDTH, HEIGHT)] * len(views) for split, views in splits.items()},
-            "own_scale": downscale,
             "magnification": capture["magnification"].tolist(),
             "subjects": capture["subjects"].tolist(),
         },

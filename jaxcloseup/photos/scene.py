@@ -84,9 +84,8 @@ class Scene:
       far: upper bound of z-depth in the scene, in world units.
       names: for each split present, the names of its photographs in order.
       metadata: extra facts from the loader, such as source paths and downscale; `own_sizes`, width
-        and height of each photograph of a split before it was reduced, by `own_scale` if that is
-        not their ratio; `seen`, for each
-        training photograph the indices of the points that it shows, and `point_errors`, their mean
+        and height of each photograph of a split before it was reduced; `seen`, for each training
+        photograph the indices of the points that it shows, and `point_errors`, their mean
         reprojection errors `[P]` in pixels of the photographs' own size, where the files list them.
       surface: renders a `Camera` to its exact `Surface`; None for photographed scenes.
       photographs_at: reads the photographs of a split again at 1 / n of their own size, given n
@@ -125,8 +124,7 @@ class Scene:
         if own is None:
             return camera
         width, height = own[split][index]
-        ratio = self.metadata.get("own_scale")
-        x, y = (width / camera.width, height / camera.height) if ratio is None else (ratio, ratio)
+        x, y = width / camera.width, height / camera.height
         intrinsics = camera.intrinsics * jnp.array([x, y, x, y], jnp.float32)
         return camera.replace(intrinsics=intrinsics, width=width, height=height)
 

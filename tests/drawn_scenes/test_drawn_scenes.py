@@ -1,5 +1,6 @@
 """The built-in scenes: cameras against exact geometry, consistency between views, the cache."""
 
+import dataclasses
 import itertools
 
 import jax
@@ -270,10 +271,14 @@ def test_an_unwritable_cache_only_warns(tmp_path, monkeypatch):
     np.testing.assert_array_equal(made["value"], [0, 1, 2])
 
 
-def test_sizes_round_up_and_focal_lengths_follow():
+def test_sizes_round_up_and_focal_lengths_follow(scene):
     camera = drawn._cameras(np.zeros((1, 3, 4)), 120, 68)
     assert (camera.height, camera.width) == (68, 120)
     np.testing.assert_allclose(camera.intrinsics[0], [100, 800 * 68 / 540, 60, 34], rtol=1e-6)
+    reduced = dataclasses.replace(scene, train=scene.train.replace(cameras=camera))
+    own = reduced.own_camera("train", 0)
+    assert (own.height, own.width) == (540, 960)
+    np.testing.assert_allclose(own.intrinsics, [800, 800, 480, 270], rtol=1e-6)
 
 
 def test_bad_requests():
