@@ -1,5 +1,8 @@
 """Pack splats as SPZ, version 3: a few bytes for each number, and all of them compressed.
 
+What the format leaves open is chosen for size: coordinates are as fine as the splats are small,
+rotations have 6 bits, and splats are in the order of their heights, so that these repeat.
+
 The format, its rounding and its frame (x right, y up, z backward, while PLY files have y down and z
 forward) are those of its authors' own programs: https://github.com/nianticlabs/spz.
 """
@@ -11,7 +14,7 @@ import struct
 import jax
 import numpy as np
 
-from jaxcloseup.artifacts.viewer_gaussians import thickened
+from jaxcloseup.artifacts.file_splats import FileSplats, file_splats, smallest_three, with_y_up
 from jaxcloseup.fields.splats.surfels import Surfels
 from jaxcloseup.io.placement import UNMOVED, Placement
 
@@ -19,8 +22,9 @@ from jaxcloseup.io.placement import UNMOVED, Placement
 _MAGIC, _VERSION = 0x5053474E, 3
 _COLOR_SCALE = 0.15
 _MOST_BITS = 20  # of the fraction of coordinates; more would say nothing
-# What each basis function of spherical harmonics above degree 0 becomes where y and z change sign.
-_SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
+_STEP = 0.3  # largest step of coordinates over the smaller radius of small splats, ...
+_SMALL = 0.1  # a tenth of which are smaller
+_TURN = 8  # step of rotations, of 511
 _FIRST_BUCKET, _BUCKET = 8, 16  # of degree 1, and of the higher ones: 5 and 4 of 8 bits
 
 
@@ -37,55 +41,50 @@ def pack_spz(
     Returns:
       The bytes, and the number of alive surfels that were dropped because a value is not finite.
     """
-    arrays = {name: np.asarray(array, np.float32) for name, array in vars(surfels).items()}
-    living = np.asarray(alive)
-    finite = [np.isfinite(array).reshape(len(living), -1).all(axis=1) for array in arrays.values()]
-    kept = living & np.all(finite, axis=0)
-    arrays = {name: array[kept] for name, array in arrays.items()}
-    means = placement.to_file(arrays["means"]) * [1, -1, -1]
-    scales = thickened(arrays["log_scales"]) - np.float32(math.log(placement.scale))
-    bits, positions = _positions(means)
-    opacity = 1 / (1 + np.exp(-np.clip(arrays["opacity_logits"], -80, 80)))
-    sh = arrays["sh"]
-    degree = math.isqrt(sh.shape[1]) - 1
-    header = struct.pack("<IIIBBBB", _MAGIC, _VERSION, len(means), degree, bits, 0, 0)
+    splats, dropped = file_splats(surfels, alive, placement=placement)
+    splats = with_y_up(splats)
+    bits = _fraction_bits(splats)
+    steps = np.rint(splats.means * 2.0**bits)
+    order = np.lexsort(steps.T[[2, 0, 1]])
+    splats = FileSplats(*(array[order] for array in splats))
+    positions = np.clip(steps[order], -(2**23), 2**23 - 1).astype("<i4")
+    degree = math.isqrt(splats.sh.shape[1]) - 1
+    header = struct.pack("<IIIBBBB", _MAGIC, _VERSION, len(splats.means), degree, bits, 0, 0)
     parts = (
-        positions,
-        _bytes(255 * opacity),
-        _bytes(255 * (_COLOR_SCALE * sh[:, 0] + 0.5)),
-        _bytes(16 * (scales + 10)),
-        _rotations(arrays["quaternions"]),
-        _harmonics(sh[:, 1:]),
+        positions[..., None].view(np.uint8)[..., :3],
+        _bytes(255 * splats.opacities),
+        _bytes(255 * (_COLOR_SCALE * splats.sh[:, 0] + 0.5)),
+        _bytes(16 * (splats.log_scales + 10)),
+        _rotations(splats.quaternions),
+        _harmonics(splats.sh[:, 1:]),
     )
     packed = header + b"".join(part.tobytes() for part in parts)
-    return gzip.compress(packed, compresslevel=9, mtime=0), int(np.sum(living & ~kept))
+    return gzip.compress(packed, compresslevel=9, mtime=0), dropped
 
 
 def _bytes(values: np.ndarray) -> np.ndarray:
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
-def _positions(means: np.ndarray) -> tuple[int, np.ndarray]:
-    """Return the bits of the fraction, and coordinates `[N, 3]` as `[N, 3, 3]` bytes."""
-    largest = float(np.abs(means).max(initial=1e-6))
-    bits = int(np.clip(math.floor(22.999 - math.log2(largest)), 0, _MOST_BITS))
-    fixed = np.clip(np.rint(means * 2.0**bits), -(2**23), 2**23 - 1).astype("<i4")
-    return bits, fixed[..., None].view(np.uint8)[..., :3]
+def _fraction_bits(splats: FileSplats) -> int:
+    """Return the bits of the fraction of coordinates, whose 24 bits must hold the largest."""
+    if not len(splats.means):
+        return 0
+    # Surfels have a thickness, which is no radius.
+    smaller = np.sort(splats.log_scales, axis=1)[:, -2]
+    bits = math.ceil(-math.log2(_STEP * math.exp(np.quantile(smaller, _SMALL))))
+    largest = max(float(np.abs(splats.means).max()), 1e-6)
+    return int(np.clip(min(bits, math.floor(22.999 - math.log2(largest))), 0, _MOST_BITS))
 
 
 def _rotations(quaternions: np.ndarray) -> np.ndarray:
     """Return the three smallest components of quaternions `[N, 4]` (w, x, y, z) as `[N]` words."""
-    turned = np.asarray(quaternions, np.float64)[:, [1, 2, 3, 0]] * [1, -1, -1, 1]
-    turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-12)
-    largest = np.abs(turned).argmax(axis=1)
-    rows = np.arange(len(turned))
-    turned *= np.where(turned[rows, largest] < 0, -1.0, 1.0)[:, None]
+    largest, others = smallest_three(quaternions[:, [1, 2, 3, 0]])
     words = largest.astype(np.uint32)
-    for axis in range(4):
-        value = turned[:, axis]
-        size = np.floor(511 * np.abs(value) * math.sqrt(2) + 0.5).astype(np.uint32)
-        packed = words << 10 | (value < 0).astype(np.uint32) << 9 | np.minimum(size, 511)
-        words = np.where(axis == largest, words, packed).astype(np.uint32)
+    for value in others.T:
+        size = _TURN * np.rint(511 / _TURN * np.abs(value) * math.sqrt(2))
+        size = np.minimum(size, 511).astype(np.uint32)
+        words = words << 10 | ((value < 0) & (size > 0)).astype(np.uint32) << 9 | size
     return words.astype("<u4")
 
 
@@ -93,5 +92,5 @@ def _harmonics(sh: np.ndarray) -> np.ndarray:
     """Return coefficients `[N, K, 3]` above degree 0, to the nearest of few levels, as bytes."""
     count = sh.shape[1]
     buckets = np.where(np.arange(count) < 3, _FIRST_BUCKET, _BUCKET)[:, None]
-    values = np.rint(128 * sh * _SIGNS[:count, None]) + 128
+    values = np.rint(128 * sh) + 128
     return np.clip((values + buckets // 2) // buckets * buckets, 0, 255).astype(np.uint8)

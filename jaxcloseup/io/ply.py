@@ -85,10 +85,7 @@ def write_vertices(
     """
     names = vertices.dtype.names or ()
     fields = [(name, vertices.dtype[name].str[1:]) for name in names]
-    lines = ["ply", "format binary_little_endian 1.0"]
-    if any(offset):
-        lines += ["comment add offset " + " ".join(f"{value:.15g}" for value in offset)]
-    lines += [f"element vertex {len(vertices)}"]
+    lines = [*header_lines(offset), f"element vertex {len(vertices)}"]
     lines += [f"property {_NAMES[kind]} {name}" for name, kind in fields]
     data = vertices.astype([(name, "<" + kind) for name, kind in fields]).tobytes()
     if faces is not None:
@@ -97,6 +94,14 @@ def write_vertices(
         triangles["count"], triangles["indices"] = 3, faces
         data += triangles.tobytes()
     write_file(path, "\n".join([*lines, "end_header\n"]).encode() + data)
+
+
+def header_lines(offset: Sequence[float] | np.ndarray) -> list[str]:
+    """Return the first lines of a binary file, whose coordinates leave out an offset `[3]`."""
+    lines = ["ply", "format binary_little_endian 1.0"]
+    if any(offset):
+        lines += ["comment add offset " + " ".join(f"{value:.15g}" for value in offset)]
+    return lines
 
 
 def _parse_header(path: pathlib.Path, header: bytes) -> tuple[str, int, list[tuple[str, str]]]:

@@ -102,7 +102,7 @@ def _part_size(needed: int, chunks: int) -> int:
 @functools.partial(jax.jit, static_argnames="rows")
 def _prepare(state: Any, *, rows: int) -> Any:
     state = _finish(state)
-    order = _morton_order(state.params, state.buffers.alive)
+    order = morton_order(state.params, state.buffers.alive)
     state = _map_rows(lambda leaf: leaf[order], state)
     number = jnp.sum(state.buffers.alive, dtype=jnp.float32)
     state = state.replace(buffers=state.buffers.replace(number=number))
@@ -212,7 +212,7 @@ def _bounds_of(state: Any, rows: int) -> Bounds:
     )
 
 
-def _morton_order(surfels: Surfels, alive: jax.Array) -> jax.Array:
+def morton_order(surfels: Surfels, alive: jax.Array) -> jax.Array:
     """Return an order `[N]` in which neighbors in space lie together, the dead last.
 
     Large surfels lie apart from small ones: one of them would make its chunk visible from anywhere.
