@@ -58,7 +58,7 @@ def test_the_command_knows_all_programs(monkeypatch, capsys):
     files = pathlib.Path(command.__file__).parent.glob("*.py")
     found = {path.stem for path in files if re.search(r"\ndef main\(\w+: list", path.read_text())}
     assert set(command.PROGRAMS) == found
-    assert all((ROOT / "experiments" / f"{name}.py").is_file() for name in found)
+    assert all((ROOT / "experiments" / f"{name}.py").is_file() for name in found - {"export"})
     for words in ([], ["--help"]):
         monkeypatch.setattr("sys.argv", ["jaxcloseup", *words])
         command.main()
@@ -93,8 +93,9 @@ def test_help_does_not_wait_for_jax(name, tmp_path):
     assert done.stdout.startswith(doc.splitlines()[0])
     topic = {"run": "The capture:", "render": "Cameras:", "view": "The run:"}
     assert topic.get(name, "--") in done.stdout
-    same = call("-m", f"experiments.{name}", "--help")
-    assert same.stdout == done.stdout
+    if name != "export":
+        same = call("-m", f"experiments.{name}", "--help")
+        assert same.stdout == done.stdout
 
 
 def test_a_new_flag_is_one_line(tmp_path):

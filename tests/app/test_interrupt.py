@@ -64,7 +64,8 @@ def wait_for(lines, ending):
 
 
 @pytest.mark.parametrize(
-    ("program", "imported"), [*((program, " experiments") for program in PROGRAMS), ("run", " jax")]
+    ("program", "imported"),
+    [*((program, " experiments") for program in PROGRAMS if program != "export"), ("run", " jax")],
 )
 def test_imports_are_interrupted(start, program, imported):
     process = start("-X", "importtime", "-m", f"experiments.{program}")

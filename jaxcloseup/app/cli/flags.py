@@ -135,9 +135,9 @@ with topic("Results") as OUTPUT:
         "output_dir",
         None,
         "folder for results, new or empty; default: outputs/<scene>/<method>/<date_time> of a run, "
-        "<run>/videos/<date_time> of render, <run>/meshes/<date_time> of mesh, and "
-        "outputs/compare/<date_time> of compare; closeup goes on in outputs/<name>/closeup, or in "
-        "the run's folder; process needs one",
+        "<run>/videos/<date_time> of render, <run>/meshes/<date_time> of mesh, "
+        "<run>/exports/<date_time> of export, and outputs/compare/<date_time> of compare; closeup "
+        "goes on in outputs/<name>/closeup, or in the run's folder; process needs one",
     )
 with topic("Results") as _RESULTS:
     flags.DEFINE_bool("resume", False, "resume the training that was cut off in --output_dir")

@@ -19,6 +19,7 @@ PROGRAMS = {
     "sweep": "the same for several arms, seeds and scenes, and compare them",
     "render": "render a camera path of a run, or fine-tune for target cameras",
     "mesh": "write the surface of a run as a colored mesh",
+    "export": "write splats and cameras as files that other programs read",
     "view": "look at a run in a browser, and choose close-ups there",
     "compare": "compare several finished runs on one scene",
     "evaluate": "score a folder of images against another",
