@@ -23,7 +23,7 @@ _SPLATTING = "KHR_gaussian_splatting"
 _UNLIT = "KHR_materials_unlit"
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 _FLOAT, _UNSIGNED_INT = 5126, 5125
-_POINTS, _TRIANGLES = 0, 4
+_POINTS, _TRIANGLES, _LINEAR = 0, 4, 9729
 _C0 = 0.28209479  # the spherical harmonic of degree 0
 
 
@@ -105,7 +105,9 @@ def pack_mesh_glb(mesh: TexturedMesh, *, placement: Placement = UNMOVED) -> byte
     colored = {"baseColorTexture": {"index": 0}, "metallicFactor": 0, "roughnessFactor": 1}
     more = {
         "materials": [{"pbrMetallicRoughness": colored, "extensions": {_UNLIT: {}}}],
-        "textures": [{"source": 0}],
+        "textures": [{"source": 0, "sampler": 0}],
+        # Smaller copies of the texture would mix triangles that only lie together in it.
+        "samplers": [{"magFilter": _LINEAR, "minFilter": _LINEAR}],
         "images": [{"bufferView": parts.add(mesh.texture), "mimeType": f"image/{kind}"}],
     }
     return parts.pack(primitive, placement, extensions=[_UNLIT], more=more)

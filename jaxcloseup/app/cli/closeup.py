@@ -39,7 +39,7 @@ flags.DEFINE_float(
     "near", 4.0, "how many times nearer than the photograph", lower_bound=1, upper_bound=1000
 )
 flags.DEFINE_bool("single_file", False, "write the page as one file that holds everything")
-flags.DEFINE_bool("mesh", False, "also write the surface as a mesh; needs the extra mesh")
+flags.DEFINE_bool("mesh", False, "also write the surface as a textured mesh; needs the extra mesh")
 
 
 def main(arguments: list[str]) -> None:
@@ -59,7 +59,7 @@ def main(arguments: list[str]) -> None:
         run = _trained(source, kind, folder)
         _present(folder, run, asked)
         if FLAGS.mesh and not (folder / "mesh").exists():
-            _start("mesh", f"--run={run}", f"--output_dir={folder / 'mesh'}")
+            _start("mesh", f"--run={run}", f"--output_dir={folder / 'mesh'}", "--texture=4096")
     minutes, seconds = divmod(round(time.perf_counter() - began), 60)
     print(f"took {minutes}:{seconds:02} minutes")
     print(f"open {folder / 'share' / 'index.html'} in a browser, or send the folder it lies in")

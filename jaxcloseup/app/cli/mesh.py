@@ -4,9 +4,10 @@
 
 The depth that the run renders in each training view is fused into signed distances on a grid, and
 marching cubes finds the surface where these are 0. Pixels do not count whose surface fewer than
-`--min_views` training views see. The mesh ends where no view says anything. On built-in scenes the
-program also measures how far the mesh is from the exact surface; `--exact` fuses exact depth
-instead, which shows what fusion alone costs. The program needs the extra "mesh".
+`--min_views` training views see. The mesh ends where no view says anything. `--texture` also writes
+it as GLB, with a texture of the photographs' colors. On built-in scenes the program also measures
+how far the mesh is from the exact surface; `--exact` fuses exact depth instead, which shows what
+fusion alone costs. The program needs the extra "mesh".
 """
 
 import importlib.util
@@ -48,6 +49,14 @@ flags.DEFINE_integer(
     "training views that must see the surface at a pixel for it to count, its own included",
     lower_bound=1,
 )
+flags.DEFINE_integer(
+    "texture",
+    None,
+    "also write mesh.glb, with a texture of the photographs' colors of at most so many pixels a "
+    "side, such as 4096",
+    lower_bound=256,
+    upper_bound=16384,
+)
 flags.DEFINE_bool("exact", False, "fuse the exact depth of a built-in scene, not the run's")
 
 
@@ -58,18 +67,21 @@ def main(_: list[str]) -> None:
         from jaxcloseup.app.run.loop import TrainingError
         from jaxcloseup.app.store.stored_run import RunError, load_run_scene
         from jaxcloseup.app.view.meshing import MeshError, write_run_mesh
+        from jaxcloseup.app.view.texturing import TextureError
         from jaxcloseup.artifacts.checkpoints import CheckpointError
         from jaxcloseup.photos.scene import SceneError
     set_up()
     if importlib.util.find_spec("skimage") is None:
         name = program_name("mesh")
         sys.exit(f'{name}: scikit-image is missing: install jaxcloseup with the extra "mesh"')
-    expected = (MeshError, RunError, SceneError, CheckpointError, TrainingError, OSError)
-    with in_one_sentence("mesh", *expected), progress.showing():
+    expected = (MeshError, TextureError, RunError, SceneError, CheckpointError, TrainingError)
+    with in_one_sentence("mesh", *expected, OSError), progress.showing():
         # Cheap checks come before loading the scene and the state.
         region = _region()
         if FLAGS.voxel is not None and not 0 < FLAGS.voxel < math.inf:
             raise MeshError(f"--voxel={FLAGS.voxel:g} must be a length above 0")
+        if FLAGS.exact and FLAGS.texture is not None:
+            raise MeshError("--texture needs the run's depth: leave out --exact")
         record, stage = run_from_flags()
         output_dir = check_unused(FLAGS.output_dir or dated(record.folder / "meshes"))
         prepare_to_stop(output_dir)
@@ -82,6 +94,7 @@ def main(_: list[str]) -> None:
             voxel=FLAGS.voxel,
             resolution=FLAGS.resolution,
             min_views=FLAGS.min_views,
+            texture=FLAGS.texture,
         )
 
 

@@ -8,11 +8,14 @@ from typing import Any
 import numpy as np
 
 from jaxcloseup.app import progress
+from jaxcloseup.app.run.kept_detail import detail_path, find_detail
 from jaxcloseup.app.score.mesh_error import CLOSE, mesh_error
 from jaxcloseup.app.store.stored_run import StoredRun, restore
 from jaxcloseup.app.view import surface
+from jaxcloseup.app.view.texturing import texture_mesh
+from jaxcloseup.artifacts.glb import pack_mesh_glb
 from jaxcloseup.artifacts.mesh_files import write_mesh
-from jaxcloseup.io.files import write_json
+from jaxcloseup.io.files import write_file, write_json
 from jaxcloseup.io.memory import installed_memory
 from jaxcloseup.io.placement import Placement
 from jaxcloseup.photos.scene import Scene
@@ -32,6 +35,7 @@ def write_run_mesh(
     voxel: float | None,
     resolution: int,
     min_views: int,
+    texture: int | None = None,
 ) -> None:
     """Fuse depth maps of the training views, and write `mesh.ply` and `mesh.json`.
 
@@ -44,8 +48,10 @@ def write_run_mesh(
       voxel: side of a voxel in the capture's unit; None: by `resolution`.
       resolution: voxels along the longest side of the region.
       min_views: training views that must see the surface at a pixel.
+      texture: largest side of the texture of `mesh.glb`; None: no such file.
 
     Raises:
+      TextureError: the mesh has too many triangles for the texture.
       MeshError: no surface is seen or lies in the region, or it needs too much memory.
     """
     if stage is None and scene.surface is None:
@@ -71,6 +77,10 @@ def write_run_mesh(
     side = scene.placement.scale * voxel if voxel else np.ptp(region, axis=0).max() / resolution
     mesh = _fuse(maps, surface.make_grid(region, side), scene.placement.scale)
     write_mesh(output_dir / "mesh.ply", mesh, scene.placement)
+    if texture is not None and stage is not None:
+        detail, _ = find_detail(programs, state, detail_path(record.folder, stage))
+        textured = texture_mesh(mesh, detail, texture)
+        write_file(output_dir / "mesh.glb", pack_mesh_glb(textured, placement=scene.placement))
     about = {
         "stage": stage,
         **_in_capture(side, region, scene.placement),
@@ -80,7 +90,8 @@ def write_run_mesh(
         "error": _measure(scene, mesh, finer),
     }
     write_json(output_dir / "mesh.json", about)
-    print(f"mesh: {output_dir / 'mesh.ply'}, {len(mesh.faces)} triangles")
+    paths = ", ".join(map(str, sorted(output_dir.glob("mesh.[!j]*"))))
+    print(f"mesh: {paths}, {len(mesh.faces)} triangles")
 
 
 def _in_capture(voxel: float, region: np.ndarray, placement: Placement) -> dict[str, Any]:
