@@ -51,6 +51,13 @@ def write_png(path: str | pathlib.Path, image: Image) -> None:
     write_file(path, encode_png(image))
 
 
+def encode_jpeg(image: Image, *, quality: int = 95) -> bytes:
+    """Encode an image as a JPEG whose colors are as fine as its brightness."""
+    full = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality, *full]
+    return cv2.imencode(".jpg", to_uint8(image)[..., ::-1], options)[1].tobytes()
+
+
 def webp_data_uri(image: Image, *, quality: int = 90) -> str:
     """Encode an image as a `data:` URI, for a self-contained HTML page.
 

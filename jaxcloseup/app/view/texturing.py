@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxcloseup.app import progress
 from jaxcloseup.artifacts.glb import TexturedMesh
-from jaxcloseup.artifacts.images import encode_png, to_uint8
+from jaxcloseup.artifacts.images import encode_jpeg, to_uint8
 from jaxcloseup.artifacts.mesh_files import Mesh
 from jaxcloseup.detail.add import Detail
 from jaxcloseup.geometry.cameras import Camera, points_to_pixels
@@ -89,7 +89,7 @@ def texture_mesh(mesh: Mesh, detail: Detail, size: int) -> TexturedMesh:
         vertices=corners.reshape(-1, 3),
         faces=np.arange(3 * len(corners)).reshape(-1, 3),
         texture_places=texture_places(atlas),
-        texture=encode_png(_in_rows(texture, atlas)),
+        texture=encode_jpeg(_in_rows(texture, atlas)),
     )
 
 
