@@ -36,7 +36,8 @@ def export(kept):
 
 @pytest.fixture(scope="module")
 def exported(export, tmp_path_factory):
-    return export(tmp_path_factory.mktemp("exported"))
+    every = [*program._SPLATS, "cameras"]
+    return export(tmp_path_factory.mktemp("exported"), files=every)
 
 
 def test_splats_are_written_in_every_format(exported):

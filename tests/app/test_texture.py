@@ -40,7 +40,7 @@ def detail_of(cameras):
         jnp.asarray(np.rint(127 * values), jnp.int8), pyramid.intrinsics, pyramid.extents
     )
     sources = gather_sources(views.cameras, depths, views.weight)
-    return Detail(shown, sources, None, jnp.float32(0))
+    return Detail(shown, sources, None, jnp.float32(0), jnp.float32(0))
 
 
 def read_between(image, places):

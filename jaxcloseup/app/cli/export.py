@@ -27,7 +27,10 @@ _SPLATS = {
 }
 _CAMERAS = "cameras"
 flags.DEFINE_list(
-    "files", None, f"what to write, of {', '.join(_SPLATS)} and {_CAMERAS}; default: all"
+    "files",
+    None,
+    f"what to write, of {', '.join(_SPLATS)} and {_CAMERAS}, which come with their photographs; "
+    "default: the splats, or the cameras of a field without",
 )
 
 
@@ -46,8 +49,9 @@ def main(_: list[str]) -> None:
     with in_one_sentence("export", *expected), progress.showing():
         asked = _asked()
         record, stage = run_from_flags()
-        if FLAGS.files is None and METHODS[record.preset.method].splats is None:
-            asked = [_CAMERAS]
+        if not asked:
+            has_splats = METHODS[record.preset.method].splats is not None
+            asked = list(_SPLATS) if has_splats else [_CAMERAS]
         output_dir = check_unused(FLAGS.output_dir or dated(record.folder / "exports"))
         prepare_to_stop(output_dir)
         scene = load_run_scene(record, FLAGS.data)
@@ -60,7 +64,7 @@ def main(_: list[str]) -> None:
 def _asked() -> list[str]:
     every = [*_SPLATS, _CAMERAS]
     if FLAGS.files is None:
-        return every
+        return []
     if not FLAGS.files or any(name not in every for name in FLAGS.files):
         said = ",".join(FLAGS.files)
         raise ValueError(f"--files={said} must be some of {', '.join(every)}")
