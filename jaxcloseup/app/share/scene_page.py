@@ -24,6 +24,7 @@ from jaxcloseup.io.files import write_file
 
 
 _ASSETS = pathlib.Path(__file__).parent / "assets"
+_ERROR = 1600  # longest side in pixels of a map of errors, which are smooth
 _QUALITY = 92  # of WebP
 _THUMBNAIL = 152  # height in pixels, for screens with two pixels to a unit of length
 
@@ -96,7 +97,10 @@ def _describe(folder: pathlib.Path, closeup: CloseUp, single_file: bool) -> dict
     )
     forward = np.asarray(closeup.camera.rotation)[:, 2]
     ahead = float((closeup.point - np.asarray(closeup.camera.position)) @ forward)
-    kinds = {"picture": closeup.picture, "error": closeup.error}
+    shrink = min(1.0, _ERROR / max(height, width))
+    size = round(shrink * width), round(shrink * height)
+    error = cv2.resize(closeup.error, size, interpolation=cv2.INTER_NEAREST)
+    kinds = {"picture": closeup.picture, "error": error}
     return {
         "name": closeup.name,
         "said": closeup.said,
