@@ -42,7 +42,7 @@ def started(monkeypatch):
         commands.append([name, *given])
 
     monkeypatch.setattr(program, "_start", start)
-    monkeypatch.setattr(program, "_present", lambda folder, run, asked: commands.append(run))
+    monkeypatch.setattr(program, "_present", lambda folder, run, asked, title: commands.append(run))
     return commands
 
 

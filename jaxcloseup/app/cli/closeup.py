@@ -57,7 +57,7 @@ def main(arguments: list[str]) -> None:
     with lock:
         began = time.perf_counter()
         run = _trained(source, kind, folder)
-        _present(folder, run, asked)
+        _present(folder, run, asked, _name(source) if kind in ("photographs", "video") else None)
         if FLAGS.mesh and not (folder / "mesh").exists():
             _start("mesh", f"--run={run}", f"--output_dir={folder / 'mesh'}", "--texture=4096")
     minutes, seconds = divmod(round(time.perf_counter() - began), 60)
@@ -66,7 +66,10 @@ def main(arguments: list[str]) -> None:
 
 
 def _present(
-    folder: pathlib.Path, run: pathlib.Path, asked: list[tuple[str, tuple[float, float]]]
+    folder: pathlib.Path,
+    run: pathlib.Path,
+    asked: list[tuple[str, tuple[float, float]]],
+    title: str | None,
 ) -> None:
     with loading():
         from jaxcloseup.app import progress
@@ -81,9 +84,8 @@ def _present(
     with in_one_sentence("closeup", *expected, ValueError, OSError), progress.showing():
         record = read_run(run)
         stage = choose_stage(record, None)
-        paths = present(
-            folder, record, stage, asked, near=FLAGS.near, single_file=FLAGS.single_file
-        )
+        looks = {"near": FLAGS.near, "single_file": FLAGS.single_file, "title": title}
+        paths = present(folder, record, stage, asked, **looks)
     print("\n".join(f"wrote {path}" for path in paths[:-1]))
 
 
@@ -153,9 +155,15 @@ def _kind(source: str) -> str:
 def _folder(source: str, kind: str) -> pathlib.Path:
     if FLAGS.output_dir is not None:
         return pathlib.Path(FLAGS.output_dir)
+    if kind == "run":
+        return pathlib.Path(source)
+    return pathlib.Path("outputs", _name(source), "closeup")
+
+
+def _name(source: str) -> str:
+    """Return what to call a path of photographs, a video or a capture."""
     path = pathlib.Path(source).resolve()
-    name = path.parent.name if path.name.lower() in _PLAIN else path.stem
-    return pathlib.Path(source) if kind == "run" else pathlib.Path("outputs", name, "closeup")
+    return path.parent.name if path.name.lower() in _PLAIN else path.stem
 
 
 def _parse_place(text: str) -> tuple[str, tuple[float, float]]:

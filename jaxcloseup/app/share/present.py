@@ -46,6 +46,7 @@ def present(
     *,
     near: float,
     single_file: bool,
+    title: str | None = None,
 ) -> list[pathlib.Path]:
     """Make close-ups of a stored run, and a page of these and of earlier ones in the folder.
 
@@ -56,6 +57,7 @@ def present(
       asked: names of photographs and pixels (x, y) at their own size; none: the best places.
       near: how many times nearer than the photograph.
       single_file: whether the page is one file.
+      title: of the page; None: the scene's name.
 
     Returns:
       The pictures of the new close-ups, the dolly if it is new, and the page.
@@ -86,7 +88,7 @@ def present(
         frames = _dolly(programs, state, detail, made[0], near)
         paths.append(write_video(folder / "dolly", frames, fps=_FPS))
     with progress.saying("writing the page"):
-        paths.append(_write_page(folder, programs, state, single_file=single_file))
+        paths.append(_write_page(folder, programs, state, title, single_file=single_file))
     return paths
 
 
@@ -98,7 +100,12 @@ def _place(scene: Scene, name: str, pixel: tuple[float, float]) -> Place:
 
 
 def _write_page(
-    folder: pathlib.Path, programs: Programs, state: TrainState, *, single_file: bool
+    folder: pathlib.Path,
+    programs: Programs,
+    state: TrainState,
+    title: str | None,
+    *,
+    single_file: bool,
 ) -> pathlib.Path:
     scene = programs.scene
     assert programs.method.splats is not None
@@ -108,7 +115,7 @@ def _write_page(
     return write_page(
         folder / "share",
         kept_closeups(folder / "closeups"),
-        title=scene.name,
+        title=title or scene.name,
         splats=splats,
         overview=scene.own_camera("train", farthest),
         distance=float(distances[farthest]),
