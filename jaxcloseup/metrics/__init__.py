@@ -7,6 +7,7 @@ __all__, __getattr__, __dir__ = lazy_names(
     __name__,
     {
         "image_metrics": "quantize psnr ssim cc_psnr fit_colors change_colors",
+        "color_corrections": "gsplat_cc_psnr multinerf_cc_psnr",
         "resolution": "ring_correlation resolved_period frequencies",
         "perceptual": "LpipsError LpipsWeights layer_shapes load_lpips lpips",
     },

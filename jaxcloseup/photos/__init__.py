@@ -18,6 +18,11 @@ __all__, __getattr__, __dir__ = lazy_names(
             "Windows photograph_windows view_windows windows_that_see sample_window "
             "sample_window_pixels cut_window in_quarters"
         ),
+        "light": "to_light to_colors change_exposure",
+        "exposures": (
+            "Exposures Metering look_at_points solve_gains meter fit_metering predict_gain "
+            "at_middle_exposure"
+        ),
         "gather": "gather_parts",
         "gather_sums": "GatherSettings Gathered Reader gather_points",
         "support": "Support find_support count_seen",

@@ -11,6 +11,7 @@ from flax import struct
 
 from jaxcloseup.geometry.cameras import Camera, mean_focal
 from jaxcloseup.io.buffers import empty_for_jax
+from jaxcloseup.photos.light import change_exposure
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.views import Photograph, Views, to_float, unpadded
 
@@ -30,11 +31,14 @@ class Pyramid:
         row: uint8 (255 means 1), int8 (127 means 1) or float.
       intrinsics: `[V, L, 4]` fx, fy, cx, cy of each level, in its own pixels.
       extents: `[V, L, 2]` int32 height and width of each image.
+      gains: `[V, 3]` factor of the light of each view's first three values over that at the middle
+        exposure, at which `image` and windows show them; None: all have one exposure.
     """
 
     values: jax.Array
     intrinsics: jax.Array
     extents: jax.Array
+    gains: jax.Array | None = None
 
     def __len__(self) -> int:
         """Return the number of views."""
@@ -67,7 +71,19 @@ class Pyramid:
         start = np.asarray(self.starts)[view, index]
         # One program serves all images of a size.
         flat = jax.lax.dynamic_slice_in_dim(self.values, start, height * width)
-        return flat.reshape(height, width, flat.shape[-1])
+        return self.at_middle(flat.reshape(height, width, flat.shape[-1]), view)
+
+    def at_middle(self, values: jax.Array, view: int | jax.Array) -> jax.Array:
+        """Return values `[..., C]` of views `[...]`, or of one, at the middle exposure.
+
+        They become float32 where exposures differ.
+        """
+        if self.gains is None:
+            return values
+        values = to_float(values)
+        gain = jnp.broadcast_to(1 / self.gains[view], (*values.shape[:-1], 3))
+        rgb = change_exposure(values[..., :3], gain)
+        return jnp.concatenate([rgb, values[..., 3:]], axis=-1)
 
     def camera(self, camera: Camera, view: int, index: int) -> Camera:
         """Return the camera of one view's image at one level, given any camera with its pose."""

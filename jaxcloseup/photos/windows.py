@@ -209,7 +209,7 @@ def sample_window_pixels(key: jax.Array, windows: Windows, count: int) -> Batch:
         pixel = jnp.floor(center * extent + within * size[None]).astype(jnp.int32)
         y, x = jnp.clip(pixel, 0, pyramid.extents[view, level] - 1).T
     first, width = pyramid.starts[view, level], pyramid.extents[view, level, 1]
-    values = to_float(pyramid.values[first + y * width + x])
+    values = to_float(pyramid.at_middle(pyramid.values[first + y * width + x], view))
     return Batch(
         cameras=camera_at(windows.cameras, view).replace(
             intrinsics=pyramid.intrinsics[view, level]
@@ -229,7 +229,7 @@ def cut_window(
     start, across = pyramid.starts[view, level], pyramid.extents[view, level, 1]
     rows = corner[0] + jnp.arange(height)[:, None]
     columns = corner[1] + jnp.arange(width)[None]
-    values = to_float(pyramid.values[start + rows * across + columns])
+    values = to_float(pyramid.at_middle(pyramid.values[start + rows * across + columns], view))
     camera = camera_at(windows.cameras, view).replace(intrinsics=pyramid.intrinsics[view, level])
     camera = crop_camera(camera, corner[::-1], height=height, width=width)
     measured = None if windows.depths is None else read_depths(windows.depths, view, camera)

@@ -93,6 +93,12 @@ with topic("Pictures"):
         True,
         "add the detail that the photographs show beyond the field; made once for a run",
     )
+    flags.DEFINE_string(
+        "exposure",
+        "auto",
+        "exposure of images, where photographs differ in theirs: auto, as the camera would have "
+        "chosen it for each; middle, the mean of all photographs; or the name of a photograph",
+    )
 # Flags that only these camera sources accept.
 _ONLY_WITH = {
     "frames": ("orbit", "from"),
@@ -138,6 +144,7 @@ def _render() -> None:
         detail=FLAGS.detail,
         fine_tuned=FLAGS.fine_tune or FLAGS.target is not None,
         most_steps=FLAGS.target_steps,
+        exposure=FLAGS.exposure,
     )
     if source != "views" and len(shots.names) > 1:
         write_videos(shots, folders, fps=FLAGS.fps or shots.fps or 30.0)

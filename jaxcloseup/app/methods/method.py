@@ -70,6 +70,9 @@ class StereoTraining:
         low=0,
     )
     points: int = setting(10_000, "initial points at matched pixels", low=0)
+    exposures: bool = setting(
+        True, "bring photographs to one exposure where matched pixels differ in it"
+    )
 
 
 @dataclasses.dataclass(frozen=True)

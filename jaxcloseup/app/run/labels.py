@@ -49,7 +49,7 @@ def start_labels(
         depth=rule.depth,
         sizes=scene.sizes("train"),
     )
-    return LabelStart(state, jax.jit(label_sources)(scene.train, depths))
+    return LabelStart(state, jax.jit(label_sources)(programs.train, depths))
 
 
 def rendered_depths(

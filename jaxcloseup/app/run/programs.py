@@ -5,10 +5,10 @@ import dataclasses
 import functools
 import math
 import threading
-from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
@@ -27,14 +27,16 @@ from jaxcloseup.app.run.photograph_sizes import describe_photographs, finest_rea
 from jaxcloseup.app.run.read_photographs import ReadPhotographs
 from jaxcloseup.app.run.step_data import ArmsData, StepData
 from jaxcloseup.app.run.stereo_depths import StereoDepths
+from jaxcloseup.app.run.taken_steps import check_steps, run_in_parts
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.photos.exposures import Exposures, at_middle_exposure
 from jaxcloseup.photos.pyramids import Pyramid, photograph_pyramid
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.views import Views, unpadded
 from jaxcloseup.photos.windows import Windows, in_quarters, photograph_windows
 from jaxcloseup.training.arms import arm_specs, run_arms
-from jaxcloseup.training.parallel import in_a_loop, in_threads, over_devices
+from jaxcloseup.training.parallel import in_a_loop, over_devices
 from jaxcloseup.training.state import Metrics, TrainState
 from jaxcloseup.training.steps import closeup_step, run_steps
 
@@ -69,6 +71,7 @@ class Programs:
         self.growth = 1
         self._growing = threading.Lock()
         self._width = width or scene.train.cameras.width
+        self.gain: jax.Array | None = None  # `[3]` of all views; None: predicted for each
         self._larger: dict[int, Programs] = {}
         self.read = read or ReadPhotographs(scene)
         self._compile()
@@ -114,14 +117,34 @@ class Programs:
     def pyramid(self, finest: int = 1) -> tuple[Pyramid, int]:
         """Return the training photographs from the finest size that fits, and its divisor.
 
-        They are read once. `finest` is the smallest divisor of their size.
+        They are read once, and shown at the middle exposure. `finest` is the smallest divisor of
+        their size.
         """
-        return self.read.pyramid(finest)
+        pyramid, divisor = self.read.pyramid(finest)
+        return self.at_middle(pyramid), divisor
 
     @property
     def stereo(self) -> StereoDepths | None:
         """Return depth of the photographs by stereo; None without, or with too few to confirm."""
         return self.read.stereo(self.preset)
+
+    @property
+    def exposures(self) -> Exposures | None:
+        """Return how exposures of the photographs differ; None where all have one exposure."""
+        return self.read.exposures(self.preset)
+
+    @functools.cached_property
+    def train(self) -> Views:
+        """Return the scene's training photographs at the middle exposure."""
+        if self.exposures is None:
+            return self.scene.train
+        return at_middle_exposure(self.scene.train, self.exposures.log_gains)
+
+    def at_middle(self, pyramid: Pyramid) -> Pyramid:
+        """Return a pyramid of the training photographs that shows them at the middle exposure."""
+        if self.exposures is None:
+            return pyramid
+        return dataclasses.replace(pyramid, gains=jnp.exp(self.exposures.log_gains))
 
     @functools.cached_property
     def coarse(self) -> "Programs":
@@ -129,7 +152,7 @@ class Programs:
         assert self.preset.coarse is not None
         field = self.preset.coarse.field
         preset = dataclasses.replace(self.preset, field=field, coarse=None, windows=None)
-        return Programs(preset, self.scene)
+        return Programs(preset, self.scene, read=self.read)
 
     @functools.cached_property
     def photographs(self) -> Views | Windows:
@@ -149,8 +172,8 @@ class Programs:
         """Return reduced photographs, or windows of the size that all have where sizes differ."""
         views, sizes = self.scene.train, self.scene.sizes("train")
         if len(set(sizes)) == 1:
-            return views
-        pyramid = photograph_pyramid(unpadded(views, sizes))
+            return self.train
+        pyramid = self.at_middle(photograph_pyramid(unpadded(views, sizes)))
         return photograph_windows(views.cameras, pyramid, whole_share=1.0)
 
     def make_room(self, growth: int) -> None:
@@ -164,7 +187,8 @@ class Programs:
         if doublings <= 0:
             return self
         if doublings not in self._larger:
-            large = Programs(self.preset, self.scene, width=self._width * 2**doublings)
+            width = self._width * 2**doublings
+            large = Programs(self.preset, self.scene, width=width, read=self.read)
             large.make_room(self.growth * 4**doublings // 2)
             self._larger[doublings] = large
         return self._larger[doublings]
@@ -200,7 +224,7 @@ class Programs:
             # Means of counts: positive if any step had an overflow.
             overflow = [metrics.pop(key, np.zeros(())) for key in ("overflow", "label_overflow")]
             if not any(np.any(values) for values in overflow):
-                return after, _checked(metrics, count)
+                return after, check_steps(metrics, count)
             self._grow(growth)
 
     def _announce_compiling(self, kind: str, what: str) -> contextlib.AbstractContextManager[Any]:
@@ -238,9 +262,9 @@ class Programs:
             step = functools.partial(data.step, **self._static)
             local = self.field.local if self.preset.train.num_windows == 1 else None
             if local is None or jax.default_backend() != "cpu":
-                return _run_in_parts(step, state, count=count)
+                return run_in_parts(step, state, count=count)
             step = functools.partial(step, local=True)
-            state, metrics = _run_in_parts(step, local.prepare(state), count=count)
+            state, metrics = run_in_parts(step, local.prepare(state), count=count)
             return local.finish(state), metrics
         result = self._run(state, data, count)
         return result if self._mesh is None else one_copy(result)
@@ -266,30 +290,3 @@ class Programs:
             if rendering.overflow is None or not int(rendering.overflow):
                 return rendering
             programs._grow(growth)
-
-
-def _run_in_parts(
-    step: Callable[..., tuple[TrainState, Metrics]], state: TrainState, *, count: int
-) -> tuple[TrainState, Metrics]:
-    """Take `count` steps whose parts are compiled, and shared by all kinds of steps.
-
-    Compiling the rendering of an image, with its derivative, takes as long as hundreds of steps.
-    """
-    metrics = []
-    for i in range(count):
-        # Two threads would compile the same parts, so the first step takes one.
-        state, measured = step(state, spread=in_threads(progress.workers() if i else 1))
-        # No step begins before the last one ends: what waits would hold memory.
-        metrics.append(jax.block_until_ready(measured))
-    return state, jax.tree.map(lambda *values: np.mean(values, axis=0), *metrics)
-
-
-def _checked(metrics: dict[str, Any], count: int) -> dict[str, Any]:
-    """Return finite means as numbers and counts of skipped steps; warn if steps were skipped."""
-    skipped = np.round(metrics.pop("skipped") * count).astype(int)
-    if skipped.any():
-        by_arm = f", by arm: {skipped.tolist()}" if skipped.ndim else ""
-        print(f"warning: {skipped.max()} of {count} steps skipped, not finite{by_arm}")
-    values = {key: float(np.mean(value)) for key, value in metrics.items()}
-    values = {key: value for key, value in values.items() if math.isfinite(value)}
-    return values | {"skipped": skipped.tolist()}

@@ -4,9 +4,11 @@ import dataclasses
 
 from jaxcloseup.app import progress
 from jaxcloseup.app.methods.method import Preset, StereoTraining
+from jaxcloseup.app.run.measured_exposures import measure_exposures
 from jaxcloseup.app.run.photograph_sizes import finest_read
 from jaxcloseup.app.run.stereo_depths import StereoDepths, can_match, match_photographs
 from jaxcloseup.io.memory import give_back_memory
+from jaxcloseup.photos.exposures import Exposures
 from jaxcloseup.photos.pyramids import Pyramid, scene_pyramid
 from jaxcloseup.photos.scene import Scene, SceneError
 
@@ -19,6 +21,7 @@ class ReadPhotographs:
         self._scene = scene
         self._pyramids: dict[int, tuple[Pyramid, int]] = {}
         self._matched: dict[int, StereoDepths | None] = {}
+        self._exposures: dict[bool, Exposures | None] = {}
 
     def pyramid(self, finest: int = 1) -> tuple[Pyramid, int]:
         """Return the training photographs from the finest size that fits, and its divisor.
@@ -45,6 +48,18 @@ class ReadPhotographs:
         if config.pixels not in self._matched:
             self._matched[config.pixels] = self._match(preset, config)
         return self._matched[config.pixels]
+
+    def exposures(self, preset: Preset) -> Exposures | None:
+        """Return how exposures of the photographs differ; None where they agree, or are unknown."""
+        wanted = preset.stereo is not None and preset.stereo.exposures
+        if wanted not in self._exposures:
+            stereo = self.stereo(preset) if wanted else None
+            self._exposures[wanted] = None if stereo is None else measure_exposures(stereo)
+        return self._exposures[wanted]
+
+    def keep_exposures(self, exposures: Exposures | None) -> None:
+        """Take exposures that were measured before, such as those of a stored run."""
+        self._exposures = dict.fromkeys((False, True), exposures)
 
     def _match(self, preset: Preset, config: StereoTraining) -> StereoDepths | None:
         if not can_match(self._scene):

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxcloseup.app.run.exposed import render_exposed
 from jaxcloseup.app.run.labels import LabelStart
 from jaxcloseup.app.run.loop import Training
 from jaxcloseup.app.run.programs import Programs
@@ -82,7 +83,7 @@ class Scorer:
         """
         programs, log = self._training.programs, self._training.log
         if render is None:
-            render = functools.partial(programs.render, state)
+            render = functools.partial(render_exposed, programs, state)
             write_splats(self._folder / "splats", stage, programs, state)
         targets, ladder = self.held_out.targets, self.held_out.ladder
         with timed(self._training.seconds, f"{stage}_evaluation"):

@@ -9,12 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcloseup.app.run.exposed import expose, render_exposed
 from jaxcloseup.app.run.fine_tuning import prepare_target_views
 from jaxcloseup.app.run.gate import gated, uses_labels, weigh
 from jaxcloseup.app.run.kept_detail import GetDetail, detail_getter, detail_path, detailed
 from jaxcloseup.app.run.keys import RunKeys, run_keys
 from jaxcloseup.app.run.labels import LabelStart, label_closeups, start_labels
 from jaxcloseup.app.run.loop import Training, train_stage
+from jaxcloseup.app.run.measured_exposures import write_exposures
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.scoring import HeldOut, Scorer, hold_out
 from jaxcloseup.app.run.stage_names import STAGES
@@ -83,7 +85,7 @@ class Run:
 
     def render(self, camera: Camera) -> Rendering:
         """Render the latest state."""
-        return self.programs.render(self.state, camera)
+        return render_exposed(self.programs, self.state, camera)
 
     def get_detail(self, stage: str, state: TrainState) -> GetDetail:
         """Return a function that finds the detail of a stage's state in the folder, or makes it."""
@@ -145,6 +147,7 @@ def train_baseline_stage(
         start = start_labels(programs, state, keys, expected_depth=labels.expected_depth)
         held_out = hold_out(programs, start)
     write_truth(output_dir / "renders" / "truth", held_out.all)
+    write_exposures(output_dir, programs.exposures, programs.scene.names["train"])
     scorer = Scorer(training, held_out, output_dir, perceptual)
     scorer.score("baseline", state)
     with timed(training.seconds, "gate"):
@@ -177,7 +180,8 @@ def add_detail_stage(run: Run, get_detail: GetDetail) -> tuple[dict[str, Any], R
 
     def render(camera: Camera) -> Rendering:
         rendering = programs.render(state, camera)
-        return rendering._replace(rgb=detailed(programs, detail, camera, rendering).rgb)
+        sharper = detailed(programs, detail, camera, rendering)
+        return rendering._replace(rgb=expose(programs, sharper.rgb, rendering))
 
     def detail_of(camera: Camera) -> Detailed:
         return detailed(programs, detail, camera, programs.render(state, camera))

@@ -72,7 +72,7 @@ def _with_depths(programs: Programs, stereo: StereoDepths | None) -> Views | Win
     if stereo is None or programs.field.depth_loss is None:
         return photographs
     if isinstance(photographs, Views):
-        pyramid = photograph_pyramid(photographs)
+        pyramid = programs.at_middle(photograph_pyramid(programs.scene.train))
         photographs = photograph_windows(photographs.cameras, pyramid, whole_share=1.0)
     return dataclasses.replace(photographs, depths=stereo.sources)
 

@@ -19,6 +19,8 @@ COLUMNS = {
     "lpips_vgg": "LPIPS (VGG)",
     "lpips_alex": "LPIPS (AlexNet)",
     "cc_psnr": "PSNR, color-corrected (dB)",
+    "cc_psnr_gsplat": "PSNR, color-corrected as by gsplat (dB)",
+    "cc_psnr_multinerf": "PSNR, color-corrected as by multinerf (dB)",
     "psnr_seen1": "PSNR where seen by 1+ photographs (dB)",
     "psnr_seen3": "PSNR where seen by 3+ photographs (dB)",
     "coverage_seen1": "share seen by 1+ photographs",

@@ -13,6 +13,7 @@ from jaxcloseup.app.score.targets import Target
 from jaxcloseup.artifacts.images import to_uint8
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.metrics.color_corrections import gsplat_cc_psnr, multinerf_cc_psnr
 from jaxcloseup.metrics.image_metrics import SSIM_TAPS, cc_psnr, psnr, quantize, ssim
 from jaxcloseup.metrics.perceptual import (
     BACKBONES,
@@ -222,7 +223,11 @@ def _metrics(
     image: jax.Array, truth: jax.Array, weight: jax.Array, masks: Mapping[str, jax.Array]
 ) -> Metrics:
     # In one program, all weights share one map of SSIM.
-    found: Metrics = {"cc_psnr": cc_psnr(image, truth, weight=weight)}
+    found: Metrics = {
+        "cc_psnr": cc_psnr(image, truth, weight=weight),
+        "cc_psnr_gsplat": gsplat_cc_psnr(image, truth, weight=weight),
+        "cc_psnr_multinerf": multinerf_cc_psnr(image, truth, weight=weight),
+    }
     for ending, counted in {"": weight, **{f"_{name}": w for name, w in masks.items()}}.items():
         found[f"psnr{ending}"] = psnr(image, truth, weight=counted)
         found[f"ssim{ending}"] = _ssim(image, truth, weight=counted)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcloseup.app import progress
+from jaxcloseup.app.run.exposed import expose
 from jaxcloseup.app.run.kept_detail import detailed
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.share.places import Place
@@ -103,7 +104,8 @@ def _closeup(
         raise CameraError(
             f"--at={name}:{x},{y}: there is no surface at this pixel: choose another pixel"
         ) from None
-    sharper = detailed(programs, detail, camera, programs.render(state, camera))
+    seen = programs.render(state, camera)
+    sharper = detailed(programs, detail, camera, seen)
     error = np.asarray(sharper.error)
     shown = np.isfinite(error)
     said = f"{near:g} times nearer than {name}, at its pixel {x}, {y}"
@@ -112,7 +114,7 @@ def _closeup(
         f"{name}_{x}_{y}".replace("/", "_"),
         camera,
         point,
-        to_uint8(sharper.rgb),
+        to_uint8(expose(programs, sharper.rgb, seen)),
         color_errors(sharper.error)[0],
         said,
         f"Expected error of colors: {off} of 1 on average; photographs show {shown.mean():.0%} of "

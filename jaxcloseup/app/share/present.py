@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxcloseup.app import progress
 from jaxcloseup.app.methods.registry import METHODS
+from jaxcloseup.app.run.exposed import expose
 from jaxcloseup.app.run.kept_detail import detail_getter, detail_path, detailed
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.share.closeups import CloseUp, choose_places, make_closeups
@@ -144,7 +145,8 @@ def _dolly(
 
     def frame(camera: Camera) -> np.ndarray:
         seen = programs.render(state, camera)
-        return to_uint8(detailed(programs, detail, camera, seen).rgb)
+        sharper = detailed(programs, detail, camera, seen)
+        return to_uint8(expose(programs, sharper.rgb, seen))
 
     cameras = [camera for _, camera in named_cameras(shots)]
     return progress.each(frame, cameras, "frames of the dolly")

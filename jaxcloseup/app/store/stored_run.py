@@ -13,6 +13,7 @@ from jaxcloseup.app.methods.method import Preset
 from jaxcloseup.app.methods.settings import with_settings
 from jaxcloseup.app.run import manifest
 from jaxcloseup.app.run.loop import TrainingError
+from jaxcloseup.app.run.measured_exposures import read_exposures
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.states import state_shapes
 from jaxcloseup.app.store.stored_config import preset_from_config
@@ -165,6 +166,10 @@ def restore(run: StoredRun, scene: Scene, stage: str) -> tuple[Programs, TrainSt
       CheckpointError: the state does not fit the preset.
     """
     programs = Programs(run.preset, scene)
+    try:
+        programs.read.keep_exposures(read_exposures(run.folder, scene.names["train"]))
+    except (OSError, ValueError) as error:
+        raise RunError(f"--run={run.folder}: {error}") from None
     try:
         shapes = state_shapes(programs)
     except TrainingError as error:

@@ -123,8 +123,10 @@ def focus_point(
     return np.mean(positions + middle * forward, axis=0)
 
 
-def find_view(scene: Scene, name: str) -> int:
+def find_view(scene: Scene, name: str, *, flag: str = "from") -> int:
     """Return the index of a training view by its name, with or without file ending.
+
+    `flag` is the one that names it.
 
     Raises:
       CameraError: no training view has this name.
@@ -134,7 +136,7 @@ def find_view(scene: Scene, name: str) -> int:
         if candidate in names:
             return names.index(candidate)
     some = ", ".join(names[:3]) + (f" ... {names[-1]}" if len(names) > 3 else "")
-    raise CameraError(f"--from={name} is no training view of {scene.name}: choose one of {some}")
+    raise CameraError(f"--{flag}={name} is no training view of {scene.name}: choose one of {some}")
 
 
 def check_pixel(camera: Camera, pixel: tuple[float, float]) -> tuple[int, int]:

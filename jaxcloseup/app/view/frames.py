@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from jaxcloseup.app import progress
+from jaxcloseup.app.run.exposed import expose
 from jaxcloseup.app.run.kept_detail import detailed
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.view.camera_paths import Shots, named_cameras
@@ -120,7 +121,7 @@ def draw_pictures(
     near, far = limits or depth_range([depth], scene)
     solid = np.asarray(seen.alpha) >= SOLID
     depth_colors = colorize_depth(seen.depth, near=near, far=far, valid=solid)
-    images: dict[str, Image] = {"rgb": np.asarray(seen.rgb), "depth": depth_colors}
+    images: dict[str, Image] = {"rgb": seen.rgb, "depth": depth_colors}
     if seen.normal is not None:
         images["normals"] = colorize_normals(np.where(solid[..., None], seen.normal, 0))
     if sources is not None:
@@ -129,8 +130,9 @@ def draw_pictures(
         images["support"] = colorize_support(*support)
     if detail is not None:
         sharper = detailed(programs, detail, camera, seen)
-        images |= {"rgb": np.asarray(sharper.rgb), "trust": np.asarray(sharper.weight)}
+        images |= {"rgb": sharper.rgb, "trust": np.asarray(sharper.weight)}
         images["error"] = colorize_expected_error(sharper.error)
+    images["rgb"] = np.asarray(expose(programs, images["rgb"], seen))
     return images
 
 

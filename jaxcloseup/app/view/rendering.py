@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 
 import cv2
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxcloseup.app import progress
@@ -21,6 +22,9 @@ from jaxcloseup.app.view.picking import surface_depth
 from jaxcloseup.artifacts.video import write_video
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.training.steps import TrainState
+
+
+AUTO, MIDDLE = "auto", "middle"  # exposures: as the camera would choose it; that of no photograph
 
 
 def dolly_towards(
@@ -76,6 +80,7 @@ def render_run(
     detail: bool,
     fine_tuned: bool,
     most_steps: int | None,
+    exposure: str = AUTO,
 ) -> tuple[Shots, list[pathlib.Path]]:
     """Render cameras of a stored run; return them and the folders of their images.
 
@@ -89,8 +94,10 @@ def render_run(
       detail: add the detail that photographs show beyond the field.
       fine_tuned: first train for exactly these cameras.
       most_steps: largest number of steps of this training; None: the preset's.
+      exposure: of the renders, see `choose_exposure`.
     """
     programs, state = restore(record, scene, stage)
+    choose_exposure(programs, exposure)
     shots = make_shots(programs, state)
     sources = None
     if support or fine_tuned:
@@ -111,6 +118,22 @@ def render_run(
     folders = render_shots(output_dir, programs, state, shots, sources=sources, detail=added)
     print(f"{len(shots.names)} frames: {', '.join(str(folder) for folder in folders)}")
     return shots, folders
+
+
+def choose_exposure(programs: Programs, exposure: str) -> None:
+    """Choose the exposure of all renders: `AUTO`, `MIDDLE`, or the name of a photograph.
+
+    Raises:
+      CameraError: there is no such photograph.
+    """
+    if exposure == AUTO:
+        return
+    gain = jnp.ones(3)
+    if exposure != MIDDLE:
+        view = find_view(programs.scene, exposure, flag="exposure")
+        if programs.exposures is not None:
+            gain = jnp.exp(programs.exposures.log_gains[view])
+    programs.gain = gain
 
 
 def write_videos(shots: Shots, folders: list[pathlib.Path], *, fps: float) -> None:

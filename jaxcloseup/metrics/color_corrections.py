@@ -1,0 +1,74 @@
+"""PSNR after a correction of colors, as other programs fit it: for tables beside their numbers."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcloseup.geometry.numerics import safe_divide
+from jaxcloseup.metrics.image_metrics import psnr
+
+
+HIGHEST = jax.lax.Precision.HIGHEST
+_ROUNDS = 5  # of multinerf's fit
+_CLIPPED = 0.5 / 255  # from black and white, colors that do not count in it
+_REGULAR = 1e-7  # share of the largest singular value below which colors do not tell features apart
+_FIRST, _SECOND = np.triu_indices(3)
+
+
+def gsplat_cc_psnr(image: jax.Array, target: jax.Array, *, weight: jax.Array) -> jax.Array:
+    """Compute the PSNR after gsplat's affine correction of each channel.
+
+    The fit is that of the image to the target, a * target + b, and its inverse corrects the image.
+    Arguments as in `psnr`; a channel of one color stays as it is.
+    """
+    share = safe_divide(weight, jnp.sum(weight), fill=jnp.nan)[..., None]
+
+    def mean(values: jax.Array) -> jax.Array:
+        return jnp.sum(share * values, axis=(0, 1), keepdims=True)
+
+    middle, target_middle = mean(image), mean(target)
+    offset = target - target_middle
+    slope = safe_divide(mean(offset * (image - middle)), mean(offset**2), fill=1)
+    slope = jnp.where(jnp.abs(slope) < 1e-8, 1, slope)
+    corrected = target_middle + (image - middle) / slope
+    return psnr(jnp.clip(corrected, 0, 1), target, weight=weight)
+
+
+def multinerf_cc_psnr(image: jax.Array, target: jax.Array, *, weight: jax.Array) -> jax.Array:
+    """Compute the PSNR after multinerf's quadratic correction, fitted and applied five times.
+
+    Each channel becomes a polynomial of all three, of degree 2, by least squares over pixels that
+    are clipped neither before nor after. Arguments as in `psnr`.
+    """
+    usable = _is_usable(image)
+
+    def correct(_: jax.Array, corrected: jax.Array) -> jax.Array:
+        counted = usable & _is_usable(corrected) & _is_usable(target)
+        return _fit_quadratic(corrected, target, jnp.where(counted, weight[..., None], 0))
+
+    return psnr(jax.lax.fori_loop(0, _ROUNDS, correct, image), target, weight=weight)
+
+
+def _is_usable(image: jax.Array) -> jax.Array:
+    return (image >= _CLIPPED) & (image <= 1 - _CLIPPED)
+
+
+def _fit_quadratic(image: jax.Array, target: jax.Array, weight: jax.Array) -> jax.Array:
+    """Return an image corrected once; `weight` `[H, W, 3]` is of each channel's pixels."""
+    # Centered colors span the same polynomials, and keep sums of 32 bits exact enough.
+    centered = image - jnp.mean(image, axis=(0, 1), keepdims=True)
+    squares = centered[..., _FIRST] * centered[..., _SECOND]
+    features = jnp.concatenate([squares, centered, jnp.ones_like(image[..., :1])], axis=-1)
+    features = jnp.moveaxis(features, -1, 1)  # [H, 10, W], one product of matrices a row
+    weighted = features[:, None] * jnp.moveaxis(weight, -1, 1)[:, :, None]
+    # Rows are summed first, as one sum of 32 bits over all pixels would lose too much.
+    rows = jnp.einsum("hciw,hjw->hcij", weighted, features, precision=HIGHEST)
+    system = jnp.sum(jax.lax.optimization_barrier(rows), axis=0)
+    change = jnp.moveaxis(target - image, -1, 1)
+    reached = jnp.sum(jnp.sum(weighted * change[:, :, None], axis=-1), axis=0)
+    scale = jnp.sqrt(jnp.maximum(jnp.diagonal(system, axis1=1, axis2=2), 1e-12))
+    system = system / (scale[..., None] * scale[:, None])
+    inverse = jnp.linalg.pinv(system, rtol=_REGULAR, hermitian=True)
+    solved = jnp.einsum("cij,cj->ci", inverse, reached / scale, precision=HIGHEST) / scale
+    changed = jnp.einsum("ci,hiw->hwc", solved, features, precision=HIGHEST)
+    return jnp.clip(image + changed, 0, 1)
