@@ -89,8 +89,9 @@ def cc_psnr(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = N
 
     The change, a 3x3 matrix and an offset for the whole image, minimizes the weighted squared
     error; its result is clipped to [0, 1]. Differences in exposure and white balance do not count.
-    Other programs fit other changes, so compare their numbers with `color_corrections`. Where colors span less than three
-    dimensions, as in a gray image, the change of least norm applies. Arguments as in `psnr`.
+    Other programs fit other changes: compare their numbers with those of `color_corrections`. Where
+    colors span less than three dimensions, as in a gray image, the change of least norm applies.
+    Arguments as in `psnr`.
     """
     weight = _check(image, target, weight)
     fitted = change_colors(image, *fit_colors(image, target, weight))

@@ -1,5 +1,6 @@
 """Depth by stereo in a run: what training begins with, on walls drawn by ray casting."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,8 +8,15 @@ import textured_corner
 from textured_corner import SMALL_LENS, corner_views
 
 from jaxcloseup.app.methods.method import StereoTraining
+from jaxcloseup.app.run.measured_exposures import (
+    NAME,
+    measure_exposures,
+    read_exposures,
+    write_exposures,
+)
 from jaxcloseup.app.run.stereo_depths import draw_points, match_photographs
 from jaxcloseup.native import library
+from jaxcloseup.photos.light import change_exposure
 from jaxcloseup.photos.pyramids import photograph_pyramid
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.stereo import StereoConfig
@@ -56,3 +64,41 @@ def test_depth_counts_where_it_is_confident(stereo):
     depth = 1 / np.asarray(sources.inverse_depth)[known]
     np.testing.assert_allclose(depth, stereo.maps.depth[known], rtol=1e-6)
     assert jnp.mean(confidence > 0) > 0.5
+
+
+@pytest.fixture(scope="module")
+def log_gains(stereo):
+    """Exposures up to two stops apart, and tints, 0 on average."""
+    rng = np.random.default_rng(0)
+    count = len(stereo.views)
+    gains = rng.uniform(-0.7, 0.7, (count, 1)) + 0.05 * rng.standard_normal((count, 3))
+    return gains - gains.mean(0)
+
+
+@pytest.fixture(scope="module")
+def exposures(stereo, log_gains):
+    gains = jnp.exp(jnp.asarray(log_gains, jnp.float32))[:, None, None]
+    light = change_exposure(0.5 * stereo.views.rgb.astype(jnp.float32) / 255, gains)
+    taken = jnp.round(255 * jnp.clip(light, 0, 1)).astype(jnp.uint8)
+    return measure_exposures(stereo._replace(views=stereo.views.replace(rgb=taken)))
+
+
+def test_known_exposures_are_recovered(exposures, log_gains):
+    assert np.ptp(log_gains.mean(1)) > 0.9
+    np.testing.assert_allclose(exposures.log_gains, log_gains, atol=0.02)
+
+
+def test_photographs_of_one_exposure_stay_as_they_are(stereo):
+    assert measure_exposures(stereo) is None
+
+
+def test_exposures_are_kept(exposures, tmp_path):
+    names = [str(view) for view in range(len(exposures.log_gains))]
+    write_exposures(tmp_path, None, names)
+    assert read_exposures(tmp_path, names) is None
+    write_exposures(tmp_path, exposures, names)
+    jax.tree.map(np.testing.assert_array_equal, read_exposures(tmp_path, names), exposures)
+    for damage in ("{}", "[", '{"log_gains": {}, "metering": {}}'):
+        (tmp_path / NAME).write_text(damage)
+        with pytest.raises(ValueError, match="does not hold the exposures of these photographs"):
+            read_exposures(tmp_path, names)
