@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxcloseup.app import progress
+from jaxcloseup.app.run.exposed import render_exposed
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.scoring import HeldOut
 from jaxcloseup.app.score.metrics_text import SPLIT_TITLES
@@ -50,7 +51,7 @@ class ArmScorer:
 
     def score(self, arm: str, seed: int, state: TrainState, skipped: int) -> None:
         """Render and score one arm of one seed."""
-        render, splits = functools.partial(self.programs.render, state), {}
+        render, splits = functools.partial(render_exposed, self.programs, state), {}
         with progress.part(f"{arm}_{seed}_evaluation"):
             for split, targets in self.held_out.all.items():
                 splits[split], seen = evaluate(render, targets, self._perceptual)

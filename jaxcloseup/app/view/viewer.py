@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcloseup.app.run.exposed import expose
 from jaxcloseup.app.run.fine_tuning import fine_tune, tuned_detail
 from jaxcloseup.app.run.kept_detail import detail_getter, detailed
 from jaxcloseup.app.run.keys import run_keys
@@ -243,7 +244,8 @@ class Viewer:
         sharper = None
         if detail or shown in (TRUST, ERROR):
             sharper = detailed(self.programs, prepared.detail(), camera, seen)
-        picture = to_uint8(sharper.rgb if sharper is not None and detail else seen.rgb)
+        rgb = sharper.rgb if sharper is not None and detail else seen.rgb
+        picture = to_uint8(expose(self.programs, rgb, seen))
         if shown == SUPPORT:
             sources = self.labels.sources
             depth = label_depth(seen, near=0, far=self.scene.far)
