@@ -45,9 +45,17 @@ def measure_exposures(stereo: StereoDepths) -> Exposures | None:
         spread = float(log_gains.std())
         if spread < _AGREE:
             return None
-        metering = fit_metering(log_gains, list(map(photograph, range(len(views)))))
+        unpadded = [_crop(*photograph(view)) for view in range(len(views))]
+        metering = fit_metering(log_gains, unpadded)
     print(_describe(log_gains, metering.slopes))
     return Exposures(jnp.asarray(log_gains, jnp.float32), metering)
+
+
+def _crop(rgb: jax.Array, weight: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return a photograph without the padding at its right and bottom, which has no middle."""
+    used = np.asarray(weight) > 0
+    height, width = (int(np.max(np.nonzero(used.any(axis))[0], initial=0)) + 1 for axis in (1, 0))
+    return rgb[:height, :width], weight[:height, :width]
 
 
 def write_exposures(
