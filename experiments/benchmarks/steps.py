@@ -67,7 +67,7 @@ def _trained_on(scene, points, rgb, spacing, count):
     field = dataclasses.replace(
         QUICK.field, capacity=count, raster=dataclasses.replace(QUICK.field.raster, capacity=2**19)
     )
-    programs = Programs(dataclasses.replace(QUICK, field=field), scene)
+    programs = Programs(dataclasses.replace(QUICK, field=field, stereo=None), scene)
     rng = np.random.default_rng(0)
     chosen = rng.integers(0, len(points), count)
     # Photographs overlap: this many of their pixels show one surfel.
