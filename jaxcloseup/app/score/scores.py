@@ -95,6 +95,7 @@ def score(rendering: Rendering, target: Target, perceptual: Perceptual = NO_PERC
         values |= surface_error(target.camera, rendering, target.surface)
     if target.could_resolve is not None:
         values["could_resolve"] = target.could_resolve
+    values |= target.proximity or {}
     if target.landmarks is not None:
         values |= point_depth_error(np.asarray(rendering.depth), target.landmarks)
     return score_image(image, truth, weight, perceptual, values, masks)

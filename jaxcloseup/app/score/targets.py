@@ -1,7 +1,7 @@
 """Held-out views with all that scoring needs: photographs, weights, and how often each is seen."""
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -13,6 +13,7 @@ from jaxcloseup.app.score.metrics_text import REDUCED
 from jaxcloseup.app.score.surface_error import Landmarks, find_landmarks
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
+from jaxcloseup.photos.proximity import Proximity, measure_proximity
 from jaxcloseup.photos.scene import Scene, SceneError, Surface
 from jaxcloseup.photos.support import find_support
 from jaxcloseup.photos.views import Photograph, camera_at, unpadded
@@ -20,6 +21,7 @@ from jaxcloseup.photos.views import Photograph, camera_at, unpadded
 
 _SCREEN = 1920  # longest side in pixels of views that are scored at the photographs' own size
 _COMMON_WIDTH = 960  # of larger ones; the paper's
+_ENOUGH_SEEN = 0.25  # share of a view that a photograph must have seen to count as near to it
 
 
 class Target(NamedTuple):
@@ -36,6 +38,8 @@ class Target(NamedTuple):
     # finest period in pixels that photographs of their own size hold of most of the view; None
     # where none sees it
     could_resolve: float | None = None
+    # how near photographs come, see `describe_proximity`; None where that was not asked
+    proximity: Mapping[str, float] | None = None
 
 
 def exact_depths(scene: Scene, cameras: Camera) -> jax.Array:
@@ -79,6 +83,7 @@ def make_targets(
     photographs = photographs or unpadded(getattr(scene, split), scene.sizes(split))
     surface = _geometry(scene.surface) if scene.surface else None
     find, own = jax.jit(find_support), scene.metadata.get("downscale", 1)
+    measure = jax.jit(measure_proximity)
 
     def make(i: int) -> Target:
         camera, rgb, weight = photographs[i]
@@ -91,10 +96,25 @@ def make_targets(
         # A period takes two pixels, of the photograph or of the view.
         held = max(2.0, 2 * float(np.median(footprint[seen > 0])) / own) if seen.any() else None
         name, counts = scene.names[split][i], jnp.asarray(seen)
-        return Target(name, camera, rgb, weight, counts, exact, landmarks, held)
+        near = describe_proximity(measure(camera, depth, scene.train, train_depths))
+        return Target(name, camera, rgb, weight, counts, exact, landmarks, held, near)
 
     pixels = max(photograph.weight.size for photograph in photographs)
     return list(progress.each(make, range(len(photographs)), f"truth of {split}", pixels=pixels))
+
+
+def describe_proximity(proximity: Proximity) -> dict[str, float]:
+    """Return how near photographs come to a view, as numbers for `results.json`.
+
+    `overlap` is the largest with any photograph. `depth_ratio` and `ray_angle`, in degrees, are the
+    smallest of photographs that saw a quarter of the view, where there are any.
+    """
+    seen, overlap, ratio, angle = map(np.asarray, proximity)
+    found, enough = {"overlap": float(overlap.max())}, seen >= _ENOUGH_SEEN
+    if enough.any():
+        degrees = np.rad2deg(angle[enough].min())
+        found |= {"depth_ratio": float(ratio[enough].min()), "ray_angle": float(degrees)}
+    return found
 
 
 def targets_by_split(
