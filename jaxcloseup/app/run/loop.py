@@ -14,6 +14,7 @@ from jaxcloseup.training.state import TrainState
 
 PERSISTENT = 10  # steps in a row whose loss is not finite
 _REPORTS, _MOST_STEPS = 10, 500  # reports of a stage, and steps between two
+_FIRST_STEPS = 20  # steps before the first report: the time left should be known soon
 
 
 class TrainingError(Exception):
@@ -50,12 +51,12 @@ def train_stage(
         last good state is kept.
     """
     with timed(training.seconds, stage):
-        chunk = max(1, min(-(-steps // _REPORTS), _MOST_STEPS))
+        chunk = max(1, min(-(-steps // _REPORTS), _MOST_STEPS, training.save_every))
         done, state, history = _resume(training, stage, state, steps)
         training.history[stage] = history
         saved, failing, good = done, 0, (done, state)
         while done < steps:
-            count = min(chunk, steps - done)
+            count = min(chunk if done else min(chunk, _FIRST_STEPS), steps - done)
             state, metrics = training.programs.run(state, data, count=count)
             done += count
             failing = failing + count if metrics["skipped"] == count else 0

@@ -1,0 +1,43 @@
+"""Where a stage reports and saves, with steps that only count."""
+
+from types import SimpleNamespace
+
+from jaxcloseup.app.run.loop import Training, train_stage
+
+
+class Kept:
+    """Checkpoints in memory."""
+
+    def __init__(self):
+        self.saved = []
+
+    def load(self, stage, like):
+        return self.saved[-1] if self.saved else None
+
+    def save(self, stage, done, state, progress):
+        self.saved.append((done, state, {**progress, "history": [*progress["history"]]}))
+
+
+def train(kept, steps, save_every):
+    def run(state, data, *, count):
+        return state + count, {"skipped": 0}
+
+    programs = SimpleNamespace(run=run, growth=1, make_room=lambda growth: None)
+    training = Training(programs, kept, save_every=save_every)
+    assert train_stage(training, "baseline", 0, None, steps=steps) == steps
+    return [entry["step"] for entry in training.history["baseline"]]
+
+
+def test_the_first_report_comes_soon_and_saves_as_often_as_asked():
+    kept = Kept()
+    steps = train(kept, 1000, 40)
+    assert steps == [20, *range(60, 1000, 40), 1000]
+    assert [done for done, *_ in kept.saved] == [*range(60, 1000, 40), 1000]
+    assert train(Kept(), 30_000, 1000) == [20, *range(520, 30_000, 500), 30_000]
+
+
+def test_a_resumed_stage_reports_at_the_same_steps():
+    kept, whole = Kept(), train(Kept(), 1000, 40)
+    train(kept, 1000, 40)
+    del kept.saved[3:]
+    assert train(kept, 1000, 40) == whole
