@@ -2,11 +2,13 @@
 
 import json
 import re
+import shutil
 
+import jax
 import numpy as np
 import PIL.Image
 
-from experiments.studies import default_runs, few_photographs, methods_table
+from experiments.studies import default_runs, few_photographs, methods_table, paper_regime
 from experiments.studies.pictures import write_rows
 from experiments.studies.tables import finished_runs, format_gain
 
@@ -86,3 +88,34 @@ def test_pictures_stand_in_rows(tmp_path):
     with PIL.Image.open(tmp_path / "a.jpg") as picture:
         assert picture.size == (86, 30 + 24 + 20)
         assert np.abs(np.asarray(picture)[-10, 20].astype(int) - 200).max() < 8
+
+
+def test_the_tables_of_the_papers_regime(tmp_path, capsys):
+    folder = write_run(tmp_path / "a", "table")
+    results = json.loads((tmp_path / "a" / "results.json").read_text())
+    views = results["stages"]["control"]["test"]
+    views |= {"ray_angle": 20.0}
+    views["views"]["a"] |= {"ray_angle": 5.0, "depth_ratio": 4.0}
+    views["views"]["b"] |= {"ray_angle": 35.0, "depth_ratio": 2.0}
+    paper_regime.print_scene(
+        "table", results, {"3DGS": finished_runs([folder], tmp_path, ())["table"]}
+    )
+    out = capsys.readouterr().out
+    scores = "21.50 | 0.500 | 22.00 | - | 31.50 | 0.500"
+    assert f"| labels by the text | {scores} | +0.50 (+0.50 to +0.50) | +0.50" in out
+    assert "| 3DGS | 20.00 | 0.500 | 20.50 | - | 30.00 | 0.500 | - | - |" in out
+    assert "| 0 to 10 | 1 | 4.0 | 20.00 | +0.50 | - | +2.00 |" in out
+    assert "| 30 to 45 | 1 | 2.0 | 22.00 | +0.50 | - | +2.00 |" in out
+
+
+def test_arms_of_the_papers_regime_continue_a_stored_baseline(kept, tmp_path):
+    folder = shutil.copytree(kept, tmp_path / "run")
+    names = {"labels by the script": paper_regime.ARMS["labels by the script"]}
+    with jax.numpy_dtype_promotion("standard"):
+        found = paper_regime.train_arms(folder, names)
+    scores = found["labels by the script"]
+    assert scores["test"]["psnr"] > 10 and len(scores["test_far"]["views"]) == 1
+    steps = folder / "arms" / "labels_by_the_script" / "diverse_0" / "2"
+    assert steps.is_dir()
+    shutil.rmtree(folder / "checkpoints")  # nothing is trained again
+    assert paper_regime.train_arms(folder, names) == found

@@ -1,0 +1,212 @@
+"""Tables of the paper's regime: whole photographs of 960 x 540, the papers' own training lengths.
+
+    python -m experiments.studies.paper_regime --capture=path/to/plush
+
+makes a run of surfels for each scene in `outputs/studies`, continues its baseline in further arms,
+makes runs of other baselines as long, and prints the tables. Whatever is there already is read, and
+what was cut off is resumed, arm by arm. `--print_only` prints the scenes that are finished.
+"""
+
+import itertools
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from absl import app, flags
+
+from experiments.studies.tables import (
+    CLOSEUPS,
+    ORDINARY,
+    Results,
+    finished_runs,
+    format_gain,
+    gains,
+    pair,
+    print_table,
+    score,
+)
+from experiments.studies.trained_run import open_run
+from jaxcloseup.app.methods.nerf import RELEASED
+from jaxcloseup.app.run.keys import run_keys
+from jaxcloseup.app.run.labels import LabelStart, start_labels
+from jaxcloseup.app.run.loop import Training, train_stage
+from jaxcloseup.app.run.scoring import hold_out
+from jaxcloseup.app.run.step_data import CloseupData
+from jaxcloseup.app.score.scores import find_perceptual
+from jaxcloseup.app.sweep.arm_scoring import ArmScorer
+from jaxcloseup.app.sweep.arm_training import train_in_turn
+from jaxcloseup.app.sweep.named_arms import Arm, describe, make_arm
+from jaxcloseup.artifacts.checkpoints import Checkpoints
+from jaxcloseup.io.files import read_object, write_json
+
+
+FLAGS = flags.FLAGS
+_BASELINES = {"3DGS": "gaussians", "Mip-Splatting": "mip_gaussians"}
+_SCRIPT = RELEASED.labels
+# Arms beside a run's own stages, as `sweep --arms` names them, by what they are.
+ARMS = {
+    "labels by the script": (
+        f"magnification={_SCRIPT.magnification[0]:g}:{_SCRIPT.magnification[1]:g}"
+        f"+anchor_tolerance={_SCRIPT.anchor_tolerance:g}+rgb_tolerance={_SCRIPT.rgb_tolerance:g}"
+        f"+depth_tolerance={_SCRIPT.depth_tolerance:g}+forward_label=true"
+    ),
+    "labels by detail": "label=residual",
+    "test time, labels by detail": "test_time+label=residual",
+}
+# Rows of the table: a stage of a run or an arm, and the one that took as many steps without labels.
+_ROWS = {
+    "baseline": ("baseline", "baseline"),
+    "control": ("control", "control"),
+    "labels by the text": ("closeup", "control"),
+    "labels by the script": ("labels by the script", "control"),
+    "labels by detail": ("labels by detail", "control"),
+    "test time, control": ("test_time_control", "test_time_control"),
+    "test time, labels by the text": ("test_time", "test_time_control"),
+    "test time, labels by detail": ("test time, labels by detail", "test_time_control"),
+    "render with detail": ("detail", "control"),
+}
+_BY_ANGLE = ("labels by the text", "labels by detail", "render with detail")
+_DEGREES = (0, 10, 20, 30, 45, 181)  # bounds of the rows by angle
+
+
+def define_flags() -> None:
+    """Define the flags of the script, whose names other scripts use too."""
+    flags.DEFINE_list("scenes", ["table", "counter", "stairs"], "drawn scenes")
+    flags.DEFINE_string("capture", None, "folder of a real capture")
+    flags.DEFINE_string("preset", "paper", "preset of surfels: paper or paper_adaptive")
+    flags.DEFINE_list("baselines", list(_BASELINES), "other methods to train as long")
+    flags.DEFINE_list("given", [], "further flags of every run, such as split=path")
+    flags.DEFINE_bool("print_only", False, "train nothing")
+    flags.DEFINE_string("output_dir", "outputs/studies", "folder of the runs to make")
+
+
+def main(_: list[str]) -> None:
+    """Train what is missing, scene by scene, and print the tables."""
+    scenes = [*FLAGS.scenes, *filter(None, [FLAGS.capture])]
+    for scene in scenes:
+        name, results, others = scene_results(scene)
+        if results.get("stages"):
+            print_scene(name, results, others)
+
+
+def scene_results(scene: str) -> tuple[str, Results, dict[str, Results]]:
+    """Return a scene's name, the results of its run with all arms, and those of other baselines."""
+    root, name = pathlib.Path(FLAGS.output_dir), pathlib.Path(scene).name
+    given = [f"--{text}" for text in FLAGS.given]
+    folder = root / "_".join([FLAGS.preset, *(text.replace("=", "_") for text in FLAGS.given)])
+    found = _run(folder, scene, f"--preset={FLAGS.preset}", *given)
+    arms = {} if FLAGS.print_only else ARMS
+    stages = {**found.get("stages", {}), **train_arms(folder / name, arms)}
+    others = {}
+    for title in FLAGS.baselines:
+        method = _BASELINES[title]
+        flags_of = (f"--method={method}", "--preset=paper", "--stages=baseline", *given)
+        if other := _run(folder.with_name(f"{method}_{folder.name}"), scene, *flags_of):
+            others[title] = other
+    return name, {**found, "stages": stages}, others
+
+
+def _run(folder: pathlib.Path, scene: str, *arguments: str) -> Results:
+    """Return the results of a run in `folder/<scene>`; nothing of one that is not to be made."""
+    if FLAGS.print_only and not (folder / pathlib.Path(scene).name / "results.json").exists():
+        return {}
+    return next(iter(finished_runs([], folder, [scene], *arguments).values()))
+
+
+def train_arms(folder: pathlib.Path, names: Mapping[str, str]) -> dict[str, Any]:
+    """Continue a run's baseline in arms; return their scores by title and split.
+
+    `arms.json` keeps them. Arms that are there are not trained again; one that was cut off resumes.
+    """
+    kept = folder / "arms.json"
+    scores = read_object(kept) if kept.exists() else {}
+    missing = {title: name for title, name in names.items() if title not in scores}
+    if not missing:
+        return scores
+    run = open_run(folder, "baseline")
+    programs, labels = run.programs, run.programs.preset.labels
+    seed = read_object(folder / "checkpoints" / "run.json")["seed"]
+    start = start_labels(programs, run.state, run_keys(seed), expected_depth=labels.expected_depth)
+    arms = {title: make_arm(name, programs.preset) for title, name in missing.items()}
+    scorer = ArmScorer(programs, hold_out(programs, start), [*arms.values()], find_perceptual())
+    for title, arm in arms.items():
+        checkpoints = Checkpoints(folder / "arms" / title.replace(" ", "_"), describe([arm]))
+        train_arm(Training(programs, checkpoints), arm, seed, start, scorer)
+        if str(seed) in scorer.scores[arm.name]:
+            scores[title] = scorer.scores[arm.name][str(seed)]["splits"]
+            write_json(kept, scores)
+    return scores
+
+
+def train_arm(
+    training: Training, arm: Arm, seed: int, start: LabelStart, scorer: ArmScorer
+) -> None:
+    """Train and score an arm, with labels made before its first step or in each step."""
+    if arm.in_turn:
+        train_in_turn(training, arm, seed, start, scorer)
+        return
+    data = CloseupData(training.programs.photographs, start.sources, arm.settings)
+    steps = training.programs.preset.closeup_steps
+    state = train_stage(training, f"{arm.kind}_{seed}", start.state, data, steps=steps)
+    scorer.score(arm.name, seed, state, 0)
+
+
+def print_scene(name: str, results: Results, others: Mapping[str, Results]) -> None:
+    """Print the arms of a scene, and its close-ups by their angle to the photographs."""
+    rows = []
+    for title, (stage, over) in _ROWS.items():
+        if stage in results["stages"]:
+            gained = [
+                "-"
+                if stage == over or over not in results["stages"]
+                else format_gain(gains(results, split, stage, over))
+                for split in (CLOSEUPS, ORDINARY)
+            ]
+            rows.append([title, *_scores(results, stage), *gained])
+    rows += [[title, *_scores(other, "baseline"), "-", "-"] for title, other in others.items()]
+    header = ["arm", "close-ups: PSNR", "SSIM", "color-corrected", "resolves (px)"]
+    header += ["ordinary views: PSNR", "SSIM", "gain over control (95 %)", "on ordinary views"]
+    print_table(f"{name}, the paper's regime", header, rows)
+    print_angles(name, results)
+
+
+def _scores(results: Results, stage: str) -> list[str]:
+    """Return the scores of a stage as texts."""
+    metrics = {"psnr": 2, "ssim": 3, "cc_psnr": 2, "resolves": 1}
+    close = [pair(results, [stage], CLOSEUPS, name, digits) for name, digits in metrics.items()]
+    return close + [
+        pair(results, [stage], ORDINARY, name, metrics[name]) for name in ("psnr", "ssim")
+    ]
+
+
+def print_angles(name: str, results: Results) -> None:
+    """Print the gains of a scene's close-ups by their angle to the nearest photograph."""
+    stages, rows = results["stages"], []
+    if score(results, "control", CLOSEUPS, "ray_angle") is None:
+        return
+    views = stages["control"][CLOSEUPS]["views"]
+    for low, high in itertools.pairwise(_DEGREES):
+        chosen = [
+            view for view, found in views.items() if low <= found.get("ray_angle", 180) < high
+        ]
+        if chosen:
+            row = [f"{low} to {high}", str(len(chosen))]
+            row += [f"{np.mean([views[view].get('depth_ratio', np.nan) for view in chosen]):.1f}"]
+            row += [f"{np.mean([views[view]['psnr'] for view in chosen]):.2f}"]
+            rows.append(row + [_gain(stages, chosen, *_ROWS[title]) for title in _BY_ANGLE])
+    header = ["degrees to the nearest photograph", "close-ups", "times nearer", "control: PSNR"]
+    print_table(f"{name}, gain by angle", [*header, *_BY_ANGLE], rows)
+
+
+def _gain(stages: Mapping[str, Any], views: Sequence[str], stage: str, over: str) -> str:
+    """Format the mean gain of some close-ups."""
+    if not {stage, over} <= set(stages):
+        return "-"
+    scores, others = (stages[name][CLOSEUPS]["views"] for name in (stage, over))
+    return format_gain([scores[view]["psnr"] - others[view]["psnr"] for view in views])
+
+
+if __name__ == "__main__":
+    define_flags()
+    app.run(main)
