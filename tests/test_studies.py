@@ -1,5 +1,6 @@
 """Tables of studies from files of made-up runs, whose numbers are easy to check."""
 
+import dataclasses
 import json
 import re
 import shutil
@@ -7,10 +8,19 @@ import shutil
 import jax
 import numpy as np
 import PIL.Image
+from tiny_runs import TINY
 
-from experiments.studies import default_runs, few_photographs, methods_table, paper_regime
+from experiments.studies import (
+    default_runs,
+    few_photographs,
+    methods_table,
+    paper_nerf,
+    paper_regime,
+)
 from experiments.studies.pictures import write_rows
 from experiments.studies.tables import finished_runs, format_gain
+from jaxcloseup.captures.load import load_scene
+from jaxcloseup.labels.config import LabelConfig
 
 
 LEVELS = {"baseline": 20.0, "control": 21.0, "closeup": 21.5, "detail": 23.0}
@@ -119,3 +129,28 @@ def test_arms_of_the_papers_regime_continue_a_stored_baseline(kept, tmp_path):
     assert steps.is_dir()
     shutil.rmtree(folder / "checkpoints")  # nothing is trained again
     assert paper_regime.train_arms(folder, names) == found
+
+
+def test_the_papers_nerf_is_trained_piece_by_piece(capture_folder, tmp_path, capsys):
+    scene, names = load_scene(str(capture_folder)), {"method": "nerf", "preset": "tiny"}
+    preset = dataclasses.replace(TINY, labels=LabelConfig(), gated=False, targets=None)
+
+    def piece(seconds):
+        with jax.numpy_dtype_promotion("standard"):
+            return paper_nerf.do_piece(tmp_path, scene, preset, names, seed=0, seconds=seconds)
+
+    assert piece(0) == "baseline 3/30"
+    assert piece(1e9) is None and "baseline 3/30  resumed" in capsys.readouterr().out
+    stages = json.loads((tmp_path / "scores.json").read_text())["stages"]
+    assert set(stages) == {"baseline", "control", "closeup", "test_time_control", "test_time"}
+    assert [path.name for path in tmp_path.glob("checkpoints/*/")] == ["baseline"]
+    paper_nerf.print_scores(stages)
+    assert f"| test_time | {stages['test_time']['test']['psnr']:.2f} |" in capsys.readouterr().out
+
+
+def test_a_piece_ends_before_a_part_that_would_not_fit():
+    times = iter([0.0, 10.0, 50.0, 140.0])
+    clock = paper_nerf.Clock(180.0, lambda: next(times))
+    clock.restart()
+    assert not clock.is_over()  # a part took 40 s, and 130 are left
+    assert clock.is_over()  # a part took 90 s, and 40 are left

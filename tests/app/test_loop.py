@@ -2,7 +2,9 @@
 
 from types import SimpleNamespace
 
-from jaxcloseup.app.run.loop import Training, train_stage
+import pytest
+
+from jaxcloseup.app.run.loop import Paused, Training, train_stage
 
 
 class Kept:
@@ -18,12 +20,12 @@ class Kept:
         self.saved.append((done, state, {**progress, "history": [*progress["history"]]}))
 
 
-def train(kept, steps, save_every):
+def train(kept, steps, save_every, pause=lambda: False):
     def run(state, data, *, count):
         return state + count, {"skipped": 0}
 
     programs = SimpleNamespace(run=run, growth=1, make_room=lambda growth: None)
-    training = Training(programs, kept, save_every=save_every)
+    training = Training(programs, kept, save_every=save_every, pause=pause)
     assert train_stage(training, "baseline", 0, None, steps=steps) == steps
     return [entry["step"] for entry in training.history["baseline"]]
 
@@ -41,3 +43,11 @@ def test_a_resumed_stage_reports_at_the_same_steps():
     train(kept, 1000, 40)
     del kept.saved[3:]
     assert train(kept, 1000, 40) == whole
+
+
+def test_a_paused_stage_keeps_its_state_and_goes_on():
+    kept, asked = Kept(), iter([False, False, True])
+    with pytest.raises(Paused, match="baseline 160/1000"):
+        train(kept, 1000, 70, pause=lambda: next(asked))
+    assert kept.saved[-1][:2] == (160, 160)
+    assert train(kept, 1000, 70) == train(Kept(), 1000, 70)

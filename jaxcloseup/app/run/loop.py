@@ -1,6 +1,7 @@
 """One stage of training: steps in chunks, with checkpoints and reports."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 from jaxcloseup.app import progress
@@ -17,6 +18,10 @@ _REPORTS, _MOST_STEPS = 10, 500  # reports of a stage, and steps between two
 _FIRST_STEPS = 20  # steps before the first report: the time left should be known soon
 
 
+class Paused(Exception):
+    """A stage was asked to pause, and its state is kept."""
+
+
 class TrainingError(Exception):
     """Training cannot go on; the message says why, in one sentence."""
 
@@ -29,6 +34,8 @@ class Training:
     checkpoints: Checkpoints  # keep the states of every stage
     log: TrainLog | None = None  # gets every report; None keeps none
     save_every: int = 1000  # steps between checkpoints
+    # Asked after every report; True keeps the state and ends the stage early with `Paused`.
+    pause: Callable[[], bool] = lambda: False
     # Filled with the wall time of each part.
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
     # Filled with the metrics of each stage, for each chunk of steps with `step`, counted within the
@@ -47,6 +54,7 @@ def train_stage(
       The state after the last step.
 
     Raises:
+      Paused: `training.pause` says so.
       TrainingError: `PERSISTENT` steps in a row, or all steps of the stage, were not finite; the
         last good state is kept.
     """
@@ -72,9 +80,12 @@ def train_stage(
             report_steps(stage, done, steps, metrics)
             if training.log is not None:
                 training.log.write(history[-1])
-            if done == steps or (done - saved >= training.save_every and not failing):
+            paused = done < steps and training.pause() and not failing
+            if done == steps or paused or (done - saved >= training.save_every and not failing):
                 _save(training, stage, done, state)
                 saved = done
+            if paused:
+                raise Paused(f"{stage} {done}/{steps}")
     return state
 
 
