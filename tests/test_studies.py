@@ -8,7 +8,7 @@ import shutil
 import jax
 import numpy as np
 import PIL.Image
-from tiny_runs import TINY
+from tiny_runs import TINY, programs_of
 
 from experiments.studies import (
     default_runs,
@@ -19,7 +19,6 @@ from experiments.studies import (
 )
 from experiments.studies.pictures import write_rows
 from experiments.studies.tables import finished_runs, format_gain
-from jaxcloseup.captures.load import load_scene
 from jaxcloseup.labels.config import LabelConfig
 
 
@@ -132,12 +131,16 @@ def test_arms_of_the_papers_regime_continue_a_stored_baseline(kept, tmp_path):
 
 
 def test_the_papers_nerf_is_trained_piece_by_piece(capture_folder, tmp_path, capsys):
-    scene, names = load_scene(str(capture_folder)), {"method": "nerf", "preset": "tiny"}
-    preset = dataclasses.replace(TINY, labels=LabelConfig(), gated=False, targets=None)
+    names, field = (
+        {"method": "nerf", "preset": "tiny"},
+        dataclasses.replace(TINY.field, target_steps=2),
+    )
+    preset = dataclasses.replace(TINY, field=field, labels=LabelConfig(), targets=None)
 
     def piece(seconds):
         with jax.numpy_dtype_promotion("standard"):
-            return paper_nerf.do_piece(tmp_path, scene, preset, names, seed=0, seconds=seconds)
+            programs = programs_of(preset, capture_folder)
+            return paper_nerf.do_piece(tmp_path, programs, names, seed=0, seconds=seconds)
 
     assert piece(0) == "baseline 3/30"
     assert piece(1e9) is None and "baseline 3/30  resumed" in capsys.readouterr().out

@@ -21,7 +21,6 @@ import jax
 from absl import app, flags
 
 from experiments.studies.tables import CLOSEUPS, ORDINARY, format_gain, gains, pair, print_table
-from jaxcloseup.app.methods.method import Preset
 from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.methods.settings import with_settings
 from jaxcloseup.app.run.fine_tuning import prepare_target_views
@@ -39,7 +38,6 @@ from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.io.files import read_object, write_json
 from jaxcloseup.labels.config import pseudo_settings
-from jaxcloseup.photos.scene import Scene
 from jaxcloseup.training.state import TrainState
 
 
@@ -124,7 +122,8 @@ def main(_: list[str]) -> None:
     scene = load_scene(FLAGS.scene, downscale=preset.downscale or 1)
     names = {"method": FLAGS.method, "preset": FLAGS.preset}
     folder, begun = pathlib.Path(FLAGS.state), time.monotonic()
-    left = do_piece(folder, scene, preset, names, seed=FLAGS.seed, seconds=60 * FLAGS.minutes)
+    programs = Programs(preset, scene)
+    left = do_piece(folder, programs, names, seed=FLAGS.seed, seconds=60 * FLAGS.minutes)
     held = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     print(f"piece: {time.monotonic() - begun:.0f} s, {held / 2**20:.0f} MiB in {folder}")
     if left:
@@ -133,13 +132,7 @@ def main(_: list[str]) -> None:
 
 
 def do_piece(
-    folder: pathlib.Path,
-    scene: Scene,
-    preset: Preset,
-    names: dict[str, str],
-    *,
-    seed: int,
-    seconds: float,
+    folder: pathlib.Path, programs: Programs, names: Mapping[str, str], *, seed: int, seconds: float
 ) -> str | None:
     """Train and score as much as fits into a piece; return what comes next, None when all is done.
 
@@ -147,11 +140,9 @@ def do_piece(
       CheckpointError: the folder belongs to another training.
     """
     clock = Clock(seconds)
+    identity = identity_of(programs.scene, programs.preset, names) | {"seed": seed}
     training = Training(
-        Programs(preset, scene),
-        Checkpoints(folder / _CHECKPOINTS, identity_of(scene, preset, names) | {"seed": seed}),
-        save_every=500,
-        pause=clock.is_over,
+        programs, Checkpoints(folder / _CHECKPOINTS, identity), save_every=500, pause=clock.is_over
     )
     kept = folder / _SCORES
     scores = read_object(kept) if kept.exists() else {"stages": {}, "views": {}}
