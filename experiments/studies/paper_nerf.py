@@ -2,8 +2,8 @@
 
     python -m experiments.studies.paper_nerf --state=folder --minutes=9
 
-takes as many steps as fit, keeps the state in the folder, and prints how much is left. The same
-command goes on, also on another computer that has the folder, until all stages are trained and
+takes as many steps as fit, keeps the state in the folder, and exits with 1 while more is left. The
+same command goes on, also on another computer that has the folder, until all stages are trained and
 scored: `baseline`; `control` and `closeup`, which continue it with as many steps; and
 `test_time_control` and `test_time`. `scores.json` holds the scores of each view. The folder stays
 below 64 MiB: of the stages after `baseline`, only the one in training has a state.
@@ -18,15 +18,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NoReturn
 
 import jax
-from absl import app, flags
+from absl import flags
 
 from experiments.studies.tables import CLOSEUPS, ORDINARY, format_gain, gains, pair, print_table
+from jaxcloseup.app.cli.start import in_one_sentence, loading, set_up_compilation_cache, start
 from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.methods.settings import with_settings
 from jaxcloseup.app.run.fine_tuning import prepare_target_views
 from jaxcloseup.app.run.keys import RunKeys, run_keys
 from jaxcloseup.app.run.labels import LabelStart, start_labels
-from jaxcloseup.app.run.loop import Paused, Training, train_stage
+from jaxcloseup.app.run.loop import Paused, Training, TrainingError, train_stage
 from jaxcloseup.app.run.manifest import identity_of, versions
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.scoring import hold_out
@@ -34,7 +35,7 @@ from jaxcloseup.app.run.states import initial_state
 from jaxcloseup.app.run.step_data import CloseupData, StepData, TrainData
 from jaxcloseup.app.score.scores import Perceptual, find_perceptual, score, summarize
 from jaxcloseup.app.score.targets import Target
-from jaxcloseup.artifacts.checkpoints import Checkpoints
+from jaxcloseup.artifacts.checkpoints import CheckpointError, Checkpoints
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.io.files import read_object, write_json
 from jaxcloseup.labels.config import pseudo_settings
@@ -118,12 +119,15 @@ def define_flags() -> None:
 
 def main(_: list[str]) -> None:
     """Do one piece."""
+    with loading():
+        set_up_compilation_cache(None)
     preset = with_settings(METHODS[FLAGS.method].presets[FLAGS.preset], FLAGS.set)
     scene = load_scene(FLAGS.scene, downscale=preset.downscale or 1)
     names = {"method": FLAGS.method, "preset": FLAGS.preset}
     folder, begun = pathlib.Path(FLAGS.state), time.monotonic()
     programs = Programs(preset, scene)
-    left = do_piece(folder, programs, names, seed=FLAGS.seed, seconds=60 * FLAGS.minutes)
+    with in_one_sentence("paper_nerf", CheckpointError, TrainingError):
+        left = do_piece(folder, programs, names, seed=FLAGS.seed, seconds=60 * FLAGS.minutes)
     held = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     print(f"piece: {time.monotonic() - begun:.0f} s, {held / 2**20:.0f} MiB in {folder}")
     if left:
@@ -217,4 +221,4 @@ def print_scores(stages: Mapping[str, Any]) -> None:
 
 if __name__ == "__main__":
     define_flags()
-    app.run(main)
+    start(sys.modules[__name__])

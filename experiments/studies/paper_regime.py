@@ -9,11 +9,12 @@ what was cut off is resumed, arm by arm. `--print_only` prints the scenes that a
 
 import itertools
 import pathlib
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from absl import app, flags
+from absl import flags
 
 from experiments.studies.tables import (
     CLOSEUPS,
@@ -27,6 +28,7 @@ from experiments.studies.tables import (
     score,
 )
 from experiments.studies.trained_run import open_run
+from jaxcloseup.app.cli.start import loading, set_up_compilation_cache, start
 from jaxcloseup.app.methods.nerf import RELEASED
 from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.labels import LabelStart, start_labels
@@ -83,6 +85,8 @@ def define_flags() -> None:
 
 def main(_: list[str]) -> None:
     """Train what is missing, scene by scene, and print the tables."""
+    with loading():
+        set_up_compilation_cache(None)
     scenes = [*FLAGS.scenes, *filter(None, [FLAGS.capture])]
     for scene in scenes:
         name, results, others = scene_results(scene)
@@ -209,4 +213,4 @@ def _gain(stages: Mapping[str, Any], views: Sequence[str], stage: str, over: str
 
 if __name__ == "__main__":
     define_flags()
-    app.run(main)
+    start(sys.modules[__name__])
