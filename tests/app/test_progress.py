@@ -8,11 +8,13 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import pytest
 
 from jaxcloseup.app import progress
 from jaxcloseup.app.cli.interrupt import STOPPED
+from jaxcloseup.app.methods.surfels import PAPER, QUICK
 from jaxcloseup.app.process.counting import progress as stage_progress
 from jaxcloseup.app.progress import display, threads
 from jaxcloseup.app.progress.estimate import Estimate
@@ -189,6 +191,16 @@ def test_ctrl_c_leaves_a_terminal_with_a_cursor():
     os.close(terminal)
     assert process.returncode == STOPPED
     assert said.rindex(b"\x1b[?25h") > said.rindex(b"\x1b[?25l")
+
+
+def test_steps_on_whole_photographs_take_most_of_a_run():
+    """Scoring takes as long as after a short training, so the estimate must not scale it up."""
+    cameras = SimpleNamespace(height=540, width=960)
+    scene = SimpleNamespace(train=SimpleNamespace(cameras=cameras), test=None)
+    quick, paper = (plan.plan_run(preset, scene, ["control"]) for preset in (QUICK, PAPER))
+    assert paper["baseline_evaluation"] == quick["baseline_evaluation"]
+    assert paper["baseline"] > 0.95 * sum(paper.values())
+    assert quick["baseline"] == pytest.approx(0.03 * 6500)
 
 
 def test_parts_have_words():

@@ -16,6 +16,7 @@ _STEP = {
     "test_time_control": 0.05,
     "test_time": 0.09,
 }
+_PIXEL = 6e-7  # seconds that each pixel adds to a step that renders whole photographs
 _PART = {
     "stereo": 20,
     "refine_baseline": 9,
@@ -68,10 +69,16 @@ def plan_run(preset: Preset, scene: Scene, to_run: Sequence[str]) -> dict[str, f
             parts += [stage, f"{stage}_evaluation"]
     parts += ["audit"] + ["dolly"] * (scene.test is not None) + ["report"]
     slower = _RAYS if method.renders_pixels else 1
-    return {
-        name: _STEP[name] * steps[name] if name in steps else slower * _PART.get(name, _EVALUATION)
-        for name in parts
-    }
+    whole = preset.windows is None and not method.renders_pixels
+    pixels = scene.train.cameras.height * scene.train.cameras.width if whole else 0
+
+    def typical(name: str) -> float:
+        if name not in steps:
+            return slower * _PART.get(name, _EVALUATION)
+        images = 2 if name in ("closeup", "test_time") else 1  # of a step
+        return (_STEP[name] + images * pixels * _PIXEL) * steps[name]
+
+    return {name: typical(name) for name in parts}
 
 
 def in_words(part: str) -> str:
