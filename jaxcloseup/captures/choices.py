@@ -3,4 +3,4 @@
 FORMATS = ("transforms", "colmap", "llff")  # of captures on disk
 SPLITS = ("given", "every8", "closest", "zoom")
 ALPHA_MODES = ("blend", "mask", "ignore")
-CHOICES = ("path", "spread")  # of some of the photographs
+CHOICES = ("path", "spread", "first")  # of some of the photographs

@@ -19,7 +19,8 @@ def choose_photographs(
       poses: `[V, 3, 4]` poses of all training photographs.
       count: how many to keep; None keeps all.
       choose: one of `CHOICES`: `path` spreads them evenly over their order, `spread` over where
-        cameras stand and look, so that angles between them are wide.
+        cameras stand and look, so that angles between them are wide; `first` takes the first, as of
+        a path that sees one side.
 
     Raises:
       SceneError: there are fewer.
@@ -31,6 +32,8 @@ def choose_photographs(
         raise SceneError(f"{name} has {total} training photographs: ask for fewer than {count}.")
     if choose == "spread":
         return _far_apart(_places(np.asarray(poses, np.float64)), count)
+    if choose == "first":
+        return list(range(count))
     return [(2 * i + 1) * total // (2 * count) for i in range(count)]
 
 

@@ -66,7 +66,7 @@ def load_scene(
         colors and uses alpha as the weight; `ignore` keeps them and drops alpha.
       photographs: keep so many training photographs; None means all.
       choose: which of them: `path` takes them evenly over their order, `spread` from cameras that
-        stand and look as far apart as possible.
+        stand and look as far apart as possible, `first` the first, which see one side.
       corrections: corrections of known mistakes, as `captures.corrections` lists them.
 
     Returns:

@@ -236,6 +236,21 @@ def test_photographs_far_apart_are_farther_apart(scene):
     assert smallest["spread"] > 1.2 * smallest["path"]
 
 
+def test_the_first_photographs_see_one_side(scene):
+    """Photographs are in order of azimuth, so close-ups look from directions that none has."""
+    first, path = (
+        load_scene("counter", downscale=DOWNSCALE, photographs=5, choose=choose)
+        for choose in ("first", "path")
+    )
+    np.testing.assert_array_equal(first.train.rgb, scene.train.rgb[:5])
+
+    def angles(chosen):
+        ahead, closeups = chosen.train.cameras.rotation[..., 2], scene.test.cameras.rotation[..., 2]
+        return np.arccos(np.clip(np.max(closeups @ ahead.T, axis=1), -1, 1))
+
+    assert np.rad2deg(np.median(angles(first) - angles(path))) > 10
+
+
 def test_the_cache_is_used_and_survives_damage(scene, cache, monkeypatch):
     stored = list(cache.glob("counter-48x27-*.npz"))
     assert len(stored) == 1

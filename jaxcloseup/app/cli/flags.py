@@ -100,7 +100,7 @@ with topic("The capture") as _CAPTURE:
         "path",
         list(CHOICES),
         "with --photographs: which ones: path: evenly over their order; spread: from cameras that "
-        "stand and look as far apart as possible",
+        "stand and look as far apart as possible; first: the first, as of a path along one side",
     )
     flags.DEFINE_bool("invert_masks", False, "read white in masks as pixels to ignore")
     flags.DEFINE_enum(
