@@ -4,7 +4,8 @@
 
 makes a run of surfels for each scene in `outputs/studies`, continues its baseline in further arms,
 makes runs of other baselines as long, and prints the tables. Whatever is there already is read, and
-what was cut off is resumed, arm by arm. `--print_only` prints the scenes that are finished.
+what was cut off is resumed, arm by arm. `--print_only` prints the scenes that are finished. With
+`--given=photographs=30,choose=first` close-ups look from directions that no photograph has.
 """
 
 import itertools
