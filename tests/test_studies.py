@@ -117,6 +117,17 @@ def test_the_tables_of_the_papers_regime(tmp_path, capsys):
     assert "| 30 to 45 | 1 | 2.0 | 22.00 | +0.50 | - | +2.00 |" in out
 
 
+def test_the_ladder_says_what_each_step_adds(tmp_path, capsys):
+    write_run(tmp_path / "a", "table")
+    before = json.loads((tmp_path / "a" / "results.json").read_text())
+    after = json.loads((tmp_path / "a" / "results.json").read_text())
+    after["stages"]["control"]["test"]["views"] = {"a": {"psnr": 21.0}, "b": {"psnr": 24.0}}
+    paper_regime.print_ladder("table", {"paper": before, "antialiasing": after})
+    out = capsys.readouterr().out
+    assert "| paper | 21.00 | 0.500 | 21.50 | - | 31.00 | 0.500 | - | - | 23.00 |" in out
+    assert "| +1.50 (+1.00 to +2.00) | +0.00 (+0.00 to +0.00) | 23.00 |" in out
+
+
 def test_arms_of_the_papers_regime_continue_a_stored_baseline(kept, tmp_path):
     folder = shutil.copytree(kept, tmp_path / "run")
     names = {"labels by the script": paper_regime.ARMS["labels by the script"]}

@@ -69,6 +69,14 @@ _ROWS = {
     "test time, labels by detail": ("test time, labels by detail", "test_time_control"),
     "render with detail": ("detail", "control"),
 }
+# Steps from the paper's baseline to ours: flags of runs, each with all before it but the preset.
+LADDER = {
+    "paper": ("--preset=paper",),
+    "scales at most 0.1 extents": ("--set=max_scale=0.1",),
+    "antialiasing": ("--set=raster.antialias=true",),
+    "windows, depth by stereo, shorter (quick)": ("--preset=quick",),
+}
+_ALONE = ("--stages=control,detail",)  # of the ladder's runs, but for the first
 _BY_ANGLE = ("labels by the text", "labels by detail", "render with detail")
 _DEGREES = (0, 10, 20, 30, 45, 181)  # bounds of the rows by angle
 
@@ -80,6 +88,7 @@ def define_flags() -> None:
     flags.DEFINE_string("preset", "paper", "preset of surfels: paper or paper_adaptive")
     flags.DEFINE_list("baselines", list(_BASELINES), "other methods to train as long")
     flags.DEFINE_list("given", [], "further flags of every run, such as split=path")
+    flags.DEFINE_bool("ladder", False, "go from the paper's baseline to ours instead")
     flags.DEFINE_bool("print_only", False, "train nothing")
     flags.DEFINE_string("output_dir", "outputs/studies", "folder of the runs to make")
 
@@ -90,6 +99,9 @@ def main(_: list[str]) -> None:
         set_up_compilation_cache(None)
     scenes = [*FLAGS.scenes, *filter(None, [FLAGS.capture])]
     for scene in scenes:
+        if FLAGS.ladder:
+            print_ladder(pathlib.Path(scene).name, ladder_results(scene))
+            continue
         name, results, others = scene_results(scene)
         if results.get("stages"):
             print_scene(name, results, others)
@@ -97,9 +109,8 @@ def main(_: list[str]) -> None:
 
 def scene_results(scene: str) -> tuple[str, Results, dict[str, Results]]:
     """Return a scene's name, the results of its run with all arms, and those of other baselines."""
-    root, name = pathlib.Path(FLAGS.output_dir), pathlib.Path(scene).name
-    given = [f"--{text}" for text in FLAGS.given]
-    folder = root / "_".join([FLAGS.preset, *(text.replace("=", "_") for text in FLAGS.given)])
+    name, given = pathlib.Path(scene).name, [f"--{text}" for text in FLAGS.given]
+    folder = _folder(FLAGS.preset)
     found = _run(folder, scene, f"--preset={FLAGS.preset}", *given)
     arms = {} if FLAGS.print_only else ARMS
     stages = {**found.get("stages", {}), **train_arms(folder / name, arms)}
@@ -107,9 +118,29 @@ def scene_results(scene: str) -> tuple[str, Results, dict[str, Results]]:
     for title in FLAGS.baselines:
         method = _BASELINES[title]
         flags_of = (f"--method={method}", "--preset=paper", "--stages=baseline", *given)
-        if other := _run(folder.with_name(f"{method}_{folder.name}"), scene, *flags_of):
+        if other := _run(_folder(method), scene, *flags_of):
             others[title] = other
     return name, {**found, "stages": stages}, others
+
+
+def ladder_results(scene: str) -> dict[str, Results]:
+    """Return the results of the runs that lead from the paper's baseline to ours, by step."""
+    given, shared, found = [f"--{text}" for text in FLAGS.given], [], {}
+    for index, (title, added) in enumerate(LADDER.items()):
+        shared = [*added] if added[0].startswith("--preset") else [*shared, *added]
+        if index:
+            results = _run(_folder(f"ladder_{index}"), scene, *shared, *_ALONE, *given)
+        else:
+            results = _run(_folder("paper"), scene, *shared, *given)
+        if results:
+            found[title] = results
+    return found
+
+
+def _folder(kind: str) -> pathlib.Path:
+    """Return the folder of the runs of a kind, with the flags that all runs are given."""
+    words = [kind, *(text.replace("=", "_") for text in FLAGS.given)]
+    return pathlib.Path(FLAGS.output_dir) / "_".join(words)
 
 
 def _run(folder: pathlib.Path, scene: str, *arguments: str) -> Results:
@@ -174,6 +205,23 @@ def print_scene(name: str, results: Results, others: Mapping[str, Results]) -> N
     header += ["ordinary views: PSNR", "SSIM", "gain over control (95 %)", "on ordinary views"]
     print_table(f"{name}, the paper's regime", header, rows)
     print_angles(name, results)
+
+
+def print_ladder(name: str, found: Mapping[str, Results]) -> None:
+    """Print the control of each step from the paper's baseline to ours, and what it adds."""
+    rows, before = [], None
+    for title, results in found.items():
+        row = [title, *_scores(results, "control")]
+        for split in (CLOSEUPS, ORDINARY):
+            views = results["stages"]["control"][split]["views"]
+            old = before and before["stages"]["control"][split]["views"]
+            gained = [views[view]["psnr"] - old[view]["psnr"] for view in views] if old else []
+            row.append(format_gain(gained) if gained else "-")
+        rows.append([*row, *_scores(results, "detail")[:1]])
+        before = results
+    header = ["with", "close-ups: PSNR", "SSIM", "color-corrected", "resolves (px)"]
+    header += ["ordinary views: PSNR", "SSIM", "adds on close-ups (95 %)", "on ordinary views"]
+    print_table(f"{name}, from the paper's baseline to ours", [*header, "with detail: PSNR"], rows)
 
 
 def _scores(results: Results, stage: str) -> list[str]:
