@@ -52,7 +52,7 @@ class SurfelTrainingConfig(SplatTraining, SurfelConfig):
 WHOLE_IMAGES = TrainConfig(num_rays=None, num_label_rays=None)
 
 # The defaults of the published code: no loss of distortion, normals from step 7000 on, of the
-# expected depth. Labels take the median depth, which is off by half as much.
+# expected depth. Labels take the median depth, which mixes no surfaces along a ray.
 PAPER = Preset(
     method="surfels",
     field=SurfelTrainingConfig(
