@@ -36,7 +36,7 @@ def measure_proximity(
     depths: jax.Array,
     *,
     tolerance: float = 0.02,
-    samples: int = 4096,
+    samples: int = 2048,
 ) -> Proximity:
     """Measure how near photographs come to a view.
 
