@@ -21,6 +21,7 @@ import jax
 from absl import flags
 
 from experiments.studies.tables import CLOSEUPS, ORDINARY, format_gain, gains, pair, print_table
+from jaxcloseup.app import progress
 from jaxcloseup.app.cli.start import in_one_sentence, loading, set_up_compilation_cache, start
 from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.methods.settings import with_settings
@@ -126,7 +127,7 @@ def main(_: list[str]) -> None:
     names = {"method": FLAGS.method, "preset": FLAGS.preset}
     folder, begun = pathlib.Path(FLAGS.state), time.monotonic()
     programs = Programs(preset, scene)
-    with in_one_sentence("paper_nerf", CheckpointError, TrainingError):
+    with in_one_sentence("paper_nerf", CheckpointError, TrainingError), progress.showing():
         left = do_piece(folder, programs, names, seed=FLAGS.seed, seconds=60 * FLAGS.minutes)
     held = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     print(f"piece: {time.monotonic() - begun:.0f} s, {held / 2**20:.0f} MiB in {folder}")

@@ -87,7 +87,7 @@ def define_flags() -> None:
     flags.DEFINE_string("capture", None, "folder of a real capture")
     flags.DEFINE_string("preset", "paper", "preset of surfels: paper or paper_adaptive")
     flags.DEFINE_list("baselines", list(_BASELINES), "other methods to train as long")
-    flags.DEFINE_list("given", [], "further flags of every run, such as split=path")
+    flags.DEFINE_list("given", [], "further flags of every run, such as split=zoom")
     flags.DEFINE_bool("ladder", False, "go from the paper's baseline to ours instead")
     flags.DEFINE_bool("print_only", False, "train nothing")
     flags.DEFINE_string("output_dir", "outputs/studies", "folder of the runs to make")
