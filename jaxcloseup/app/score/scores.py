@@ -98,7 +98,9 @@ def score(rendering: Rendering, target: Target, perceptual: Perceptual = NO_PERC
     values |= target.proximity or {}
     if target.landmarks is not None:
         values |= point_depth_error(np.asarray(rendering.depth), target.landmarks)
-    return score_image(image, truth, weight, perceptual, values, masks)
+    # Drawn scenes have one exposure.
+    others = target.surface is None
+    return score_image(image, truth, weight, perceptual, values, masks, corrections=others)
 
 
 def score_image(
@@ -108,6 +110,8 @@ def score_image(
     perceptual: Perceptual = NO_PERCEPTUAL,
     more: Metrics | None = None,
     masks: Mapping[str, np.ndarray] | None = None,
+    *,
+    corrections: bool = True,
 ) -> View:
     """Return the metrics of an image, on 8-bit colors.
 
@@ -118,6 +122,7 @@ def score_image(
       perceptual: LPIPS networks; they see the true image at pixels without weight.
       more: other metrics of the image, to add to the result.
       masks: further weights by name; PSNR and SSIM with these have the names as their ending.
+      corrections: whether colors are also corrected as other programs do.
 
     Returns:
       Each metric by name. A metric that cannot be computed is None, and `<metric>_reason` says why;
@@ -126,6 +131,8 @@ def score_image(
     """
     image, truth = _as_8_bits(image, truth)
     values = dict(_metrics(image, truth, weight, dict(masks or {}))) | dict(more or {})
+    if corrections:
+        values |= _corrected(image, truth, weight)
     finite, side = bool(np.isfinite(image).all()), min(truth.shape[:2])
     result: View = {}
     if finite and side >= SMALLEST_RINGS:
@@ -224,15 +231,19 @@ def _metrics(
     image: jax.Array, truth: jax.Array, weight: jax.Array, masks: Mapping[str, jax.Array]
 ) -> Metrics:
     # In one program, all weights share one map of SSIM.
-    found: Metrics = {
-        "cc_psnr": cc_psnr(image, truth, weight=weight),
-        "cc_psnr_gsplat": gsplat_cc_psnr(image, truth, weight=weight),
-        "cc_psnr_multinerf": multinerf_cc_psnr(image, truth, weight=weight),
-    }
+    found: Metrics = {"cc_psnr": cc_psnr(image, truth, weight=weight)}
     for ending, counted in {"": weight, **{f"_{name}": w for name, w in masks.items()}}.items():
         found[f"psnr{ending}"] = psnr(image, truth, weight=counted)
         found[f"ssim{ending}"] = _ssim(image, truth, weight=counted)
     return found
+
+
+@jax.jit
+def _corrected(image: jax.Array, truth: jax.Array, weight: jax.Array) -> Metrics:
+    return {
+        "cc_psnr_gsplat": gsplat_cc_psnr(image, truth, weight=weight),
+        "cc_psnr_multinerf": multinerf_cc_psnr(image, truth, weight=weight),
+    }
 
 
 @jax.jit
