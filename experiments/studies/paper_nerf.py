@@ -147,7 +147,11 @@ def do_piece(
     clock = Clock(seconds)
     identity = identity_of(programs.scene, programs.preset, names) | {"seed": seed}
     training = Training(
-        programs, Checkpoints(folder / _CHECKPOINTS, identity), save_every=500, pause=clock.is_over
+        programs,
+        Checkpoints(folder / _CHECKPOINTS, identity),
+        save_every=2000,
+        report_every=50,  # so that a piece ends in time also where a step takes seconds
+        pause=clock.is_over,
     )
     kept = folder / _SCORES
     scores = read_object(kept) if kept.exists() else {"stages": {}, "views": {}}

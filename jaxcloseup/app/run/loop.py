@@ -14,7 +14,7 @@ from jaxcloseup.training.state import TrainState
 
 
 PERSISTENT = 10  # steps in a row whose loss is not finite
-_REPORTS, _MOST_STEPS = 10, 500  # reports of a stage, and steps between two
+_REPORTS = 10  # reports of a stage at least
 _FIRST_STEPS = 20  # steps before the first report: the time left should be known soon
 
 
@@ -34,6 +34,7 @@ class Training:
     checkpoints: Checkpoints  # keep the states of every stage
     log: TrainLog | None = None  # gets every report; None keeps none
     save_every: int = 1000  # steps between checkpoints
+    report_every: int = 500  # steps between reports at most
     # Asked after every report; True keeps the state and ends the stage early with `Paused`.
     pause: Callable[[], bool] = lambda: False
     # Filled with the wall time of each part.
@@ -59,7 +60,7 @@ def train_stage(
         last good state is kept.
     """
     with timed(training.seconds, stage):
-        chunk = max(1, min(-(-steps // _REPORTS), _MOST_STEPS, training.save_every))
+        chunk = max(1, min(-(-steps // _REPORTS), training.report_every, training.save_every))
         done, state, history = _resume(training, stage, state, steps)
         training.history[stage] = history
         saved, failing, good = done, 0, (done, state)
