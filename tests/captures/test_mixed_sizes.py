@@ -81,7 +81,9 @@ def test_padding_is_neither_scored_nor_written(scene, tmp_path):
 
 
 def test_views_are_rendered_at_the_size_of_their_files(scene, tmp_path):
-    programs = SimpleNamespace(scene=scene, render=lambda state, camera: render(camera))
+    programs = SimpleNamespace(
+        exposures=None, scene=scene, render=lambda state, camera: render(camera)
+    )
     frames.render_shots(tmp_path, programs, None, view_shots(scene, "test"), sources=None)
     for name, size in SIZES.items():
         for kind in ("rgb", "depth"):
