@@ -25,7 +25,7 @@ _LEAST = 0.05  # residual of log light below which all count alike
 _ROUNDS = 10  # of reweighting
 _HELD = 1.0  # weight of the middle in each gain, in points
 _WIDTHS = 0.2, 0.35, 0.5, 10.0  # candidates for `Metering.width`
-_BETTER = 0.97  # share of the error left out one by one that a slope must leave, to be believed
+_BETTER = 0.7  # share of the error left out one by one that a slope must leave, to be believed
 
 
 class Metering(struct.PyTreeNode):
