@@ -76,7 +76,7 @@ LADDER = {
     "antialiasing": ("--set=raster.antialias=true",),
     "windows, depth by stereo, shorter (quick)": ("--preset=quick",),
 }
-_ALONE = ("--stages=control,detail",)  # of the ladder's runs, but for the first
+_ALONE = ("--stages=control,detail",)  # of all runs of the ladder after the first
 _BY_ANGLE = ("labels by the text", "labels by detail", "render with detail")
 _DEGREES = (0, 10, 20, 30, 45, 181)  # bounds of the rows by angle
 

@@ -19,7 +19,6 @@ from jaxcloseup.io.ply import header_lines
 _CHUNK = 256
 _order = jax.jit(morton_order)
 _LIMIT = 20.0  # of log scales, which the format cuts
-_C0 = 0.28209479  # the spherical harmonic of degree 0
 
 
 def pack_compressed_ply(
@@ -40,7 +39,7 @@ def pack_compressed_ply(
     splats, dropped = file_splats(surfels, np.asarray(alive)[order], placement=placement)
     means, bounds_of_means = _in_chunks(splats.means)
     scales, bounds_of_scales = _in_chunks(np.clip(splats.log_scales, -_LIMIT, _LIMIT))
-    colors, bounds_of_colors = _in_chunks(_C0 * splats.sh[:, 0] + 0.5)
+    colors, bounds_of_colors = _in_chunks(splats.base_colors)
     bounds = [*bounds_of_means, *bounds_of_scales, *bounds_of_colors]
     chunks = np.concatenate(bounds, axis=1).astype("<f4")
     words = [

@@ -10,6 +10,7 @@ from jaxcloseup.fields.splats.surfels import Surfels
 from jaxcloseup.io.placement import UNMOVED, Placement
 
 
+_C0 = 0.28209479  # the spherical harmonic of degree 0
 # What each basis function of spherical harmonics above degree 0 becomes where y and z change sign.
 _SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 
@@ -30,6 +31,11 @@ class FileSplats(NamedTuple):
     quaternions: np.ndarray
     opacities: np.ndarray
     sh: np.ndarray
+
+    @property
+    def base_colors(self) -> np.ndarray:
+        """Return the colors `[M, 3]` of degree 0, which are the same from everywhere."""
+        return _C0 * self.sh[:, 0] + 0.5
 
 
 def file_splats(

@@ -24,7 +24,6 @@ _UNLIT = "KHR_materials_unlit"
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 _FLOAT, _UNSIGNED_INT = 5126, 5125
 _POINTS, _TRIANGLES, _LINEAR = 0, 4, 9729
-_C0 = 0.28209479  # the spherical harmonic of degree 0
 
 
 class TexturedMesh(NamedTuple):
@@ -59,7 +58,7 @@ def pack_splats_glb(
     """
     splats, dropped = file_splats(surfels, alive, placement=placement)
     splats = with_y_up(splats)
-    color = np.clip(_C0 * splats.sh[:, 0] + 0.5, 0, 1)
+    color = np.clip(splats.base_colors, 0, 1)
     arrays = {
         "POSITION": splats.means,
         "COLOR_0": np.column_stack([_to_linear(color), splats.opacities]),
