@@ -12,6 +12,7 @@ from jaxcloseup.app.view.picking import (
     surface_depth,
     vertical_fov,
     viewer_camera,
+    window_size,
 )
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import pixels_to_points, points_to_pixels
@@ -89,3 +90,15 @@ def test_a_viewer_camera_has_the_given_field_of_view():
     # A point half of 0.8 above the optical axis is at the upper edge.
     point = jnp.array([1, 2 - np.tan(0.4), 4], jnp.float32)
     np.testing.assert_allclose(points_to_pixels(camera, point)[0], [16, 0], atol=1e-4)
+
+
+def test_a_window_that_is_drawn_with_fewer_pixels_keeps_its_size():
+    size = window_size(1280, 800, (0, 0))
+    assert size == (1280, 800)
+    assert window_size(959, 600, size) == size  # three quarters of the pixels of a side
+    assert window_size(640, 399, size) == size
+    assert window_size(1440, 900, size) == (1440, 900)  # grows
+    assert window_size(900, 800, size) == (900, 800)  # another shape
+    assert window_size(1280, 790, size) == (1280, 790)
+    large = window_size(3840, 2160, size)
+    assert large == (1886, 1061) and window_size(1920, 1080, large) == large

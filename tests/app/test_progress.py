@@ -4,6 +4,7 @@ import io
 import os
 import pathlib
 import re
+import select
 import signal
 import subprocess
 import sys
@@ -173,6 +174,14 @@ def test_ctrl_c_leaves_a_terminal_with_a_cursor():
         "    time.sleep(60)\n"
     )
     terminal, inner = os.openpty()
+
+    def read_until(end):
+        said = b""
+        while end not in said:
+            assert select.select([terminal], [], [], 60)[0], said
+            said += os.read(terminal, 4096)
+        return said
+
     with subprocess.Popen(
         [sys.executable, "-c", program],
         stdin=inner,
@@ -181,13 +190,11 @@ def test_ctrl_c_leaves_a_terminal_with_a_cursor():
         env=os.environ | {"TERM": "xterm", "COLUMNS": "80"},
         cwd=pathlib.Path(__file__).parents[2],
     ) as process:
-        os.close(inner)
-        said = b""
-        while b"waiting" not in said:
-            said += os.read(terminal, 4096)
+        said = read_until(b"waiting")
         process.send_signal(signal.SIGINT)
-        while b"program: stopped" not in said:
-            said += os.read(terminal, 4096)
+        said += read_until(b"program: stopped")
+    # Held open until here: where nobody holds it, what was not read yet may be lost.
+    os.close(inner)
     os.close(terminal)
     assert process.returncode == STOPPED
     assert said.rindex(b"\x1b[?25h") > said.rindex(b"\x1b[?25l")

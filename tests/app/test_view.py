@@ -127,8 +127,9 @@ def test_the_window_shows_the_rendered_closeup_in_a_browser(serve, kept, monkeyp
         before = expected()
         assert before.shape[0] > 500 and before.std() > 5
         assert sees(browser, before) < 3
-        seconds = []
-        for _ in range(2):
+        seconds, sizes = [], [before.shape]
+        while len(seconds) < 2 or sizes[-1] != sizes[-2]:  # another size compiles
+            assert len(seconds) < 5, sizes
             settle(page)
             visitor._status.content = ""
             start = click(browser, page)
@@ -141,9 +142,10 @@ def test_the_window_shows_the_rendered_closeup_in_a_browser(serve, kept, monkeyp
             settle(page)
             assert sees(browser, expected()) < 3
             seconds.append(time.monotonic() - start - RESTS)
+            sizes.append(expected().shape)
         # Optimized, the second click takes less than 2 seconds on two quiet cores; tests compile
         # nearly everything without optimizing, and others work too.
-        assert seconds[1] < 15, seconds
+        assert seconds[-1] < 15, seconds
         assert differ(before, expected()) > 3
 
 

@@ -18,6 +18,7 @@ from jaxcloseup.photos.views import Views
 
 
 _AROUND = 16  # pixels of an image's part that is rendered for the depth of one of them
+_MOST_PIXELS = 2_000_000  # of a rendered window; larger windows show it enlarged
 
 
 def surface_depth(
@@ -134,3 +135,20 @@ def viewer_camera(rotation: np.ndarray, position: np.ndarray, fov: float, like: 
 def vertical_fov(camera: Camera) -> float:
     """Return the vertical field of view in radians, for a principal point at the image center."""
     return float(2 * np.arctan(camera.height / 2 / np.asarray(camera.intrinsics)[1]))
+
+
+def window_size(width: int, height: int, before: tuple[int, int]) -> tuple[int, int]:
+    """Return the width and height, in pixels, of what a browser's window is rendered with.
+
+    A page that draws slowly asks for fewer pixels of the same window, and each size compiles its
+    own programs: the size before stays unless the window has another shape or grows.
+
+    Args:
+      width: of the window's canvas, in pixels.
+      height: of the canvas.
+      before: the size that this function returned before; (0, 0) at first.
+    """
+    smaller = min(1.0, (_MOST_PIXELS / max(1, width * height)) ** 0.5)
+    width, height = (max(1, round(smaller * side)) for side in (width, height))
+    alike = abs(width * before[1] - height * before[0]) <= max(before)  # one pixel of rounding
+    return before if alike and width <= before[0] else (width, height)

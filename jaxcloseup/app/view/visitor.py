@@ -10,7 +10,7 @@ import numpy as np
 from viser.transforms import SO3
 
 from jaxcloseup.app.view.drawn_scene import add_frustum, add_scene, quaternion, same
-from jaxcloseup.app.view.picking import closeup_camera, vertical_fov, viewer_camera
+from jaxcloseup.app.view.picking import closeup_camera, vertical_fov, viewer_camera, window_size
 from jaxcloseup.app.view.server import Server
 from jaxcloseup.app.view.viewer import PICTURE, SHOWN, Prepared, Viewer
 from jaxcloseup.artifacts.images import encode_png
@@ -21,7 +21,6 @@ _HELP = """Click on the scene, or give a pixel of a photograph, to come near to 
 Drag to move; click on a training camera to move there.
 When you rest, the window shows the scene as the run renders it, with detail."""
 _REST = 0.3  # seconds without a move before the window is rendered
-_MOST_PIXELS = 2_000_000  # of a rendered window; larger windows show it enlarged
 _SAME = 1e-4  # of the distance from the scene, up to which positions are one
 _TINT = 0.7  # share of the colors of support, if these are shown
 
@@ -58,6 +57,7 @@ class Visitor:
         self._history: list[tuple[Camera, float]] = []  # cameras, and how far ahead their point is
         self._prepared: Prepared | None = None  # what rendered the window last
         self._rendered: Camera | None = None  # the window's camera while its render is shown
+        self._size = (0, 0)  # of the rendered window
         self._visited = -np.inf  # time of the last visit to a camera, seconds
         self._rest: threading.Timer | None = None
         self._drawing = threading.Lock()
@@ -281,9 +281,8 @@ class Visitor:
         """Return the visitor's camera, with the window's size or that of another camera."""
         camera = self._client.camera
         if like is None:
-            width, height = camera.image_width, camera.image_height
-            smaller = min(1.0, (_MOST_PIXELS / max(1, width * height)) ** 0.5)
-            width, height = (max(1, round(smaller * side)) for side in (width, height))
+            asked = camera.image_width, camera.image_height
+            self._size = width, height = window_size(*asked, self._size)
             like = self._viewer.scene.camera("train", 0).replace(width=width, height=height)
         rotation = SO3(camera.wxyz).as_matrix()
         return viewer_camera(rotation, camera.position, camera.fov, like)
