@@ -19,6 +19,8 @@ from experiments.studies import (
 )
 from experiments.studies.pictures import write_rows
 from experiments.studies.tables import finished_runs, format_gain
+from jaxcloseup.app.methods.registry import METHODS
+from jaxcloseup.app.methods.settings import with_settings
 from jaxcloseup.labels.config import LabelConfig
 
 
@@ -126,6 +128,20 @@ def test_the_ladder_says_what_each_step_adds(tmp_path, capsys):
     out = capsys.readouterr().out
     assert "| paper | 21.00 | 0.500 | 21.50 | - | 31.00 | 0.500 | - | - | 23.00 |" in out
     assert "| +1.50 (+1.00 to +2.00) | +0.00 (+0.00 to +0.00) | 23.00 |" in out
+
+
+def test_a_shorter_regime_has_no_other_proportions():
+    preset = METHODS["surfels"].presets["paper_adaptive"]
+    found = dict(text.split("=") for text in paper_regime.shorter(preset, 10))
+    assert found["baseline_steps"] == "3000" and found["density.reset_every"] == "300"
+    short = with_settings(preset, [f"{name}={value}" for name, value in found.items()])
+    for before, after in ((preset.field, short.field), (preset.field.density, short.field.density)):
+        for field in dataclasses.fields(before):
+            name, values = field.name, [getattr(side, field.name) for side in (before, after)]
+            if {name, f"density.{name}"} & set(found):
+                assert values[0] == 10 * values[1]
+            elif isinstance(values[0], int) and values[0] > 99:
+                assert name == "capacity"  # no count of steps was forgotten
 
 
 def test_arms_of_the_papers_regime_continue_a_stored_baseline(kept, tmp_path):

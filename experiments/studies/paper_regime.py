@@ -31,6 +31,7 @@ from experiments.studies.tables import (
 from experiments.studies.trained_run import open_run
 from jaxcloseup.app.cli.start import loading, set_up_compilation_cache, start
 from jaxcloseup.app.methods.nerf import RELEASED
+from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.labels import LabelStart, start_labels
 from jaxcloseup.app.run.loop import Training, train_stage
@@ -76,6 +77,9 @@ LADDER = {
     "antialiasing": ("--set=raster.antialias=true",),
     "windows, depth by stereo, shorter (quick)": ("--preset=quick",),
 }
+# What `--shorter` divides: settings of presets that are counts of steps before the close-ups.
+_LENGTHS = ("baseline_steps", "means_lr_steps", "sh_every", "regularize_from")
+_DENSITY_LENGTHS = ("every", "start", "stop", "reset_every")
 _ALONE = ("--stages=control,detail",)  # of all runs of the ladder after the first
 _BY_ANGLE = ("labels by the text", "labels by detail", "render with detail")
 _DEGREES = (0, 10, 20, 30, 45, 181)  # bounds of the rows by angle
@@ -88,6 +92,7 @@ def define_flags() -> None:
     flags.DEFINE_string("preset", "paper", "preset of surfels: paper or paper_adaptive")
     flags.DEFINE_list("baselines", list(_BASELINES), "other methods to train as long")
     flags.DEFINE_list("given", [], "further flags of every run, such as split=zoom")
+    flags.DEFINE_integer("shorter", 1, "divide all lengths of stage 1 by so much", lower_bound=1)
     flags.DEFINE_bool("ladder", False, "go from the paper's baseline to ours instead")
     flags.DEFINE_bool("print_only", False, "train nothing")
     flags.DEFINE_string("output_dir", "outputs/studies", "folder of the runs to make")
@@ -109,37 +114,63 @@ def main(_: list[str]) -> None:
 
 def scene_results(scene: str) -> tuple[str, Results, dict[str, Results]]:
     """Return a scene's name, the results of its run with all arms, and those of other baselines."""
-    name, given = pathlib.Path(scene).name, [f"--{text}" for text in FLAGS.given]
-    folder = _folder(FLAGS.preset)
-    found = _run(folder, scene, f"--preset={FLAGS.preset}", *given)
+    name, folder = pathlib.Path(scene).name, _folder(FLAGS.preset)
+    found = _run(folder, scene, *_of("surfels", FLAGS.preset))
     arms = {} if FLAGS.print_only else ARMS
     stages = {**found.get("stages", {}), **train_arms(folder / name, arms)}
     others = {}
     for title in FLAGS.baselines:
         method = _BASELINES[title]
-        flags_of = (f"--method={method}", "--preset=paper", "--stages=baseline", *given)
-        if other := _run(_folder(method), scene, *flags_of):
+        if other := _run(_folder(method), scene, *_of(method, "paper"), "--stages=baseline"):
             others[title] = other
     return name, {**found, "stages": stages}, others
 
 
 def ladder_results(scene: str) -> dict[str, Results]:
     """Return the results of the runs that lead from the paper's baseline to ours, by step."""
-    given, shared, found = [f"--{text}" for text in FLAGS.given], [], {}
+    given: Sequence[str] = ()
+    found = {}
     for index, (title, added) in enumerate(LADDER.items()):
-        shared = [*added] if added[0].startswith("--preset") else [*shared, *added]
+        preset = added[0].removeprefix("--preset=") if added[0].startswith("--preset") else None
+        given = _of("surfels", preset) if preset else [*given, *added]
         if index:
-            results = _run(_folder(f"ladder_{index}"), scene, *shared, *_ALONE, *given)
+            results = _run(_folder(f"ladder_{index}"), scene, *given, *_ALONE)
         else:
-            results = _run(_folder("paper"), scene, *shared, *given)
+            results = _run(_folder("paper"), scene, *given)
         if results:
             found[title] = results
     return found
 
 
+def _of(method: str, preset: str) -> list[str]:
+    """Return the flags of a run: its preset, how much shorter that is, and what all are given."""
+    shown = [f"--method={method}", f"--preset={preset}"]
+    if FLAGS.shorter > 1 and preset.startswith("paper"):
+        shown += [f"--set={text}" for text in shorter(METHODS[method].presets[preset])]
+    return shown + [f"--{text}" for text in FLAGS.given]
+
+
+def shorter(preset: Any, factor: int | None = None) -> list[str]:
+    """Return settings, as `name=value`, with which stage 1 of a preset is shorter in all parts.
+
+    Args:
+      preset: a preset of splats.
+      factor: what lengths are divided by; default: `--shorter`.
+    """
+    parts = [("", preset, _LENGTHS), ("", preset.field, _LENGTHS)]
+    parts += [("density.", preset.field.density, _DENSITY_LENGTHS)]
+    return [
+        f"{path}{name}={max(1, getattr(part, name) // (factor or FLAGS.shorter))}"
+        for path, part, names in parts
+        for name in names
+        if hasattr(part, name)
+    ]
+
+
 def _folder(kind: str) -> pathlib.Path:
     """Return the folder of the runs of a kind, with the flags that all runs are given."""
     words = [kind, *(text.replace("=", "_") for text in FLAGS.given)]
+    words += [f"shorter_{FLAGS.shorter}"] * (FLAGS.shorter > 1)
     return pathlib.Path(FLAGS.output_dir) / "_".join(words)
 
 
