@@ -26,11 +26,11 @@ from jaxcloseup.training.state import TrainState
 
 
 COUNTS = 60_000, 250_000, 1_000_000
-STEPS = 50  # of each timed call
+STEPS = 10, 60  # of a short and a long call: both sort the surfels once, as runs do every 500 steps
 
 
 def run() -> None:
-    """Print milliseconds of a step on a window, by number of surfels, and the memory in use."""
+    """Print milliseconds of a step, by number of surfels, and the memory in use."""
     scene = load_scene("table", downscale=QUICK.downscale)
     points, rgb, spacing = _seen_points(scene)
     calls = {}
@@ -42,15 +42,20 @@ def run() -> None:
             share = jnp.zeros(levels).at[level].set(1)
             data = TrainData(dataclasses.replace(windows, shares=share))
 
-            def steps(programs=programs, state=state, data=data):
-                return programs.run(state, data, count=STEPS)[0].params.means
+            for number in STEPS:
 
-            calls[f"{count:,} surfels, {name}"] = steps
-            jax.block_until_ready(steps())
+                def steps(programs=programs, state=state, data=data, number=number):
+                    return programs.run(state, data, count=number)[0].params.means
+
+                calls[f"{count:,} surfels, {name}", number] = steps
+                jax.block_until_ready(steps())
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
         print(f"{count:,} surfels: {memory:.0f} MiB at most so far", flush=True)
-    for name, seconds in interleaved_medians(calls, 5).items():
-        print(f"{name}: {1e3 * seconds / STEPS:.1f} ms a step", flush=True)
+    medians = {key: 1e3 * seconds for key, seconds in interleaved_medians(calls, 5).items()}
+    few, many = STEPS
+    for name in dict.fromkeys(name for name, _ in medians):
+        step = (medians[name, many] - medians[name, few]) / (many - few)
+        print(f"{name}: {step:.1f} ms a step, {medians[name, few] - few * step:.0f} to sort them")
 
 
 def _seen_points(scene):
@@ -64,9 +69,8 @@ def _seen_points(scene):
 
 def _trained_on(scene, points, rgb, spacing, count):
     """Return programs and a state with `count` surfels at seen points."""
-    field = dataclasses.replace(
-        QUICK.field, capacity=count, raster=dataclasses.replace(QUICK.field.raster, capacity=2**19)
-    )
+    raster = dataclasses.replace(QUICK.field.raster, capacity=2**19)
+    field = dataclasses.replace(QUICK.field, capacity=count, raster=raster, depth_weight=0.0)
     programs = Programs(dataclasses.replace(QUICK, field=field, stereo=None), scene)
     rng = np.random.default_rng(0)
     chosen = rng.integers(0, len(points), count)
