@@ -236,42 +236,50 @@ def _describe(
     solids: Solids, origin: jax.Array, direction: jax.Array, depth: jax.Array, index: jax.Array
 ) -> Hit:
     """Compute the normal, face and chart of a crossing."""
+    # Written out by component: of small arrays, XLA would compute what they share anew for each.
     is_hit = index >= 0
     index = jnp.maximum(index, 0)
-    point = origin + jnp.where(is_hit, depth, 0) * direction
+    along = jnp.where(is_hit, depth, 0)
+    point = tuple(a + along * b for a, b in zip(origin, direction, strict=True))
     to_local, taper, kind = solids.to_local[index], solids.taper[index], solids.kind[index]
-    x, y, z = _apply(to_local, tuple(point), 1.0)
-    local, square, up = jnp.stack([x, y, z]), jnp.stack([x, y]), jnp.array([0.0, 0.0, 1.0])
-
-    axis = jnp.argmax(jnp.abs(local)).astype(jnp.int32)
-    sign = jnp.where(local[axis] < 0, -1.0, 1.0)
-    box_normal = sign * jax.nn.one_hot(axis, 3)
-    box_face = 2 * axis + jnp.where(sign > 0, 1, 0)
-    box_chart = jnp.select([axis == 0, axis == 1], [local[1:], local[::2]], square)
-
-    on_cap = jnp.abs(z) > jnp.hypot(x, y) / (1 + taper * z)
-    end = jnp.where(z > 0, 1.0, -1.0)
-    side_normal = jnp.stack([x, y, -taper * (1 + taper * z)])
-    cap_face = jnp.where(z > 0, 2, 1)
-    cap_chart = square / (1 + end * taper)  # in units of its own radius
-
+    x, y, z = _apply(to_local, point, 1.0)
     is_plane, is_box = kind == PLANE, kind == BOX
-    is_cap = (kind == CYLINDER) & on_cap
-    is_side = (kind == CYLINDER) & ~on_cap
-    face = jnp.select([is_box, is_cap], [box_face, cap_face], 0)
-    normal = jnp.select(
-        [is_plane, is_box, is_cap, is_side], [up, box_normal, end * up, side_normal], local
-    )
-    around = jnp.stack([jnp.arctan2(y, x) / jnp.pi, z])
-    chart = jnp.select([is_plane, is_box, is_cap], [square, box_chart, cap_chart], around)
+    on_cap = jnp.abs(z) > jnp.hypot(x, y) / (1 + taper * z)
+    is_cap, is_side = (kind == CYLINDER) & on_cap, (kind == CYLINDER) & ~on_cap
 
+    # A box shows the side to which the point is nearest.
+    across_x = (jnp.abs(x) >= jnp.abs(y)) & (jnp.abs(x) >= jnp.abs(z))
+    across_y = ~across_x & (jnp.abs(y) >= jnp.abs(z))
+    across_z = ~across_x & ~across_y
+    nearest = jnp.where(across_x, x, jnp.where(across_y, y, z))
+    sign, end = (jnp.where(side < 0, -1.0, 1.0) for side in (nearest, z))
+    axis = jnp.where(across_x, 0, jnp.where(across_y, 1, 2))
+    box_face = 2 * axis + jnp.where(sign > 0, 1, 0)
+    face = jnp.where(is_box, box_face, jnp.where(is_cap, jnp.where(z > 0, 2, 1), 0))
+
+    def normal_along(across: jax.Array, flat: jax.Array | float, round_: jax.Array) -> jax.Array:
+        of_box = jnp.where(across, sign, 0)
+        return jnp.where(is_plane | is_cap, flat, jnp.where(is_box, of_box, round_))
+
+    flank = jnp.where(is_side, -taper * (1 + taper * z), z)
+    local = [
+        normal_along(across_x, 0.0, x),
+        normal_along(across_y, 0.0, y),
+        normal_along(across_z, jnp.where(is_plane, 1, end), flank),
+    ]
     # Normals transform by the transpose of the map to the unit solid.
-    normal = jnp.asarray(sum(to_local[i, :3] * normal[i] for i in range(3)))
-    normal = normal / jnp.sqrt(jnp.sum(normal * normal))
-    normal = jnp.where(jnp.sum(normal * direction) > 0, -normal, normal)
+    normal = [_dot([*to_local[:, i]], local) for i in range(3)]
+    facing = jnp.where(_dot(normal, [*direction]) > 0, -1, 1) / jnp.sqrt(_dot(normal, normal))
+
+    radius = 1 + end * taper  # of a cap, whose chart is in units of it
+    around = jnp.arctan2(y, x) / jnp.pi
+    chart = (
+        jnp.select([is_plane, is_box, is_cap], [x, jnp.where(across_x, y, x), x / radius], around),
+        jnp.select([is_plane, is_box, is_cap], [y, jnp.where(across_z, y, z), y / radius], z),
+    )
     return Hit(
         depth=jnp.where(is_hit, depth, jnp.inf),
-        normal=jnp.where(is_hit, normal, 0),
+        normal=jnp.where(is_hit, jnp.stack([facing * a for a in normal]), 0),
         face=jnp.where(is_hit, solids.first_face[index] + face, 0),
-        chart=jnp.clip((chart + 1) / 2, 0, 1),
+        chart=jnp.clip((jnp.stack(chart) + 1) / 2, 0, 1),
     )

@@ -68,41 +68,49 @@ def pack_pyramid(image: np.ndarray) -> np.ndarray:
     return np.concatenate(levels)
 
 
+# Both samplers are written out by corner and channel: of small arrays, XLA would compute the index
+# of a texel anew for each entry.
 def sample_texture(
     texels: jax.Array, texture: jax.Array, uv: jax.Array, level: jax.Array
 ) -> jax.Array:
     """Sample `[3]` of the periodic pyramid `texels[texture]` at `uv[2]` repeats, trilinearly."""
     level = jnp.clip(level, 0, LEVELS - 1)
     fine = jnp.minimum(jnp.floor(level), LEVELS - 2).astype(jnp.int32)
-    levels = fine + jnp.arange(2)
     blend = level - fine.astype(jnp.float32)
-    size = TEXTURE_SIZE >> levels
-    first = (4 * (TEXTURE_SIZE**2 - size * size)) // 3  # texels in all finer levels
-    xy = (uv - jnp.floor(uv))[None] * size[:, None].astype(jnp.float32) - 0.5
-    corner, weight = _corners(xy)  # [2, 4, 2], [2, 4]
-    corner = corner & (size - 1)[:, None, None]
-    index = first[:, None] + corner[..., 1] * size[:, None] + corner[..., 0]
-    weight = weight * jnp.stack([1 - blend, blend])[:, None]
-    return jnp.sum(_unpack(texels[texture, index]) * weight[None], axis=(1, 2))
+    within = [repeat - jnp.floor(repeat) for repeat in uv]
+    rgb = [jnp.zeros(())] * 3
+    for pyramid_level, share in ((fine, 1 - blend), (fine + 1, blend)):
+        size = TEXTURE_SIZE >> pyramid_level
+        first = (4 * (TEXTURE_SIZE**2 - size * size)) // 3  # texels in all finer levels
+        for x, y, weight in _corners(*(size.astype(jnp.float32) * part - 0.5 for part in within)):
+            packed = texels[texture, first + (y & (size - 1)) * size + (x & (size - 1))]
+            weight = share * weight
+            rgb = [a + weight * b for a, b in zip(rgb, _unpack(packed), strict=True)]
+    return jnp.stack(rgb)
 
 
-def _corners(xy: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the four integer neighbors `[..., 4, 2]` of points, and bilinear weights."""
-    low = jnp.floor(xy)
-    part = (xy - low)[..., None, :]
-    far = jnp.array([[0, 0], [1, 0], [0, 1], [1, 1]]).reshape((1,) * (xy.ndim - 1) + (4, 2))
-    weight = jnp.where(far == 1, part, 1 - part).prod(-1)
-    return low.astype(jnp.int32)[..., None, :] + far, weight
+def _corners(x: jax.Array, y: jax.Array) -> list[tuple[jax.Array, jax.Array, jax.Array]]:
+    """Return the four integer neighbors (x, y) of a point, and their bilinear weights."""
+    low_x, low_y = jnp.floor(x), jnp.floor(y)
+    right, down = x - low_x, y - low_y
+    i, j = low_x.astype(jnp.int32), low_y.astype(jnp.int32)
+    columns, rows = ((i, 1 - right), (i + 1, right)), ((j, 1 - down), (j + 1, down))
+    return [(column, row, a * b) for row, b in rows for column, a in columns]
 
 
 def sample_light(light: jax.Array, faces: Faces, hit: Hit) -> jax.Array:
     """Sample the baked light `[C]` at a hit, bilinearly in the tile of its face."""
     first, width, height = faces.tile[hit.face]
-    corner, weight = _corners(hit.chart * jnp.stack([width, height]).astype(jnp.float32) - 0.5)
-    x, y = corner.T
-    x = jnp.where(faces.wraps[hit.face] > 0, x % width, jnp.clip(x, 0, width - 1))
-    entries = light[first + jnp.clip(y, 0, height - 1) * width + x]
-    return jnp.sum(entries * weight[:, None], axis=0)
+    wraps, total = faces.wraps[hit.face] > 0, jnp.zeros(light.shape[1])
+    place = (
+        hit.chart[i] * size.astype(jnp.float32) - 0.5 for i, size in enumerate((width, height))
+    )
+    for x, y, weight in _corners(*place):
+        # At most one past either end.
+        around = jnp.where(x < 0, x + width, jnp.where(x < width, x, x - width))
+        x = jnp.where(wraps, around, jnp.clip(x, 0, width - 1))
+        total = total + weight * light[first + jnp.clip(y, 0, height - 1) * width + x]
+    return total
 
 
 def surface_color(world: World, hit: Hit, footprint: jax.Array) -> jax.Array:
@@ -201,13 +209,12 @@ def lattice(count: int) -> jax.Array:
 
 def mean_colors(texels: jax.Array) -> np.ndarray:
     """Return the mean color `[K, 3]` of each pyramid."""
-    return np.asarray(_unpack(texels[:, -1])).T
+    return np.stack(_unpack(texels[:, -1]), axis=-1)
 
 
-def _unpack(packed: jax.Array) -> jax.Array:
-    """Unpack RGB `[3, ...]` in [0, 1] from bytes."""
-    rgb = [(packed >> shift) & 255 for shift in (0, 8, 16)]
-    return jnp.stack(rgb).astype(jnp.float32) / 255
+def _unpack(packed: jax.Array) -> list[jax.Array]:
+    """Unpack red, green and blue in [0, 1] from bytes."""
+    return [((packed >> shift) & 255).astype(jnp.float32) / 255 for shift in (0, 8, 16)]
 
 
 def _unit(v: jax.Array) -> jax.Array:
