@@ -1,5 +1,7 @@
 """Depth by stereo in a run: what training begins with, on walls drawn by ray casting."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,11 +16,13 @@ from jaxcloseup.app.run.measured_exposures import (
     read_exposures,
     write_exposures,
 )
-from jaxcloseup.app.run.stereo_depths import draw_points, match_photographs
+from jaxcloseup.app.run.stereo_depths import draw_points, match_photographs, matched_divisor
+from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.native import library
 from jaxcloseup.photos.light import change_exposure
 from jaxcloseup.photos.pyramids import photograph_pyramid
 from jaxcloseup.photos.scene import Scene
+from jaxcloseup.photos.views import Views
 from jaxcloseup.stereo import StereoConfig
 
 
@@ -102,3 +106,23 @@ def test_exposures_are_kept(exposures, tmp_path):
         (tmp_path / NAME).write_text(damage)
         with pytest.raises(ValueError, match="does not hold the exposures of these photographs"):
             read_exposures(tmp_path, names)
+
+
+@pytest.mark.parametrize("times", [0.1, 1.2, 3.0, 5.0, 1e3])
+def test_photographs_are_drawn_at_the_size_that_is_matched(times):
+    """The witness makes the whole pyramid and asks it for its level."""
+
+    def blank(width, height):
+        camera = Camera(jnp.zeros((2, 3, 4)), jnp.ones((2, 4)), height, width)
+        return Views(camera, np.zeros((2, height, width, 3), np.uint8), np.ones((2, height, width)))
+
+    small, budget = blank(24, 18), StereoTraining(pixels=int(times * 2 * 24 * 18))
+    wanted = 24 * max(1, times) ** 0.5
+    for reduced in (1, 2, 3, 4, 5, 8):
+        for finest in range(1, reduced):
+            whole = blank(24 * reduced // finest, 18 * reduced // finest)
+            pyramid = photograph_pyramid(whole, small)
+            expected = pyramid.sizes[pyramid.level_near(wanted)][1]
+            scene = SimpleNamespace(train=small, metadata={"downscale": reduced})
+            divisor = matched_divisor(scene, budget, finest)
+            assert expected == pytest.approx(24 * reduced / divisor, abs=1), (reduced, finest)

@@ -6,7 +6,12 @@ from jaxcloseup.app import progress
 from jaxcloseup.app.methods.method import Preset, StereoTraining
 from jaxcloseup.app.run.measured_exposures import measure_exposures
 from jaxcloseup.app.run.photograph_sizes import finest_read
-from jaxcloseup.app.run.stereo_depths import StereoDepths, can_match, match_photographs
+from jaxcloseup.app.run.stereo_depths import (
+    StereoDepths,
+    can_match,
+    match_photographs,
+    matched_divisor,
+)
 from jaxcloseup.io.memory import give_back_memory
 from jaxcloseup.photos.exposures import Exposures
 from jaxcloseup.photos.pyramids import Pyramid, scene_pyramid
@@ -64,5 +69,8 @@ class ReadPhotographs:
     def _match(self, preset: Preset, config: StereoTraining) -> StereoDepths | None:
         if not can_match(self._scene):
             return None
-        pyramid, _ = self.pyramid(finest_read(preset, self._scene))
-        return match_photographs(self._scene, pyramid, config)
+        scene, finest = self._scene, finest_read(preset, self._scene)
+        if scene.surface is not None:  # drawing costs by the pixel, reading by the file
+            finest = matched_divisor(scene, config, finest)
+        pyramid, _ = self.pyramid(finest)
+        return match_photographs(scene, pyramid, config)

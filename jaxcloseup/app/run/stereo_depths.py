@@ -52,6 +52,25 @@ def can_match(scene: Scene) -> bool:
     return True
 
 
+def matched_divisor(scene: Scene, config: StereoTraining, finest: int) -> int:
+    """Return the divisor of the photographs' own size at which they are matched.
+
+    Args:
+      scene: a scene whose photographs were divided for training.
+      config: how many pixels are matched.
+      finest: divisor of the finest photographs, which `photograph_pyramid` halves, and of which the
+        level near the size that `config` affords is matched.
+    """
+    reduced, cameras = scene.metadata.get("downscale", 1), scene.train.cameras
+    affords = config.pixels / (len(scene.train) * cameras.height * cameras.width)
+    widest = 1.5 * max(1.0, affords**0.5)  # of a level, in widths of the reduced photographs
+    while reduced / finest >= widest:
+        if reduced / (2 * finest) < 1.5:
+            return reduced
+        finest *= 2
+    return finest
+
+
 def match_photographs(
     scene: Scene, pyramid: Pyramid, config: StereoTraining, matching: StereoConfig = _MATCHING
 ) -> StereoDepths:
