@@ -61,7 +61,7 @@ def read_listing(
     content, placement = placed(content)
     folder, scene = detected.folder, detected.folder.resolve().name
     given = content.given
-    if split == "given" and not given:
+    if split in ("given", "listed") and not given:
         given = splits_from_file(folder, content.frames)
     points, rgb = content.points
     division = divide(scene, content.frames, given, split, points, zoom, find_points=find_points)

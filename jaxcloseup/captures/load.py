@@ -59,7 +59,7 @@ def load_scene(
       half_pixel: whether the files put pixel centers at integers, as the paper's data does.
       background: gray level in [0, 1] behind transparent pixels.
       format: the only format to read, `transforms`, `colmap` or `llff`; None reads the first found.
-      split: how to hold out photographs: `given`, `every8`, `closest` or `zoom`.
+      split: how to hold out photographs: `given`, `listed`, `every8`, `closest` or `zoom`.
       zoom: how many times finer `test` is with split `zoom`, 2 or more; None means 4.
       invert_masks: whether masks mark ignored pixels in white instead of black.
       alpha_mode: `blend` shows the background through transparent pixels; `mask` keeps the file's

@@ -92,7 +92,8 @@ def divide(
       name: name of the capture, for notes.
       frames: all photographs.
       given: splits that the capture's files list, or None.
-      split: one of `SPLITS`, see `load_scene`; `given` without lists holds out every 8th.
+      split: one of `SPLITS`, see `load_scene`; without lists `given` holds out every 8th, and
+        `listed` nothing.
       points: `[P, 3]` world points, which `closest` needs.
       zoom: how many times finer the close-ups of `zoom` are.
       find_points: finds them for `closest` where there are none.
@@ -100,9 +101,12 @@ def divide(
     Raises:
       SceneError: `closest` has too few photographs, or no points that they see.
     """
-    if split == "given" and given:
+    if split in ("given", "listed") and given:
         return Division(given)
     frames = sorted({frame.file: frame for frame in frames}.values(), key=lambda f: f.listed)
+    if split == "listed":
+        note = f"{name} lists no splits: all of its {len(frames)} photographs train, none is scored"
+        return Division({"train": frames}, (note,))
     if split == "closest":
         return _closest(name, frames, points, find_points)
     if split == "zoom":

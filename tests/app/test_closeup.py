@@ -67,7 +67,8 @@ def test_photographs_get_poses_and_are_trained_on_as_far_as_that_is_not_done(
     find, train, shown = started
     assert find == ["process", f"--images={photographs}", f"--output_dir={out / 'capture'}"]
     assert train[:3] == ["run", f"--scene={out / 'capture'}", f"--output_dir={out / 'run'}"]
-    assert "--minutes=3" in train and "--resume" not in train and shown == out / "run"
+    assert "--minutes=3" in train and "--split=listed" in train
+    assert "--resume" not in train and shown == out / "run"
     assert "photographs without poses" in capsys.readouterr().out
     # Stopped while it trained, then finished.
     (out / "run" / "checkpoints").mkdir(parents=True)
@@ -81,12 +82,14 @@ def test_photographs_get_poses_and_are_trained_on_as_far_as_that_is_not_done(
 def test_captures_and_videos_are_told_from_photographs(closeup, started, capture_folder, tmp_path):
     closeup(capture_folder, fix=True, check=False)
     assert started[0][:2] == ["run", f"--scene={capture_folder}"]
-    assert started[0][-2:] == ["--nocheck", "--fix"]
+    assert started[0][-2:] == ["--nocheck", "--fix"] and "--split=listed" in started[0]
+    closeup("table")
+    assert "--split=listed" not in started[2]  # a drawn scene has no lists
     video = tmp_path / "walk.mp4"
     video.write_bytes(b"")
     closeup(video, output_dir=None)
-    assert started[2][:2] == ["process", f"--video={video}"]
-    assert started[4] == program.pathlib.Path("outputs/walk/closeup/run")
+    assert started[4][:2] == ["process", f"--video={video}"]
+    assert started[6] == program.pathlib.Path("outputs/walk/closeup/run")
 
 
 @pytest.mark.parametrize(

@@ -34,10 +34,17 @@ def test_split_file(capture):
     assert load_scene(capture).names == {"train": ["1", "2"], "test": ["0"]}
     (capture / "split.json").write_text(json.dumps({"unused": ["1.png"], "test_far": ["2.png"]}))
     assert load_scene(capture).names == {"train": ["0"], "test_far": ["2"]}
+    assert load_scene(capture, split="listed").names == {"train": ["0"], "test_far": ["2"]}
     assert load_scene(capture, split="every8").names["train"] == ["1", "2"]
     (capture / "split.json").write_text(json.dumps({"train": ["1.png"], "why": "because"}))
     with pytest.warns(UnknownKeyWarning, match=r"split\.json: these fields are ignored: why"):
         load_scene(capture)
+
+
+def test_nothing_is_held_out_that_no_list_names(capture):
+    scene = load_scene(capture, split="listed")
+    assert scene.names == {"train": ["0", "1", "2"]} and scene.test is scene.test_far is None
+    assert "all of its 3 photographs train" in " ".join(scene.metadata["notes"])
 
 
 def test_every_eighth_of_separate_files(tmp_path):

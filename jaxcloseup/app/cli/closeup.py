@@ -104,7 +104,9 @@ def _trained(source: str, kind: str, folder: pathlib.Path) -> pathlib.Path:
     else:
         print(f"{source}: a {kind}; {_training()}")
     resume = ["--resume"] if (run / CHECKPOINTS).is_dir() else []
-    given = f"--scene={capture}", f"--output_dir={run}", f"--minutes={_minutes():g}"
+    given = [f"--scene={capture}", f"--output_dir={run}", f"--minutes={_minutes():g}"]
+    # A picture is wanted, not a score: all photographs train but those that the capture holds out.
+    given += ["--split=listed"] * (kind != "scene")
     changed = [FLAGS[name] for name in CHECK if FLAGS[name].value != FLAGS[name].default]
     checking = [f"--{'' if flag.value else 'no'}{flag.name}" for flag in changed]
     _start("run", *given, "--stages=detail", *checking, *resume)
