@@ -8,7 +8,7 @@ from absl.testing import flagsaver
 from tiny_runs import KEPT, copy_of
 from wrong_input import endless, pipe, terabyte
 
-from jaxcloseup.app.cli import render, sweep
+from jaxcloseup.app.cli import render, run, sweep
 from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.methods.settings import check_value, plain_config, settings_of, with_settings
 from jaxcloseup.app.run import states
@@ -177,3 +177,14 @@ def test_whole_numbers_may_stand_for_others():
     stored["labels"]["lr_scale"] = 1
     preset, _ = preset_from_config(stored)
     assert preset == KEPT and isinstance(preset.labels.lr_scale, float)
+
+
+def test_settings_that_a_run_found_for_itself_are_read_as_strictly(kept, tmp_path, capture_folder):
+    flags.FLAGS(["run"])
+    broken = copy_of(kept, tmp_path / "broken", RUN, without("config"))
+    given = {"scene": str(capture_folder), "output_dir": str(broken), "check": False}
+    with (
+        flagsaver.flagsaver(compilation_cache="", resume=True, minutes=1.0, **given),
+        pytest.raises(SystemExit, match=r"^jaxcloseup run: .*run\.json: config must be an object"),
+    ):
+        run.main(["run"])

@@ -31,7 +31,6 @@ from jaxcloseup.app.cli.start import in_one_sentence, loading, set_up
 from jaxcloseup.app.cli.topics import share
 from jaxcloseup.app.methods.method import Preset
 from jaxcloseup.app.run.stage_names import STAGES
-from jaxcloseup.io.files import read_object
 
 
 if TYPE_CHECKING:
@@ -66,10 +65,11 @@ def main(_: list[str]) -> None:
         from jaxcloseup.app.run.loop import TrainingError
         from jaxcloseup.app.run.scene_input import load
         from jaxcloseup.app.score.scores import find_perceptual
+        from jaxcloseup.app.store.stored_run import RunError
         from jaxcloseup.artifacts.checkpoints import CheckpointError
         from jaxcloseup.photos.scene import SceneError
     set_up()
-    with in_one_sentence("run", SceneError, OSError, ValueError):
+    with in_one_sentence("run", SceneError, RunError, OSError, ValueError):
         if FLAGS.tensorboard:
             check_tensorboard()
         preset = preset_from_flags()
@@ -109,8 +109,9 @@ def main(_: list[str]) -> None:
 def _resumed(output_dir: pathlib.Path) -> "tuple[Preset, ReadPhotographs | None]":
     """Return the preset with the settings that were found when the run began."""
     from jaxcloseup.app.store.stored_config import preset_from_config
+    from jaxcloseup.app.store.stored_run import read_fields
 
-    identity = read_object(output_dir / CHECKPOINTS / "run.json")
+    identity = read_fields(output_dir / CHECKPOINTS / "run.json", {"config": dict})
     return preset_from_config(identity["config"])[0], None
 
 
