@@ -1,6 +1,7 @@
 """Rendering a run: its state is the plane as surfels, kept as a run would keep it."""
 
 import dataclasses
+import itertools
 import json
 
 import cv2
@@ -20,7 +21,9 @@ from jaxcloseup.app.run.labels import LabelStart
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.store.stored_config import preset_from_config
 from jaxcloseup.app.store.stored_run import RunError, change_settings, load_run_scene, read_run
+from jaxcloseup.app.view import frames
 from jaxcloseup.captures.load import load_scene
+from jaxcloseup.labels.make import LabelSources
 
 
 @pytest.fixture
@@ -237,3 +240,19 @@ def test_settings_change_what_is_fine_tuned(kept):
     assert changed.trained == KEPT
     with pytest.raises(RunError, match=r"--set=sharpness=3: .* no setting sharpness"):
         change_settings(read_run(kept), ["sharpness=3"])
+
+
+def test_support_of_a_large_image_repeats_every_second_pixel(monkeypatch):
+    views, depths = plane.make_views([plane.camera_above(x, 0.0, 3.0) for x in (-1.0, 0.5)])
+    camera = plane.camera_above(0.3, 0.2, 4.0, tilt=0.1)
+    camera = camera.replace(height=plane.HEIGHT - 1, width=plane.WIDTH - 3)  # odd
+    depth, sources = plane.surface(camera)[1], LabelSources(views, depths, blocks=None)
+    every = frames._support_of(camera, depth, sources)
+    monkeypatch.setattr(frames, "_LARGE", 0)
+    for whole, repeated in zip(every, frames._support_of(camera, depth, sources), strict=True):
+        assert whole.shape == repeated.shape == depth.shape and len(np.unique(whole)) > 1
+        for i, j in itertools.product((0, 1), (0, 1)):
+            part = repeated[i::2, j::2]
+            np.testing.assert_array_equal(
+                part, whole[::2, ::2][: part.shape[0], : part.shape[1]], strict=True
+            )

@@ -30,6 +30,7 @@ from jaxcloseup.training.state import TrainState
 
 
 SOLID = 0.5  # opacity of a pixel that shows the scene
+_LARGE = 200_000  # pixels of an image whose support is found at every second pixel and row
 _support = jax.jit(find_support)
 
 
@@ -125,15 +126,25 @@ def draw_pictures(
     if seen.normal is not None:
         images["normals"] = colorize_normals(np.where(solid[..., None], seen.normal, 0))
     if sources is not None:
-        pixels = pixel_grid(camera.height, camera.width)
-        support = _support(camera, pixels, depth, sources.views, sources.depths)
-        images["support"] = colorize_support(*support)
+        images["support"] = colorize_support(*_support_of(camera, depth, sources))
     if detail is not None:
         sharper = detailed(programs, detail, camera, seen)
         images |= {"rgb": sharper.rgb, "trust": np.asarray(sharper.weight)}
         images["error"] = colorize_expected_error(sharper.error)
     images["rgb"] = np.asarray(expose(programs, images["rgb"], seen))
     return images
+
+
+def _support_of(camera: Camera, depth: jax.Array, sources: LabelSources) -> list[np.ndarray]:
+    """Return count and footprint of an image's support, which repeat in a large image.
+
+    The depth maps of the photographs, which decide it, are coarser still.
+    """
+    step = 2 if depth.size > _LARGE else 1
+    pixels, some = pixel_grid(*depth.shape)[::step, ::step], depth[::step, ::step]
+    found = jax.device_get(_support(camera, pixels, some, sources.views, sources.depths))
+    repeated = (part.repeat(step, axis=0).repeat(step, axis=1) for part in found)
+    return [part[: depth.shape[0], : depth.shape[1]] for part in repeated]
 
 
 def depth_range(depths: Sequence[jax.Array], scene: Scene) -> tuple[float, float]:
