@@ -19,7 +19,7 @@ from jaxcloseup.fields.splats.surfels import Surfels
 from jaxcloseup.geometry.cameras import Camera
 
 
-_LARGEST, _SMALLEST = 128, 32  # surfels of a chunk
+_LARGEST, _SMALLEST = 64, 32  # surfels of a chunk: smaller ones hold less that is out of sight
 _STEP = 2  # parts are compiled for this many times more chunks, and for all
 _FEWEST = 64  # chunks of the smallest part; smaller ones would save less than they compile
 _SAMPLED = 4096  # surfels, about, of which quantiles are taken: more would only take longer
