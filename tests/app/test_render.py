@@ -6,6 +6,7 @@ import json
 
 import cv2
 import jax
+import jax.numpy as jnp
 import numpy as np
 import plane
 import pytest
@@ -23,6 +24,7 @@ from jaxcloseup.app.store.stored_config import preset_from_config
 from jaxcloseup.app.store.stored_run import RunError, change_settings, load_run_scene, read_run
 from jaxcloseup.app.view import frames
 from jaxcloseup.captures.load import load_scene
+from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.labels.make import LabelSources
 
 
@@ -256,3 +258,25 @@ def test_support_of_a_large_image_repeats_every_second_pixel(monkeypatch):
             np.testing.assert_array_equal(
                 part, whole[::2, ::2][: part.shape[0], : part.shape[1]], strict=True
             )
+
+
+def test_support_is_as_fine_as_the_photographs_own_pixels(kept, monkeypatch):
+    """Photographs reduced fourfold have four times finer pixels of their own."""
+    record = read_run(kept)
+    programs = Programs(record.preset, load_run_scene(record))
+    views, depths = plane.make_views([plane.camera_above(x, 0.0, 3.0) for x in (-1.0, 0.5)])
+    sources, camera = LabelSources(views, depths, blocks=None), plane.camera_above(0.3, 0.2, 4.0)
+    rgb, depth, _ = plane.surface(camera)
+    seen, shown = Rendering(rgb, depth, jnp.ones_like(depth)), []
+    monkeypatch.setattr(frames, "colorize_support", lambda *maps: shown.append(maps) or maps[0])
+    for reduced in (1, 4):
+        programs.scene = dataclasses.replace(
+            programs.scene,
+            metadata={**programs.scene.metadata, "downscale": reduced},
+            photographs_at=lambda factor, split="train": [],
+        )
+        frames.draw_pictures(programs, seen, camera, sources=sources)
+    (counts, whole), (same, fine) = shown
+    assert np.isfinite(whole).any()
+    np.testing.assert_array_equal(counts, same)
+    np.testing.assert_array_equal(whole, 4 * fine)

@@ -126,7 +126,10 @@ def draw_pictures(
     if seen.normal is not None:
         images["normals"] = colorize_normals(np.where(solid[..., None], seen.normal, 0))
     if sources is not None:
-        images["support"] = colorize_support(*_support_of(camera, depth, sources))
+        count, footprint = _support_of(camera, depth, sources)
+        # Detail and windows show the photographs' own pixels, and sources are reduced.
+        reduced = scene.metadata.get("downscale", 1) if scene.photographs_at else 1
+        images["support"] = colorize_support(count, footprint / reduced)
     if detail is not None:
         sharper = detailed(programs, detail, camera, seen)
         images |= {"rgb": sharper.rgb, "trust": np.asarray(sharper.weight)}
