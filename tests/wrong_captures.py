@@ -442,7 +442,7 @@ CASES = {
         (same, "choose 'spread' needs photographs: say how many", {"choose": "spread"}),
         (same, "format 'nerf' is unknown: choose one of transforms", {"format": "nerf"}),
         (same, "holds no capture in the format colmap", {"format": "colmap"}),
-        (same, "split 'nearest' is unknown: choose one of given, eve", {"split": "nearest"}),
+        (same, "split 'nearest' is unknown: choose one of given", {"split": "nearest"}),
         (same, "closest needs points.*--format=colmap.*--split=", {"split": "closest"}),
         (same, "alpha_mode 'x' is unknown: choose one of blend, mask", {"alpha_mode": "x"}),
         (alone, "closest needs at least 2 photographs", {"split": "closest"}),

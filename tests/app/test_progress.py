@@ -182,14 +182,18 @@ def test_ctrl_c_leaves_a_terminal_with_a_cursor():
             said += os.read(terminal, 4096)
         return said
 
-    with subprocess.Popen(
+    # A test session that a shell started in the background ignores Ctrl-C.
+    ours = signal.signal(signal.SIGINT, signal.default_int_handler)
+    process = subprocess.Popen(
         [sys.executable, "-c", program],
         stdin=inner,
         stdout=inner,
         stderr=inner,
         env=os.environ | {"TERM": "xterm", "COLUMNS": "80"},
         cwd=pathlib.Path(__file__).parents[2],
-    ) as process:
+    )
+    signal.signal(signal.SIGINT, ours)
+    with process:
         said = read_until(b"waiting")
         process.send_signal(signal.SIGINT)
         said += read_until(b"program: stopped")
