@@ -51,7 +51,7 @@ def run() -> None:
                 jax.block_until_ready(steps())
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
         print(f"{count:,} surfels: {memory:.0f} MiB at most so far", flush=True)
-    medians = {key: 1e3 * seconds for key, seconds in interleaved_medians(calls, 5).items()}
+    medians = {key: 1e3 * seconds for key, seconds in interleaved_medians(calls, 3).items()}
     few, many = STEPS
     for name in dict.fromkeys(name for name, _ in medians):
         step = (medians[name, many] - medians[name, few]) / (many - few)

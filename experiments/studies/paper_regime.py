@@ -133,11 +133,8 @@ def ladder_results(scene: str) -> dict[str, Results]:
     for index, (title, added) in enumerate(LADDER.items()):
         preset = added[0].removeprefix("--preset=") if added[0].startswith("--preset") else None
         given = _of("surfels", preset) if preset else [*given, *added]
-        if index:
-            results = _run(_folder(f"ladder_{index}"), scene, *given, *_ALONE)
-        else:
-            results = _run(_folder("paper"), scene, *given)
-        if results:
+        kind, alone = (f"ladder_{index}", _ALONE) if index else ("paper", ())
+        if results := _run(_folder(kind), scene, *given, *alone):
             found[title] = results
     return found
 
@@ -146,21 +143,23 @@ def _of(method: str, preset: str) -> list[str]:
     """Return the flags of a run: its preset, how much shorter that is, and what all are given."""
     shown = [f"--method={method}", f"--preset={preset}"]
     if FLAGS.shorter > 1 and preset.startswith("paper"):
-        shown += [f"--set={text}" for text in shorter(METHODS[method].presets[preset])]
+        shown += [
+            f"--set={text}" for text in shorter(METHODS[method].presets[preset], FLAGS.shorter)
+        ]
     return shown + [f"--{text}" for text in FLAGS.given]
 
 
-def shorter(preset: Any, factor: int | None = None) -> list[str]:
+def shorter(preset: Any, factor: int) -> list[str]:
     """Return settings, as `name=value`, with which stage 1 of a preset is shorter in all parts.
 
     Args:
       preset: a preset of splats.
-      factor: what lengths are divided by; default: `--shorter`.
+      factor: what lengths are divided by.
     """
     parts = [("", preset, _LENGTHS), ("", preset.field, _LENGTHS)]
     parts += [("density.", preset.field.density, _DENSITY_LENGTHS)]
     return [
-        f"{path}{name}={max(1, getattr(part, name) // (factor or FLAGS.shorter))}"
+        f"{path}{name}={max(1, getattr(part, name) // factor)}"
         for path, part, names in parts
         for name in names
         if hasattr(part, name)

@@ -18,6 +18,7 @@ from jaxcloseup.photos.views import Photograph, Views, to_float, unpadded
 
 BUDGET = 5 * 2**28  # bytes that the photographs of a scene may take
 _BYTES_PER_PIXEL = 4 * 4 / 3  # colors and weight of the finest level, and of all halves of it
+_WIDER = 1.5  # times that a finer level is at least as wide as the one that is wanted, or the last
 
 
 @struct.dataclass
@@ -63,7 +64,7 @@ class Pyramid:
 
     def level_near(self, width: float) -> int:
         """Return the finest level that is not 1.5 times as wide as `width`; there must be one."""
-        return [finer < 1.5 * width for _, finer in self.sizes].index(True)
+        return [finer < _WIDER * width for _, finer in self.sizes].index(True)
 
     def image(self, view: int, index: int) -> jax.Array:
         """Return the image `[H, W, C]` of one view at one level."""
@@ -117,6 +118,21 @@ def scene_pyramid(scene: Scene, *, finest: int = 1, budget: int = BUDGET) -> tup
     return photograph_pyramid(scene.photographs_at(factor), train), factor
 
 
+def divisor_near(finest: int, coarsest: int, times: float) -> int:
+    """Return the divisor of the level that `Pyramid.level_near` chooses, without the pyramid.
+
+    Args:
+      finest: divisor of the photographs' own size at the first level.
+      coarsest: divisor at the last level.
+      times: the width that is wanted, in widths of the last level, 1 or more.
+    """
+    while coarsest / finest >= _WIDER * times:
+        if coarsest / (2 * finest) < _WIDER:
+            return coarsest
+        finest *= 2
+    return finest
+
+
 def photograph_pyramid(
     photographs: Views | Sequence[Photograph],
     coarsest: Views | Sequence[Photograph] | None = None,
@@ -137,7 +153,7 @@ def photograph_pyramid(
     finest, last = map(_listed, (photographs, coarsest or ()))
     halves = [np.array([image.weight.shape for image in finest], np.int32)]
     ends = np.array([image.weight.shape for image in last], np.int32).reshape(-1, 2)
-    smallest = (1, 1.5 * ends[:, 1].max()) if len(last) else least
+    smallest = (1, _WIDER * ends[:, 1].max()) if len(last) else least
     while smallest is not None and _holds(halves[-1] // 2, smallest):
         halves.append(halves[-1] // 2)
     extents = np.stack([*halves, *([ends] if len(last) else [])], axis=1)

@@ -13,7 +13,7 @@ from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_points
 from jaxcloseup.geometry.numerics import safe_divide
 from jaxcloseup.native import library
 from jaxcloseup.photos.depth_maps import GatherSources, join_maps
-from jaxcloseup.photos.pyramids import Pyramid
+from jaxcloseup.photos.pyramids import Pyramid, divisor_near
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.views import Views, camera_at, pad_images, to_float
 from jaxcloseup.stereo import StereoConfig, StereoMaps, choose_neighbors, estimate_depths
@@ -58,17 +58,11 @@ def matched_divisor(scene: Scene, config: StereoTraining, finest: int) -> int:
     Args:
       scene: a scene whose photographs were divided for training.
       config: how many pixels are matched.
-      finest: divisor of the finest photographs, which `photograph_pyramid` halves, and of which the
-        level near the size that `config` affords is matched.
+      finest: divisor of the finest photographs that may be read.
     """
-    reduced, cameras = scene.metadata.get("downscale", 1), scene.train.cameras
+    cameras = scene.train.cameras
     affords = config.pixels / (len(scene.train) * cameras.height * cameras.width)
-    widest = 1.5 * max(1.0, affords**0.5)  # of a level, in widths of the reduced photographs
-    while reduced / finest >= widest:
-        if reduced / (2 * finest) < 1.5:
-            return reduced
-        finest *= 2
-    return finest
+    return divisor_near(finest, scene.metadata.get("downscale", 1), max(1.0, affords**0.5))
 
 
 def match_photographs(
