@@ -111,6 +111,17 @@ def test_stages_are_never_cut_in_a_narrow_terminal(capsys, monkeypatch):
 HOSTILE = "<script>alert('x')</script> \"&{{ 1 }}"
 
 
+def test_a_page_without_held_out_views_has_no_empty_sections(tmp_path):
+    found = results({}, scene="shelf", method="surfels", preset="quick", seed=0, versions={})
+    found |= {"stages": {"baseline": {}, "detail": {}}, "labels": {}, "left_out": None}
+    found["detail"] = {"stage": "baseline", "errors": [], "sizes": [[36, 48]]}
+    write_report(tmp_path / "report.html", found, [], [])
+    page = Page((tmp_path / "report.html").read_text())
+    assert page.headings == ["shelf"] and not page.tables
+    assert page.tags.count("details") == 1  # the configuration
+    assert "No view was held out" in page.text and "scored at" not in page.text
+
+
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     """Write a page with everything that a page can have; names in it are hostile."""

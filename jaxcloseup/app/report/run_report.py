@@ -171,7 +171,7 @@ def write_report(
         gate_table=gate_table(gate) if gate else None,
         gate_verdict=verdict(gate) if gate else None,
         labels={title: shown for title, shown in sections.items() if title not in views},
-        detail_table=detail_table(detail) if detail else None,
+        detail_table=detail_table(detail) if detail and detail["errors"] else None,
         config=json.dumps({key: results[key] for key in ("config", "versions")}, indent=1),
     )
     for quality in QUALITIES:
