@@ -11,11 +11,12 @@ import pathlib
 import jax
 
 
-# The functions that XLA may call, of `splats.cc`, `surfels.cc`, `gather.cc` and `stereo.cc`.
+# The functions that XLA may call, of `splats.cc`, `surfels.cc`, `gather.cc`, `stereo.cc` and
+# `rows.cc`.
 TARGETS = (
     *("splats_forward", "splats_backward", "splats_count"),
     *("surfels_forward", "surfels_backward"),
-    *("gather", "stereo"),
+    *("gather", "stereo", "rows_sum", "rows_add"),
 )
 
 INSTALL = (

@@ -40,7 +40,7 @@ def hash_features(table: jax.Array, config: HashGridConfig, positions: jax.Array
     """
     chex.assert_shape(table, (sum(config.entries), config.features))
     chex.assert_shape(positions, (3, None))
-    return weighted_rows(table, *grid_rows(config, positions))
+    return weighted_rows(table, *grid_rows(config, positions), tuple(config.entries))
 
 
 def grid_rows(config: HashGridConfig, positions: jax.Array) -> tuple[jax.Array, jax.Array]:
