@@ -12,11 +12,11 @@ import jax
 
 
 # The functions that XLA may call, of `splats.cc`, `surfels.cc`, `gather.cc`, `stereo.cc` and
-# `rows.cc`.
+# `hash_grid.cc`.
 TARGETS = (
     *("splats_forward", "splats_backward", "splats_count"),
     *("surfels_forward", "surfels_backward"),
-    *("gather", "stereo", "rows_sum", "rows_add"),
+    *("gather", "stereo", "hash_forward", "hash_backward"),
 )
 
 INSTALL = (

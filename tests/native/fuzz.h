@@ -73,5 +73,5 @@ void fuzz_gathering();
 // Matches patches once; in `fuzz_stereo.cc`.
 void fuzz_matching();
 
-// Sums rows of a table once, and adds to them; in `fuzz_rows.cc`.
-void fuzz_rows();
+// Encodes positions once; in `fuzz_hash_grid.cc`.
+void fuzz_hash_grid();

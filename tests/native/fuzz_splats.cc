@@ -186,7 +186,7 @@ int main(int, char** arguments) {
     number % 2 ? fuzz_surfels(size) : fuzz_tables(size);
     fuzz_gathering();
     fuzz_matching();
-    fuzz_rows();
+    fuzz_hash_grid();
   }
   check_limits();
   std::printf("%d cases\n", cases);

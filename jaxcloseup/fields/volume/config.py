@@ -70,8 +70,8 @@ class HashGridConfig:
     log2_entries: int = setting(
         19, "base-2 logarithm of the largest number of entries of a level", low=1, high=28
     )
-    coarsest: int = setting(16, "cells along each side of the first grid", low=1)
-    finest: int = setting(2048, "cells along each side of the last grid", low=1)
+    coarsest: int = setting(16, "cells along each side of the first grid", low=1, high=2**20)
+    finest: int = setting(2048, "cells along each side of the last grid", low=1, high=2**20)
 
     @property
     def resolutions(self) -> tuple[int, ...]:

@@ -4,6 +4,7 @@ Levels of cubic grids, each finer than the last by one factor, hold trained feat
 vertices. A grid with more vertices than a level has entries shares these by a hash.
 """
 
+import functools
 from typing import Any
 
 import chex
@@ -14,6 +15,7 @@ import numpy as np
 from jaxcloseup.fields.volume.config import HashGridConfig
 from jaxcloseup.fields.volume.interpolation import weighted_rows
 from jaxcloseup.geometry.numerics import matmul
+from jaxcloseup.native import library
 
 
 _PRIMES = (1, 2_654_435_761, 805_459_861)  # eq. 4
@@ -27,20 +29,74 @@ def init_hash_grid(key: jax.Array, config: HashGridConfig) -> jax.Array:
     return jax.random.uniform(key, shape, minval=-_INITIAL, maxval=_INITIAL)
 
 
-def hash_features(table: jax.Array, config: HashGridConfig, positions: jax.Array) -> jax.Array:
+def hash_features(
+    table: jax.Array, config: HashGridConfig, positions: jax.Array, *, native: bool | None = None
+) -> jax.Array:
     """Interpolate features of positions between the vertices of their cells on every level.
 
     Args:
       table: from `init_hash_grid`.
       config: sizes.
       positions: `[3, M]` in [0, 1]; others are taken to the nearest such position.
+      native: whether to call the native library; None: where it is there and a program is
+        compiled for CPUs.
 
     Returns:
       `[levels, features, M]`.
     """
     chex.assert_shape(table, (sum(config.entries), config.features))
     chex.assert_shape(positions, (3, None))
-    return weighted_rows(table, *grid_rows(config, positions), tuple(config.entries))
+    if native is None:
+        single = table.dtype == positions.dtype == jnp.float32
+        if not (single and library.available()):
+            return _in_jax(config, table, positions)
+        return jax.lax.platform_dependent(
+            table,
+            positions,
+            cpu=functools.partial(_in_library, config),
+            default=functools.partial(_in_jax, config),
+        )
+    return (_in_library if native else _in_jax)(config, table, positions)
+
+
+def _in_jax(config: HashGridConfig, table: jax.Array, positions: jax.Array) -> jax.Array:
+    return weighted_rows(table, *grid_rows(config, positions))
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _in_library(config: HashGridConfig, table: jax.Array, positions: jax.Array) -> jax.Array:
+    shape = (config.levels, config.features, positions.shape[1])
+    return _call("hash_forward", shape, config, table, positions)
+
+
+def _forward(
+    config: HashGridConfig, table: jax.Array, positions: jax.Array
+) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+    return _in_library(config, table, positions), (table, positions)
+
+
+def _backward(
+    config: HashGridConfig, residuals: tuple[jax.Array, jax.Array], cotangent: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    table, positions = residuals
+    d_table = _call("hash_backward", table.shape, config, positions, cotangent)
+    # Dead code unless someone differentiates positions.
+    _, pull = jax.vjp(functools.partial(_in_jax, config, table), positions)
+    return d_table, *pull(cotangent)
+
+
+_in_library.defvjp(_forward, _backward)
+
+
+def _call(
+    name: str, shape: tuple[int, ...], config: HashGridConfig, *arrays: jax.Array
+) -> jax.Array:
+    result = jax.ShapeDtypeStruct(shape, jnp.float32)
+    return jax.ffi.ffi_call(f"jaxcloseup_{name}", result, vmap_method="broadcast_all")(
+        *arrays,
+        cells=np.array(config.resolutions, np.int64),
+        rows=np.array(config.entries, np.int64),
+    )
 
 
 def grid_rows(config: HashGridConfig, positions: jax.Array) -> tuple[jax.Array, jax.Array]:

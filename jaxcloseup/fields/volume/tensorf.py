@@ -117,11 +117,10 @@ def factor_products(factors: Any, vertices: jax.Array, positions: jax.Array) -> 
     rows = vertex[:, None, first] * size + vertex[None, :, second]
     rows = rows.reshape(4, 3, -1) + modes * size**2
     weights = (share[:, None, first] * share[None, :, second]).reshape(4, 3, -1)
-    flat = {name: table.reshape(-1, components) for name, table in factors.items()}
-    planes = weighted_rows(flat["planes"], rows, weights, (size**2,) * 3)
+    planes = weighted_rows(factors["planes"].reshape(-1, components), rows, weights)
     line = np.array(_LINES)
     rows, weights = vertex[:, line] + modes * size, share[:, line]
-    return planes * weighted_rows(flat["lines"], rows, weights, (size,) * 3)
+    return planes * weighted_rows(factors["lines"].reshape(-1, components), rows, weights)
 
 
 def _init_params(key: jax.Array, config: TensorfConfig) -> Params:

@@ -1,5 +1,6 @@
 """Positional and hash encodings against slow oracles: values, rows, weights and gradients."""
 
+import dataclasses
 import functools
 
 import jax
@@ -15,11 +16,23 @@ from jaxcloseup.fields.volume.hash_grid import (
     hash_features,
     init_hash_grid,
 )
+from jaxcloseup.native import library
 
 
 # The first levels hold all their vertices, the last ones share entries by the hash.
 CONFIG = HashGridConfig(levels=4, features=2, log2_entries=9, coarsest=3, finest=40)
 EDGES = np.array([[0, 1, 0.5, 1 / 3, -0.2], [0, 1, 0.25, 2 / 3, 1.2], [0, 1, 0.75, 1, 0.5]])
+
+
+natively = pytest.mark.parametrize(
+    "native",
+    [
+        False,
+        pytest.param(
+            True, marks=pytest.mark.skipif(not library.available(), reason=str(library.missing()))
+        ),
+    ],
+)
 
 
 def positions(numbers):
@@ -60,13 +73,18 @@ def test_rows_and_weights_are_those_of_the_cells_corners():
             assert ours.get(at, 0) == pytest.approx(expected.get(at, 0), abs=1e-5)
 
 
-def test_features_match_the_oracle():
+@natively
+def test_features_match_the_oracle(native):
     table, x, expected, _ = case()
-    ours = jax.jit(hash_features, static_argnums=1)(np.float32(table), CONFIG, np.float32(x))
+    encode = jax.jit(functools.partial(hash_features, config=CONFIG, native=native))
+    ours = encode(np.float32(table), positions=np.float32(x))
     np.testing.assert_allclose(ours, expected, atol=1e-5)
+    lost = np.asarray(encode(np.float32(table), positions=np.full((3, 1), np.nan, np.float32)))
+    assert np.all(np.isnan(lost))
 
 
-def test_the_tables_gradient_is_the_sum_of_shares():
+@natively
+def test_the_tables_gradient_is_the_sum_of_shares(native):
     table, x, _, shares = case()
     cotangent = np.random.default_rng(1).normal(size=(CONFIG.levels, CONFIG.features, x.shape[1]))
     expected = np.zeros_like(table)
@@ -75,10 +93,47 @@ def test_the_tables_gradient_is_the_sum_of_shares():
             expected[row] += share * cotangent[level, :, point]
 
     def total(table):
-        return jnp.sum(np.float32(cotangent) * hash_features(table, CONFIG, np.float32(x)))
+        features = hash_features(table, CONFIG, np.float32(x), native=native)
+        return jnp.sum(np.float32(cotangent) * features)
 
     ours = jax.jit(jax.grad(total))(np.float32(table))
     np.testing.assert_allclose(ours, expected, atol=1e-5)
+
+
+@pytest.mark.skipif(not library.available(), reason=str(library.missing()))
+@pytest.mark.parametrize("features", [1, 3, 7])
+def test_the_library_encodes_several_tables_as_jax_does(features):
+    """More positions than a thread takes at once, any number of features, arms, and positions."""
+    config = dataclasses.replace(CONFIG, features=features)
+    numbers = np.random.default_rng(3)
+    tables = numbers.normal(size=(2, sum(config.entries), features)).astype(np.float32)
+    x = numbers.uniform(-0.1, 1.1, (3, 1500)).astype(np.float32)
+    cotangent = numbers.normal(size=(config.levels, features, 1500)).astype(np.float32)
+
+    @functools.partial(jax.jit, static_argnames="native")
+    def both(native):
+        def of_arm(table):
+            def encode(table, x):
+                return hash_features(table, config, x, native=native)
+
+            ours, pull = jax.vjp(encode, table, jnp.asarray(x))
+            return ours, *pull(jnp.asarray(cotangent))
+
+        return jax.vmap(of_arm)(jnp.asarray(tables))
+
+    for ours, theirs in zip(both(native=True), both(native=False), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-3)
+
+
+def test_programs_for_other_processors_and_types_call_no_library():
+    table, x, _, _ = case()
+    encode = jax.jit(functools.partial(hash_features, config=CONFIG))
+    traced = encode.trace(np.float32(table), positions=np.float32(x))
+    assert "jaxcloseup_hash" not in traced.lower(lowering_platforms=("cuda",)).as_text()
+    called = "jaxcloseup_hash" in traced.lower(lowering_platforms=("cpu",)).as_text()
+    assert called == library.available()
+    with jax.enable_x64(True):
+        assert encode(jnp.asarray(table), positions=jnp.asarray(x)).dtype == jnp.float64
 
 
 def test_the_gradient_of_positions_is_the_finite_difference():

@@ -1,0 +1,172 @@
+// Hash encoding and its derivative as functions that XLA calls, see `fields/volume/hash_grid.py`.
+//
+// Rows of the table and weights of corners are never arrays: they take longer to write and to read
+// than to compute. Levels share no rows, so they are shared out over threads, and every sum has one
+// order.
+#include <algorithm>
+#include <type_traits>
+#include <vector>
+
+#include "parallel.h"
+#include "xla/ffi/api/ffi.h"
+
+namespace jaxcloseup {
+namespace {
+
+namespace ffi = xla::ffi;
+using Floats = ffi::Buffer<ffi::F32>;
+
+constexpr int64_t BLOCK = 1024;  // positions that a thread takes at once
+constexpr uint32_t PRIMES[2] = {2654435761u, 805459861u};
+constexpr int64_t MOST_CELLS = 1 << 20;  // along a side
+
+// A level of a grid: what tells which row of the table a vertex has.
+struct Level {
+  int64_t start, rows;  // in the table
+  uint32_t cells;       // along each side
+  bool in_order;        // else vertices share rows by a hash, and there is a power of two of them
+
+  uint32_t row(uint32_t x, uint32_t y, uint32_t z) const {
+    const uint32_t side = cells + 1;
+    return in_order ? x + side * (y + side * z) : (x ^ (y * PRIMES[0]) ^ (z * PRIMES[1])) & uint32_t(rows - 1);
+  }
+};
+
+struct Sizes {
+  int64_t batches, entries, features, positions;
+  std::vector<Level> levels;
+
+  const Level& level(int64_t i) const { return levels[i % levels.size()]; }
+  int64_t batch(int64_t i) const { return i / levels.size(); }
+  int64_t grids() const { return batches * levels.size(); }
+};
+
+// Calls work(row, weight) for the corners of a position's cell; the last coordinate changes first.
+template <typename Work>
+void for_corners(const Level& level, const float* positions, int64_t count, int64_t i, const Work& work) {
+  uint32_t low[3];
+  float share[3][2];
+  for (int k = 0; k < 3; k++) {
+    const float at = float(level.cells) * std::clamp(positions[k * count + i], 0.f, 1.f);
+    low[k] = at > 0 ? std::min(uint32_t(at), level.cells - 1) : 0;  // the lowest too if it is no number
+    share[k][1] = at - float(low[k]);
+    share[k][0] = 1 - share[k][1];
+  }
+  for (int x = 0; x < 2; x++)
+    for (int y = 0; y < 2; y++)
+      for (int z = 0; z < 2; z++)
+        work(level.row(low[0] + x, low[1] + y, low[2] + z), share[0][x] * share[1][y] * share[2][z]);
+}
+
+// Calls work with the number of features as a constant, piece after piece.
+template <typename Work>
+void by_pieces(int64_t features, const Work& work) {
+  int64_t at = 0;
+  for (; features - at >= 4; at += 4) work(std::integral_constant<int, 4>(), at);
+  for (; features - at >= 2; at += 2) work(std::integral_constant<int, 2>(), at);
+  if (at < features) work(std::integral_constant<int, 1>(), at);
+}
+
+// `table` is [.., E, F], `positions` [.., 3, M], `features` [.., L, F, M].
+template <typename Table, typename Features>
+ffi::Error read_sizes(const Table& table, const Floats& positions, const Features& features,
+                      ffi::Span<const int64_t> cells, ffi::Span<const int64_t> rows, Sizes& sizes) {
+  const auto t = table.dimensions(), p = positions.dimensions();
+  if (t.size() < 2 || p.size() != t.size() || p[p.size() - 2] != 3)
+    return ffi::Error::InvalidArgument("the table must be [.., E, F] and positions [.., 3, M]");
+  sizes.entries = t[t.size() - 2], sizes.features = t[t.size() - 1], sizes.positions = p[p.size() - 1];
+  sizes.batches = 1;
+  for (size_t i = 0; i + 2 < t.size(); i++) sizes.batches *= t[i];
+  if (cells.size() != rows.size() || cells.size() == 0) return ffi::Error::InvalidArgument("levels have no such sizes");
+  int64_t start = 0;
+  for (size_t i = 0; i < cells.size(); i++) {
+    if (cells[i] < 1 || cells[i] > MOST_CELLS || rows[i] < 1 || rows[i] > (1 << 30))
+      return ffi::Error::InvalidArgument("a level has no such size");
+    const int64_t side = cells[i] + 1, vertices = side * side * side;
+    const bool in_order = vertices == rows[i];
+    if (!in_order && (rows[i] & (rows[i] - 1)))
+      return ffi::Error::InvalidArgument("rows of a level must be its vertices, or a power of two");
+    sizes.levels.push_back({start, rows[i], uint32_t(cells[i]), in_order});
+    start += rows[i];
+  }
+  if (start != sizes.entries || int64_t(positions.element_count()) != sizes.batches * 3 * sizes.positions ||
+      int64_t(features.element_count()) != sizes.grids() * sizes.features * sizes.positions)
+    return ffi::Error::InvalidArgument("arguments have different sizes");
+  return ffi::Error::Success();
+}
+
+ffi::Error hash_forward(ffi::ThreadPool pool, Floats table, Floats positions, ffi::Result<Floats> features,
+                        ffi::Span<const int64_t> cells, ffi::Span<const int64_t> rows) {
+  Sizes sizes;
+  if (auto error = read_sizes(table, positions, *features, cells, rows, sizes); error.failure()) return error;
+  const int64_t blocks = (sizes.positions + BLOCK - 1) / BLOCK;
+  parallel_for(pool, int(sizes.grids() * blocks), [&](int number) {
+    const int64_t i = number / blocks, begin = number % blocks * BLOCK;
+    const Level level = sizes.level(i);
+    const float* at = positions.typed_data() + sizes.batch(i) * 3 * sizes.positions;
+    const float* first = table.typed_data() + (sizes.batch(i) * sizes.entries + level.start) * sizes.features;
+    float* out = features->typed_data() + i * sizes.features * sizes.positions;
+    by_pieces(sizes.features, [&](auto constant, int64_t feature) {
+      constexpr int COUNT = decltype(constant)::value;
+      for (int64_t m = begin; m < std::min(begin + BLOCK, sizes.positions); m++) {
+        float sum[COUNT] = {};
+        for_corners(level, at, sizes.positions, m, [&](int64_t row, float weight) {
+          const float* values = first + row * sizes.features + feature;
+          for (int k = 0; k < COUNT; k++) sum[k] += weight * values[k];
+        });
+        for (int k = 0; k < COUNT; k++) out[(feature + k) * sizes.positions + m] = sum[k];
+      }
+    });
+  });
+  return ffi::Error::Success();
+}
+
+ffi::Error hash_backward(ffi::ThreadPool pool, Floats positions, Floats features, ffi::Result<Floats> table,
+                         ffi::Span<const int64_t> cells, ffi::Span<const int64_t> rows) {
+  Sizes sizes;
+  if (auto error = read_sizes(*table, positions, features, cells, rows, sizes); error.failure()) return error;
+  parallel_for(pool, int(sizes.grids()), [&](int i) {
+    const Level level = sizes.level(i);
+    const float* at = positions.typed_data() + sizes.batch(i) * 3 * sizes.positions;
+    const float* bars = features.typed_data() + i * sizes.features * sizes.positions;
+    float* first = table->typed_data() + (sizes.batch(i) * sizes.entries + level.start) * sizes.features;
+    std::fill(first, first + level.rows * sizes.features, 0.f);
+    by_pieces(sizes.features, [&](auto constant, int64_t feature) {
+      constexpr int COUNT = decltype(constant)::value;
+      for (int64_t m = 0; m < sizes.positions; m++) {
+        float bar[COUNT];
+        for (int k = 0; k < COUNT; k++) bar[k] = bars[(feature + k) * sizes.positions + m];
+        for_corners(level, at, sizes.positions, m, [&](int64_t row, float weight) {
+          float* values = first + row * sizes.features + feature;
+          for (int k = 0; k < COUNT; k++) values[k] += weight * bar[k];
+        });
+      }
+    });
+  });
+  return ffi::Error::Success();
+}
+
+}  // namespace
+}  // namespace jaxcloseup
+
+#pragma GCC visibility push(default)
+
+XLA_FFI_DEFINE_HANDLER_SYMBOL(hash_forward, jaxcloseup::hash_forward,
+                              xla::ffi::Ffi::Bind()
+                                  .Ctx<xla::ffi::ThreadPool>()
+                                  .Arg<jaxcloseup::Floats>()
+                                  .Arg<jaxcloseup::Floats>()
+                                  .Ret<jaxcloseup::Floats>()
+                                  .Attr<xla::ffi::Span<const int64_t>>("cells")
+                                  .Attr<xla::ffi::Span<const int64_t>>("rows"));
+
+XLA_FFI_DEFINE_HANDLER_SYMBOL(hash_backward, jaxcloseup::hash_backward,
+                              xla::ffi::Ffi::Bind()
+                                  .Ctx<xla::ffi::ThreadPool>()
+                                  .Arg<jaxcloseup::Floats>()
+                                  .Arg<jaxcloseup::Floats>()
+                                  .Ret<jaxcloseup::Floats>()
+                                  .Attr<xla::ffi::Span<const int64_t>>("cells")
+                                  .Attr<xla::ffi::Span<const int64_t>>("rows"));
+
+#pragma GCC visibility pop
