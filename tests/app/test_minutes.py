@@ -1,9 +1,11 @@
 """`--minutes`: the steps that fit, the settings that repeat them."""
 
 import dataclasses
+import time
 import types
 
 import jax
+import jax.numpy as jnp
 import pytest
 from tiny_runs import TINY, TINY_SURFELS
 
@@ -42,3 +44,20 @@ def test_steps_are_timed_on_the_scene(capture_folder, monkeypatch):
     assert 0 <= before < 0.1 and 0 < step < 5
     assert fitted.baseline_steps >= 1
     assert given[0] == f"baseline_steps={fitted.baseline_steps}"
+
+
+def test_compiling_is_no_part_of_the_time():
+    """A run compiles once, however many steps it takes."""
+
+    @jax.jit
+    def compiled_slowly(x):
+        for i in range(40):
+            x = x @ jnp.sin(x + i)
+        return x
+
+    start = time.perf_counter()
+    result, seconds = minutes._timed(lambda: compiled_slowly(jnp.eye(3)))
+    assert result.shape == (3, 3)
+    assert 0 <= seconds < 0.8 * (time.perf_counter() - start)
+    _, again = minutes._timed(lambda: time.sleep(0.1))
+    assert 0.1 <= again < 1

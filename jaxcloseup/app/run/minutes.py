@@ -1,25 +1,30 @@
 """A preset that trains for a given time on this computer: steps are timed before the run."""
 
+import functools
 import math
-import statistics
 import time
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 
 from jaxcloseup.app.methods.method import Preset
 from jaxcloseup.app.methods.settings import settings_of, with_settings
 from jaxcloseup.app.run.keys import run_keys
+from jaxcloseup.app.run.photograph_sizes import finest_read
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.read_photographs import ReadPhotographs
 from jaxcloseup.app.run.states import initial_state, refine_state
 from jaxcloseup.app.run.step_data import TrainData
+from jaxcloseup.app.run.timers import timed_compiling
 from jaxcloseup.photos.scene import Scene
 
 
 _USUAL = 5.0  # minutes for which a preset's number of surfels was chosen
-_WARMING, _TIMED, _TIMES = 15, 20, 3  # steps: the first compile programs; how often to time
+_WARMING, _TIMED = 15, 100  # steps: the first compile most programs
 _FEWEST = 100  # steps
+
+_Result = TypeVar("_Result")
 
 
 class Fitted(NamedTuple):
@@ -66,27 +71,32 @@ def _schedules(preset: Preset, steps: int) -> list[str]:
 
 def _time_steps(programs: Programs) -> tuple[float, float]:
     """Return the seconds before the first step of stage 1, and those of a step."""
-    preset, keys, start = programs.preset, run_keys(0), time.perf_counter()
-    stereo = programs.stereo
-    before = time.perf_counter() - start
+    preset, keys = programs.preset, run_keys(0)
+    stereo, before = _timed(lambda: programs.stereo)
     if preset.coarse is None:
         state = initial_state(programs, keys, stereo)
     else:
         coarse = programs.coarse
         state = initial_state(coarse, keys, stereo)
         state, each = _steps(coarse, state, TrainData(coarse.photographs))
-        start = time.perf_counter()
-        state = jax.block_until_ready(refine_state(programs, state))
-        before += preset.coarse.steps * each + time.perf_counter() - start
+        # What is read here is kept, so the run does not wait for it.
+        programs.pyramid(finest_read(preset, programs.scene))
+        state, refining = _timed(functools.partial(refine_state, programs, state))
+        before += preset.coarse.steps * each + refining
     return before, _steps(programs, state, TrainData(programs.photographs))[1]
 
 
 def _steps(programs: Programs, state: Any, data: TrainData) -> tuple[Any, float]:
-    """Return the state after some steps, and the median seconds of one of the later ones."""
+    """Return the state after some steps, and the mean seconds of one of the later ones."""
     state, _ = programs.run(state, data, count=_WARMING)
-    each = []
-    for _ in range(_TIMES):
-        start = time.perf_counter()
-        state, _ = programs.run(state, data, count=_TIMED)
-        each.append((time.perf_counter() - start) / _TIMED)
-    return state, statistics.median(each)
+    (state, _), seconds = _timed(lambda: programs.run(state, data, count=_TIMED))
+    return state, seconds / _TIMED
+
+
+def _timed(call: Callable[[], _Result]) -> tuple[_Result, float]:
+    """Return what a call returns, and its seconds without compiling."""
+    compiling: dict[str, float] = {}
+    start = time.perf_counter()
+    with timed_compiling(compiling):
+        result = jax.block_until_ready(call())
+    return result, time.perf_counter() - start - compiling["compile"]
