@@ -13,7 +13,7 @@ from jaxcloseup.app.cli.start import start
 
 
 SUITES = (
-    *("nerf", "warp", "labels", "splats", "native", "steps", "sweep"),
+    *("nerf", "ngp", "warp", "labels", "splats", "native", "steps", "sweep"),
     *("resume", "detail", "scales", "teach", "gpu"),
 )
 

@@ -4,6 +4,7 @@
 // than to compute. Levels share no rows, so they are shared out over threads, and every sum has one
 // order.
 #include <algorithm>
+#include <cstring>
 #include <type_traits>
 #include <vector>
 
@@ -25,12 +26,41 @@ struct Level {
   int64_t start, rows;  // in the table
   uint32_t cells;       // along each side
   bool in_order;        // else vertices share rows by a hash, and there is a power of two of them
-
-  uint32_t row(uint32_t x, uint32_t y, uint32_t z) const {
-    const uint32_t side = cells + 1;
-    return in_order ? x + side * (y + side * z) : (x ^ (y * PRIMES[0]) ^ (z * PRIMES[1])) & uint32_t(rows - 1);
-  }
 };
+
+// Rows of the corners of a position's cell, and their weights; the last coordinate changes first.
+struct Corners {
+  uint32_t row[8];
+  float weight[8];
+};
+
+template <bool IN_ORDER>
+inline Corners corners_of(const Level& level, const float* positions, int64_t count, int64_t i) {
+  const uint32_t side = level.cells + 1, mask = uint32_t(level.rows - 1);
+  const uint32_t factors[3] = {1, IN_ORDER ? side : PRIMES[0], IN_ORDER ? side * side : PRIMES[1]};
+  uint32_t part[3][2];
+  float share[3][2];
+  for (int k = 0; k < 3; k++) {
+    const float at = float(level.cells) * std::clamp(positions[k * count + i], 0.f, 1.f);
+    // The lowest cell too if it is no number.
+    const uint32_t low = at > 0 ? std::min(uint32_t(int32_t(at)), level.cells - 1) : 0;
+    part[k][0] = low * factors[k];
+    part[k][1] = part[k][0] + factors[k];
+    share[k][1] = at - float(low);
+    share[k][0] = 1 - share[k][1];
+  }
+  Corners corners;
+  for (int x = 0; x < 2; x++)
+    for (int y = 0; y < 2; y++) {
+      const uint32_t both = IN_ORDER ? part[0][x] + part[1][y] : part[0][x] ^ part[1][y];
+      const float weight = share[0][x] * share[1][y];
+      for (int z = 0; z < 2; z++) {
+        corners.row[4 * x + 2 * y + z] = IN_ORDER ? both + part[2][z] : (both ^ part[2][z]) & mask;
+        corners.weight[4 * x + 2 * y + z] = weight * share[2][z];
+      }
+    }
+  return corners;
+}
 
 struct Sizes {
   int64_t batches, entries, features, positions;
@@ -41,30 +71,30 @@ struct Sizes {
   int64_t grids() const { return batches * levels.size(); }
 };
 
-// Calls work(row, weight) for the corners of a position's cell; the last coordinate changes first.
-template <typename Work>
-void for_corners(const Level& level, const float* positions, int64_t count, int64_t i, const Work& work) {
-  uint32_t low[3];
-  float share[3][2];
-  for (int k = 0; k < 3; k++) {
-    const float at = float(level.cells) * std::clamp(positions[k * count + i], 0.f, 1.f);
-    low[k] = at > 0 ? std::min(uint32_t(at), level.cells - 1) : 0;  // the lowest too if it is no number
-    share[k][1] = at - float(low[k]);
-    share[k][0] = 1 - share[k][1];
-  }
-  for (int x = 0; x < 2; x++)
-    for (int y = 0; y < 2; y++)
-      for (int z = 0; z < 2; z++)
-        work(level.row(low[0] + x, low[1] + y, low[2] + z), share[0][x] * share[1][y] * share[2][z]);
-}
+// Neighboring features of a row, as one vector.
+template <int COUNT>
+struct Values {
+  typedef float Vector __attribute__((vector_size(4 * COUNT)));
+  Vector values;
 
-// Calls work with the number of features as a constant, piece after piece.
+  static Values read(const float* from) {
+    Values read;
+    std::memcpy(&read, from, sizeof(Values));
+    return read;
+  }
+  void write(float* to) const { std::memcpy(to, this, sizeof(Values)); }
+};
+
+// Calls work with the number of features and the kind of level as constants, piece after piece.
 template <typename Work>
-void by_pieces(int64_t features, const Work& work) {
+void by_pieces(int64_t features, const Level& level, const Work& work) {
+  const auto piece = [&](auto count, int64_t at) {
+    level.in_order ? work(count, std::true_type(), at) : work(count, std::false_type(), at);
+  };
   int64_t at = 0;
-  for (; features - at >= 4; at += 4) work(std::integral_constant<int, 4>(), at);
-  for (; features - at >= 2; at += 2) work(std::integral_constant<int, 2>(), at);
-  if (at < features) work(std::integral_constant<int, 1>(), at);
+  for (; features - at >= 4; at += 4) piece(std::integral_constant<int, 4>(), at);
+  for (; features - at >= 2; at += 2) piece(std::integral_constant<int, 2>(), at);
+  if (at < features) piece(std::integral_constant<int, 1>(), at);
 }
 
 // `table` is [.., E, F], `positions` [.., 3, M], `features` [.., L, F, M].
@@ -106,15 +136,14 @@ ffi::Error hash_forward(ffi::ThreadPool pool, Floats table, Floats positions, ff
     const float* at = positions.typed_data() + sizes.batch(i) * 3 * sizes.positions;
     const float* first = table.typed_data() + (sizes.batch(i) * sizes.entries + level.start) * sizes.features;
     float* out = features->typed_data() + i * sizes.features * sizes.positions;
-    by_pieces(sizes.features, [&](auto constant, int64_t feature) {
-      constexpr int COUNT = decltype(constant)::value;
+    by_pieces(sizes.features, level, [&](auto count, auto in_order, int64_t feature) {
+      using Some = Values<count.value>;
       for (int64_t m = begin; m < std::min(begin + BLOCK, sizes.positions); m++) {
-        float sum[COUNT] = {};
-        for_corners(level, at, sizes.positions, m, [&](int64_t row, float weight) {
-          const float* values = first + row * sizes.features + feature;
-          for (int k = 0; k < COUNT; k++) sum[k] += weight * values[k];
-        });
-        for (int k = 0; k < COUNT; k++) out[(feature + k) * sizes.positions + m] = sum[k];
+        const Corners corners = corners_of<in_order.value>(level, at, sizes.positions, m);
+        Some sum{};
+        for (int c = 0; c < 8; c++)
+          sum.values += corners.weight[c] * Some::read(first + corners.row[c] * sizes.features + feature).values;
+        for (int k = 0; k < count.value; k++) out[(feature + k) * sizes.positions + m] = sum.values[k];
       }
     });
   });
@@ -131,15 +160,18 @@ ffi::Error hash_backward(ffi::ThreadPool pool, Floats positions, Floats features
     const float* bars = features.typed_data() + i * sizes.features * sizes.positions;
     float* first = table->typed_data() + (sizes.batch(i) * sizes.entries + level.start) * sizes.features;
     std::fill(first, first + level.rows * sizes.features, 0.f);
-    by_pieces(sizes.features, [&](auto constant, int64_t feature) {
-      constexpr int COUNT = decltype(constant)::value;
+    by_pieces(sizes.features, level, [&](auto count, auto in_order, int64_t feature) {
+      using Some = Values<count.value>;
       for (int64_t m = 0; m < sizes.positions; m++) {
-        float bar[COUNT];
-        for (int k = 0; k < COUNT; k++) bar[k] = bars[(feature + k) * sizes.positions + m];
-        for_corners(level, at, sizes.positions, m, [&](int64_t row, float weight) {
-          float* values = first + row * sizes.features + feature;
-          for (int k = 0; k < COUNT; k++) values[k] += weight * bar[k];
-        });
+        const Corners corners = corners_of<in_order.value>(level, at, sizes.positions, m);
+        Some bar;
+        for (int k = 0; k < count.value; k++) bar.values[k] = bars[(feature + k) * sizes.positions + m];
+        for (int c = 0; c < 8; c++) {
+          float* row = first + corners.row[c] * sizes.features + feature;
+          Some sum = Some::read(row);
+          sum.values += corners.weight[c] * bar.values;
+          sum.write(row);
+        }
       }
     });
   });
