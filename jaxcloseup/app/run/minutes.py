@@ -45,7 +45,7 @@ def fit_minutes(preset: Preset, scene: Scene, minutes: float) -> Fitted:
     Args:
       preset: what is trained.
       scene: what was photographed.
-      minutes: wall time of stage 1 with its coarse model, without compiling.
+      minutes: wall time of stage 1 with stereo, its coarse model and compiling.
     """
     given: list[str] = []
     if preset.coarse is not None:
@@ -53,7 +53,10 @@ def fit_minutes(preset: Preset, scene: Scene, minutes: float) -> Fitted:
         given.append(f"capacity={max(1000, 1000 * round(preset.field.capacity * times / 1000))}")
         preset = with_settings(preset, given)
     programs = Programs(preset, scene)
-    before, step = _time_steps(programs)
+    compiling: dict[str, float] = {}
+    with timed_compiling(compiling):  # the run compiles once more what depends on the steps' number
+        before, step = _time_steps(programs)
+    before += compiling["compile"]
     steps = max(_FEWEST, 10 * round((60 * minutes - before) / step / 10))
     given += [f"baseline_steps={steps}", *_schedules(preset, steps)]
     return Fitted(with_settings(preset, given), given, programs.read)
