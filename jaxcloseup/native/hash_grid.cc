@@ -63,12 +63,8 @@ inline Corners corners_of(const Level& level, const float* positions, int64_t co
 }
 
 struct Sizes {
-  int64_t batches, entries, features, positions;
+  int64_t features, positions;
   std::vector<Level> levels;
-
-  const Level& level(int64_t i) const { return levels[i % levels.size()]; }
-  int64_t batch(int64_t i) const { return i / levels.size(); }
-  int64_t grids() const { return batches * levels.size(); }
 };
 
 // Neighboring features of a row, as one vector.
@@ -97,17 +93,15 @@ void by_pieces(int64_t features, const Level& level, const Work& work) {
   if (at < features) piece(std::integral_constant<int, 1>(), at);
 }
 
-// `table` is [.., E, F], `positions` [.., 3, M], `features` [.., L, F, M].
+// `table` is [E, F], `positions` [3, M], `features` [L, F, M].
 template <typename Table, typename Features>
 ffi::Error read_sizes(const Table& table, const Floats& positions, const Features& features,
                       ffi::Span<const int64_t> cells, ffi::Span<const int64_t> rows, Sizes& sizes) {
   const auto t = table.dimensions(), p = positions.dimensions();
-  if (t.size() < 2 || p.size() != t.size() || p[p.size() - 2] != 3)
-    return ffi::Error::InvalidArgument("the table must be [.., E, F] and positions [.., 3, M]");
-  sizes.entries = t[t.size() - 2], sizes.features = t[t.size() - 1], sizes.positions = p[p.size() - 1];
-  sizes.batches = 1;
-  for (size_t i = 0; i + 2 < t.size(); i++) sizes.batches *= t[i];
-  if (cells.size() != rows.size() || cells.size() == 0) return ffi::Error::InvalidArgument("levels have no such sizes");
+  if (t.size() != 2 || p.size() != 2 || p[0] != 3)
+    return ffi::Error::InvalidArgument("the table must be [E, F] and positions [3, M]");
+  sizes.features = t[1], sizes.positions = p[1];
+  if (cells.size() != rows.size()) return ffi::Error::InvalidArgument("levels have no such sizes");
   int64_t start = 0;
   for (size_t i = 0; i < cells.size(); i++) {
     if (cells[i] < 1 || cells[i] > MOST_CELLS || rows[i] < 1 || rows[i] > (1 << 30))
@@ -119,8 +113,8 @@ ffi::Error read_sizes(const Table& table, const Floats& positions, const Feature
     sizes.levels.push_back({start, rows[i], uint32_t(cells[i]), in_order});
     start += rows[i];
   }
-  if (start != sizes.entries || int64_t(positions.element_count()) != sizes.batches * 3 * sizes.positions ||
-      int64_t(features.element_count()) != sizes.grids() * sizes.features * sizes.positions)
+  if (start != t[0] ||
+      features.element_count() != sizes.levels.size() * size_t(sizes.features) * size_t(sizes.positions))
     return ffi::Error::InvalidArgument("arguments have different sizes");
   return ffi::Error::Success();
 }
@@ -130,15 +124,16 @@ ffi::Error hash_forward(ffi::ThreadPool pool, Floats table, Floats positions, ff
   Sizes sizes;
   if (auto error = read_sizes(table, positions, *features, cells, rows, sizes); error.failure()) return error;
   const int64_t blocks = (sizes.positions + BLOCK - 1) / BLOCK;
-  parallel_for(pool, int(sizes.grids() * blocks), [&](int number) {
+  const float* at = positions.typed_data();
+  parallel_for(pool, int(sizes.levels.size() * blocks), [&](int number) {
     const int64_t i = number / blocks, begin = number % blocks * BLOCK;
-    const Level level = sizes.level(i);
-    const float* at = positions.typed_data() + sizes.batch(i) * 3 * sizes.positions;
-    const float* first = table.typed_data() + (sizes.batch(i) * sizes.entries + level.start) * sizes.features;
+    const int64_t end = std::min(begin + BLOCK, sizes.positions);
+    const Level level = sizes.levels[i];
+    const float* first = table.typed_data() + level.start * sizes.features;
     float* out = features->typed_data() + i * sizes.features * sizes.positions;
     by_pieces(sizes.features, level, [&](auto count, auto in_order, int64_t feature) {
       using Some = Values<count.value>;
-      for (int64_t m = begin; m < std::min(begin + BLOCK, sizes.positions); m++) {
+      for (int64_t m = begin; m < end; m++) {
         const Corners corners = corners_of<in_order.value>(level, at, sizes.positions, m);
         Some sum{};
         for (int c = 0; c < 8; c++)
@@ -154,11 +149,11 @@ ffi::Error hash_backward(ffi::ThreadPool pool, Floats positions, Floats features
                          ffi::Span<const int64_t> cells, ffi::Span<const int64_t> rows) {
   Sizes sizes;
   if (auto error = read_sizes(*table, positions, features, cells, rows, sizes); error.failure()) return error;
-  parallel_for(pool, int(sizes.grids()), [&](int i) {
-    const Level level = sizes.level(i);
-    const float* at = positions.typed_data() + sizes.batch(i) * 3 * sizes.positions;
+  const float* at = positions.typed_data();
+  parallel_for(pool, int(sizes.levels.size()), [&](int i) {
+    const Level level = sizes.levels[i];
     const float* bars = features.typed_data() + i * sizes.features * sizes.positions;
-    float* first = table->typed_data() + (sizes.batch(i) * sizes.entries + level.start) * sizes.features;
+    float* first = table->typed_data() + level.start * sizes.features;
     std::fill(first, first + level.rows * sizes.features, 0.f);
     by_pieces(sizes.features, level, [&](auto count, auto in_order, int64_t feature) {
       using Some = Values<count.value>;

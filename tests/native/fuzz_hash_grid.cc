@@ -5,7 +5,6 @@ extern "C" XLA_FFI_Error* hash_forward(XLA_FFI_CallFrame*);
 extern "C" XLA_FFI_Error* hash_backward(XLA_FFI_CallFrame*);
 
 void fuzz_hash_grid() {
-  const Dims batch = any_of<Dims>({{}, {}, {2}, {0}, {2, 2}});
   const int64_t number = any_of({0, 1, 2, 3, 7}), positions = any_of({0, 1, 7, 1024, 2500});
   std::vector<int64_t> cells(any_of({1, 3})), rows(cells.size());
   int64_t entries = 0;
@@ -15,8 +14,8 @@ void fuzz_hash_grid() {
     entries += rows[i] = side < 7 && generator() % 2 ? side * side * side : any_of({1, 16, 1024});
   }
   const int rarity = any_of({0, 200, 20, 2});
-  Floats table(with(batch, {entries, number})), at(with(batch, {3, positions}));
-  Floats features(with(batch, {int64_t(cells.size()), number, positions}));
+  Floats table({entries, number}), at({3, positions});
+  Floats features({int64_t(cells.size()), number, positions});
   const auto draw = [](size_t) { return uniform(-.1f, 1.1f); };
   fill(table, rarity, draw);
   fill(at, rarity, draw);

@@ -92,7 +92,7 @@ def _call(
     name: str, shape: tuple[int, ...], config: HashGridConfig, *arrays: jax.Array
 ) -> jax.Array:
     result = jax.ShapeDtypeStruct(shape, jnp.float32)
-    return jax.ffi.ffi_call(f"jaxcloseup_{name}", result, vmap_method="broadcast_all")(
+    return jax.ffi.ffi_call(f"jaxcloseup_{name}", result, vmap_method="sequential")(
         *arrays,
         cells=np.array(config.resolutions, np.int64),
         rows=np.array(config.entries, np.int64),
