@@ -23,10 +23,15 @@ def test_steps_and_schedules_follow_from_the_time_of_a_step(monkeypatch, wanted)
     preset = dataclasses.replace(
         TINY_SURFELS, coarse=coarse, field=field, windows=WindowConfig(), baseline_steps=100
     )
-    monkeypatch.setattr(minutes, "_time_steps", lambda *_: (6.0, 0.01))
+    times = minutes._Times(reading=0.0, before=6.0, step=0.01)
+    monkeypatch.setattr(minutes, "_time_steps", lambda *_: times)
     monkeypatch.setattr(minutes, "Programs", lambda *_: types.SimpleNamespace(read=None))
     fitted, given, _ = minutes.fit_minutes(preset, None, wanted)
     assert fitted.baseline_steps == 6000 * wanted - 600
+    with monkeypatch.context() as patch:  # half of the minutes are for the steps
+        slow = times._replace(before=50.0 * wanted)
+        patch.setattr(minutes, "_time_steps", lambda *_: slow)
+        assert minutes.fit_minutes(preset, None, wanted).preset.baseline_steps == 3000 * wanted
     assert fitted.field.means_lr_steps == pytest.approx(0.9 * fitted.baseline_steps, abs=10)
     assert fitted.field.capacity == pytest.approx(20_000 * (wanted / 5) ** 0.5, abs=500)
     assert with_settings(preset, given) == fitted
@@ -34,14 +39,15 @@ def test_steps_and_schedules_follow_from_the_time_of_a_step(monkeypatch, wanted)
 
 def test_steps_are_timed_on_the_scene(capture_folder, monkeypatch):
     monkeypatch.setattr(minutes, "_WARMING", 2)
-    monkeypatch.setattr(minutes, "_TIMED", 3)
+    monkeypatch.setattr(minutes, "_FEW", 1)
+    monkeypatch.setattr(minutes, "_MANY", 3)
     monkeypatch.setattr(minutes, "_FEWEST", 1)
     scene = load_scene(str(capture_folder), downscale=2)
     with jax.numpy_dtype_promotion("standard"):
         programs = Programs(dataclasses.replace(TINY, downscale=2), scene)
-        before, step = minutes._time_steps(programs)
+        reading, before, step = minutes._time_steps(programs)
         fitted, given, _ = minutes.fit_minutes(dataclasses.replace(TINY, downscale=2), scene, 0.1)
-    assert 0 <= before < 0.1 and 0 < step < 5
+    assert reading == before == 0 and 0 < step < 5
     assert fitted.baseline_steps >= 1
     assert given[0] == f"baseline_steps={fitted.baseline_steps}"
 

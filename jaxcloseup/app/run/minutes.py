@@ -21,7 +21,8 @@ from jaxcloseup.photos.scene import Scene
 
 
 _USUAL = 5.0  # minutes for which a preset's number of surfels was chosen
-_WARMING, _TIMED = 15, 100  # steps: the first compile most programs
+_WARMING = 60  # steps, in which most programs are traced and compiled
+_FEW, _MANY, _SECONDS = 20, 200, 5.0  # steps that are timed, and about how long they may take
 _FEWEST = 100  # steps
 
 _Result = TypeVar("_Result")
@@ -45,7 +46,8 @@ def fit_minutes(preset: Preset, scene: Scene, minutes: float) -> Fitted:
     Args:
       preset: what is trained.
       scene: what was photographed.
-      minutes: wall time of stage 1 with stereo, its coarse model and compiling.
+      minutes: wall time from here to the end of stage 1, without reading photographs. Steps get
+        half of it, however long everything else takes.
     """
     given: list[str] = []
     if preset.coarse is not None:
@@ -53,11 +55,10 @@ def fit_minutes(preset: Preset, scene: Scene, minutes: float) -> Fitted:
         given.append(f"capacity={max(1000, 1000 * round(preset.field.capacity * times / 1000))}")
         preset = with_settings(preset, given)
     programs = Programs(preset, scene)
-    compiling: dict[str, float] = {}
-    with timed_compiling(compiling):  # the run compiles once more what depends on the steps' number
-        before, step = _time_steps(programs)
-    before += compiling["compile"]
-    steps = max(_FEWEST, 10 * round((60 * minutes - before) / step / 10))
+    start = time.perf_counter()
+    seconds = _time_steps(programs)
+    left = 60 * minutes - (time.perf_counter() - start - seconds.reading) - seconds.before
+    steps = max(_FEWEST, 10 * round(max(left, 30 * minutes) / seconds.step / 10))
     given += [f"baseline_steps={steps}", *_schedules(preset, steps)]
     return Fitted(with_settings(preset, given), given, programs.read)
 
@@ -72,28 +73,39 @@ def _schedules(preset: Preset, steps: int) -> list[str]:
     ]
 
 
-def _time_steps(programs: Programs) -> tuple[float, float]:
-    """Return the seconds before the first step of stage 1, and those of a step."""
-    preset, keys = programs.preset, run_keys(0)
-    stereo, before = _timed(lambda: programs.stereo)
+class _Times(NamedTuple):
+    """Seconds, without compiling."""
+
+    reading: float  # of photographs, which the run does not read again
+    before: float  # the first step of stage 1: the coarse model, and what makes it finer
+    step: float
+
+
+def _time_steps(programs: Programs) -> _Times:
+    """Time everything that a run does until the end of stage 1."""
+    preset, keys, stereo = programs.preset, run_keys(0), programs.stereo
+    reading = before = 0.0
     if preset.coarse is None:
         state = initial_state(programs, keys, stereo)
     else:
         coarse = programs.coarse
         state = initial_state(coarse, keys, stereo)
         state, each = _steps(coarse, state, TrainData(coarse.photographs))
-        # What is read here is kept, so the run does not wait for it.
-        programs.pyramid(finest_read(preset, programs.scene))
+        _, reading = _timed(lambda: programs.pyramid(finest_read(preset, programs.scene)))
         state, refining = _timed(functools.partial(refine_state, programs, state))
-        before += preset.coarse.steps * each + refining
-    return before, _steps(programs, state, TrainData(programs.photographs))[1]
+        before = preset.coarse.steps * each + refining
+    return _Times(reading, before, _steps(programs, state, TrainData(programs.photographs))[1])
 
 
 def _steps(programs: Programs, state: Any, data: TrainData) -> tuple[Any, float]:
-    """Return the state after some steps, and the mean seconds of one of the later ones."""
-    state, _ = programs.run(state, data, count=_WARMING)
-    (state, _), seconds = _timed(lambda: programs.run(state, data, count=_TIMED))
-    return state, seconds / _TIMED
+    """Return the state after some steps, and the mean seconds of one of the later ones.
+
+    Each call sorts surfels, which a run does seldom, so many steps are timed in one.
+    """
+    (state, _), warming = _timed(lambda: programs.run(state, data, count=_WARMING))
+    count = round(min(max(_FEW, _SECONDS * _WARMING / warming), _MANY))
+    (state, _), seconds = _timed(lambda: programs.run(state, data, count=count))
+    return state, seconds / count
 
 
 def _timed(call: Callable[[], _Result]) -> tuple[_Result, float]:
@@ -102,4 +114,4 @@ def _timed(call: Callable[[], _Result]) -> tuple[_Result, float]:
     start = time.perf_counter()
     with timed_compiling(compiling):
         result = jax.block_until_ready(call())
-    return result, time.perf_counter() - start - compiling["compile"]
+    return result, max(1e-6, time.perf_counter() - start - compiling["compile"])
