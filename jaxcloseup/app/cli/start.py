@@ -149,4 +149,4 @@ def set_up_compilation_cache(folder: str | None) -> None:
         import jax  # not before the flags are read
 
         jax.config.update("jax_compilation_cache_dir", folder)
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
