@@ -173,27 +173,23 @@ ffi::Error hash_backward(ffi::ThreadPool pool, Floats positions, Floats features
   return ffi::Error::Success();
 }
 
+// Both functions take two arrays and make one.
+auto binding() {
+  return ffi::Ffi::Bind()
+      .Ctx<ffi::ThreadPool>()
+      .Arg<Floats>()
+      .Arg<Floats>()
+      .Ret<Floats>()
+      .Attr<ffi::Span<const int64_t>>("cells")
+      .Attr<ffi::Span<const int64_t>>("rows");
+}
+
 }  // namespace
 }  // namespace jaxcloseup
 
 #pragma GCC visibility push(default)
 
-XLA_FFI_DEFINE_HANDLER_SYMBOL(hash_forward, jaxcloseup::hash_forward,
-                              xla::ffi::Ffi::Bind()
-                                  .Ctx<xla::ffi::ThreadPool>()
-                                  .Arg<jaxcloseup::Floats>()
-                                  .Arg<jaxcloseup::Floats>()
-                                  .Ret<jaxcloseup::Floats>()
-                                  .Attr<xla::ffi::Span<const int64_t>>("cells")
-                                  .Attr<xla::ffi::Span<const int64_t>>("rows"));
-
-XLA_FFI_DEFINE_HANDLER_SYMBOL(hash_backward, jaxcloseup::hash_backward,
-                              xla::ffi::Ffi::Bind()
-                                  .Ctx<xla::ffi::ThreadPool>()
-                                  .Arg<jaxcloseup::Floats>()
-                                  .Arg<jaxcloseup::Floats>()
-                                  .Ret<jaxcloseup::Floats>()
-                                  .Attr<xla::ffi::Span<const int64_t>>("cells")
-                                  .Attr<xla::ffi::Span<const int64_t>>("rows"));
+XLA_FFI_DEFINE_HANDLER_SYMBOL(hash_forward, jaxcloseup::hash_forward, jaxcloseup::binding());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(hash_backward, jaxcloseup::hash_backward, jaxcloseup::binding());
 
 #pragma GCC visibility pop
