@@ -23,6 +23,7 @@ __all__, __getattr__, __dir__ = lazy_names(
             "Exposures Metering look_at_points solve_gains meter fit_metering predict_gain "
             "at_middle_exposure"
         ),
+        "stated_exposures": "StatedExposure stated_differences fit_cameras",
         "gather": "gather_parts",
         "gather_sums": "GatherSettings Gathered Reader gather_points",
         "support": "Support find_support count_seen",

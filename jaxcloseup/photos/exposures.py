@@ -4,7 +4,7 @@ A gain is the factor of a photograph's light over the same light at the middle e
 logarithms of gains are 0 on average. Light is what colors of sRGB encode.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -50,10 +50,13 @@ class Exposures(struct.PyTreeNode):
     Attributes:
       log_gains: `[V, 3]` logarithms of gains, 0 on average.
       metering: how the camera chose them.
+      stated: `[3]` log gains of held-out photographs whose files state their exposure, by split and
+        name.
     """
 
     log_gains: jax.Array
     metering: Metering
+    stated: Mapping[str, Mapping[str, jax.Array]] = struct.field(default_factory=dict)
 
 
 def look_at_points(
@@ -84,7 +87,7 @@ def look_at_points(
     return jnp.where(seen[:, None], jnp.log(to_light(jnp.maximum(colors, _USABLE[0]))), jnp.nan)
 
 
-def solve_gains(logs: np.ndarray) -> np.ndarray:
+def solve_gains(logs: np.ndarray, expected: np.ndarray | float = 0.0) -> np.ndarray:
     """Return log gains `[V, 3]` of photographs, 0 on average, from what they show of points.
 
     Minimizes the sum of |logs[v, p] - gains[v] - colors[p]| by reweighted least squares without the
@@ -92,7 +95,9 @@ def solve_gains(logs: np.ndarray) -> np.ndarray:
 
     Args:
       logs: `[V, P, 3]` log light; NaN where a photograph does not show a point.
+      expected: `[V, 1 or 3]` log gains near which photographs stay that share few points.
     """
+    logs = logs - np.asarray(expected)[..., None, :] if np.ndim(expected) else logs
     known = np.isfinite(logs).all(axis=-1)
     logs, weight = np.where(known[..., None], logs, 0).astype(np.float64), known.astype(np.float64)
     gains = np.zeros((len(logs), 3))
@@ -100,12 +105,13 @@ def solve_gains(logs: np.ndarray) -> np.ndarray:
         total = np.maximum(weight.sum(axis=0), 1e-9)
         share = weight / total
         colors = np.einsum("vp,vpc->pc", share, logs)
-        # A photograph that shares few points with others stays near the middle.
+        # A photograph that shares few points with others stays near what is expected.
         system = np.diag(weight.sum(axis=1) + _HELD) - share @ weight.T
         gains = np.linalg.solve(system, np.einsum("vp,vpc->vc", weight, logs - colors))
         colors -= share.T @ gains
         residual = np.linalg.norm(logs - gains[:, None] - colors, axis=-1)
         weight = known * _LEAST / np.maximum(residual, _LEAST)
+    gains = gains + expected
     return gains - gains.mean(axis=0)
 
 

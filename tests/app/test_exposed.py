@@ -1,5 +1,6 @@
 """Renders of a run at exposures that are predicted, chosen, or those of a photograph."""
 
+import functools
 import pathlib
 import shutil
 import types
@@ -8,8 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxcloseup.app.run.exposed import expose
+from jaxcloseup.app.run import scoring
+from jaxcloseup.app.run.exposed import expose, known_gain, render_exposed
 from jaxcloseup.app.run.measured_exposures import write_exposures
+from jaxcloseup.app.score.scores import evaluate
+from jaxcloseup.app.score.targets import Target
 from jaxcloseup.app.store.stored_run import RunError, load_run_scene, read_run, restore
 from jaxcloseup.app.view.camera_paths import CameraError
 from jaxcloseup.app.view.rendering import choose_exposure
@@ -60,6 +64,49 @@ def test_exposures_are_chosen(programs, seen):
     np.testing.assert_allclose(expose(programs, seen.rgb, seen), expected, rtol=1e-4)
     with pytest.raises(CameraError, match="--exposure=7 is no training view of plane"):
         choose_exposure(programs, "7")
+
+
+def test_a_photograph_whose_exposure_is_known_gets_it(programs, seen):
+    stated = {"test": {"near": jnp.log(jnp.array([2.0, 1.0, 0.5]))}}
+    programs.exposures = programs.exposures.replace(stated=stated)
+    gain = known_gain(programs, "test", "near")
+    expected = np.broadcast_to(colors_of(LIGHT * np.array([2, 1, 0.5])), (6, 8, 3))
+    np.testing.assert_allclose(expose(programs, seen.rgb, seen, gain), expected, rtol=1e-4)
+    np.testing.assert_allclose(known_gain(programs, "train", "3"), np.exp(GAINS[3]), rtol=1e-6)
+    for split, name in (("test", "far"), ("test_far", "near"), (None, "near")):
+        assert known_gain(programs, split, name) is None
+    choose_exposure(programs, "middle")  # what the user asks for goes first
+    np.testing.assert_allclose(expose(programs, seen.rgb, seen, gain), seen.rgb, rtol=1e-5)
+    programs.exposures = None
+    assert known_gain(programs, "train", "3") is None
+
+
+def test_held_out_views_are_scored_at_their_known_exposure(programs, seen, monkeypatch):
+    """The photograph has 4.1 times the light of the middle, and its file says 4."""
+    truth = colors_of(np.full((6, 8, 3), 4.1 * LIGHT / 2))
+    targets = [
+        Target(name, None, truth.astype(np.float32), np.ones((6, 8)), jnp.ones((6, 8)))
+        for name in ("stated", "unknown")
+    ]
+    found = {"test": targets[:1], "test_reduced": targets}
+    monkeypatch.setattr(scoring, "targets_by_split", lambda *_, **__: found)
+    programs.exposures = programs.exposures.replace(
+        stated={"test": {"stated": jnp.log(jnp.full(3, 4.0))}}
+    )
+    programs.scene.surface = None
+    programs.scene.train = types.SimpleNamespace(cameras=types.SimpleNamespace(width=8, height=6))
+    programs.scene.metadata = {}
+    programs.scene.photographs_at = None
+    programs.preset = types.SimpleNamespace(score_width=None)
+    middle = seen._replace(rgb=jnp.full((6, 8, 3), colors_of(LIGHT / 2), jnp.float32))
+    programs.render = lambda state, camera: middle
+    start = types.SimpleNamespace(state=None, sources=types.SimpleNamespace(depths=None))
+    held = scoring.hold_out(programs, start)
+    render = functools.partial(render_exposed, programs, None)
+    for split in found:
+        views = evaluate(render, held.targets[split])[0]["views"]
+        assert views["stated"]["psnr"] > 35
+    assert views["unknown"]["psnr"] < 15
 
 
 def test_photographs_of_one_exposure_leave_renders_alone(programs, seen):

@@ -5,15 +5,19 @@ from types import SimpleNamespace
 import jax
 import jax.numpy as jnp
 import numpy as np
+import PIL.Image
 import pytest
 import textured_corner
+from PIL.ExifTags import IFD, Base
 from textured_corner import SMALL_LENS, corner_views
 
 from jaxcloseup.app.methods.method import StereoTraining
 from jaxcloseup.app.run.measured_exposures import (
     NAME,
+    held_out_gains,
     measure_exposures,
     read_exposures,
+    stated_exposures,
     write_exposures,
 )
 from jaxcloseup.app.run.stereo_depths import draw_points, match_photographs, matched_divisor
@@ -22,6 +26,7 @@ from jaxcloseup.native import library
 from jaxcloseup.photos.light import change_exposure
 from jaxcloseup.photos.pyramids import photograph_pyramid
 from jaxcloseup.photos.scene import Scene
+from jaxcloseup.photos.stated_exposures import fit_cameras
 from jaxcloseup.photos.views import Views
 from jaxcloseup.stereo import StereoConfig
 
@@ -84,7 +89,9 @@ def exposures(stereo, log_gains):
     gains = jnp.exp(jnp.asarray(log_gains, jnp.float32))[:, None, None]
     light = change_exposure(0.5 * stereo.views.rgb.astype(jnp.float32) / 255, gains)
     taken = jnp.round(255 * jnp.clip(light, 0, 1)).astype(jnp.uint8)
-    return measure_exposures(stereo._replace(views=stereo.views.replace(rgb=taken)))
+    names = {"train": [str(view) for view in range(len(log_gains))]}
+    scene = SimpleNamespace(metadata={}, names=names)
+    return measure_exposures(stereo._replace(views=stereo.views.replace(rgb=taken)), scene)
 
 
 def test_known_exposures_are_recovered(exposures, log_gains):
@@ -93,11 +100,37 @@ def test_known_exposures_are_recovered(exposures, log_gains):
 
 
 def test_photographs_of_one_exposure_stay_as_they_are(stereo):
-    assert measure_exposures(stereo) is None
+    names = {"train": [""] * len(stereo.views)}
+    assert measure_exposures(stereo, SimpleNamespace(metadata={}, names=names)) is None
+
+
+def test_held_out_photographs_get_the_exposure_of_their_files(tmp_path):
+    """Time and sensitivity explain the gains of the others, but for a factor of the camera."""
+
+    def write(name, seconds):
+        exif = PIL.Image.Exif()
+        exif.get_ifd(IFD.Exif).update({Base.ExposureTime: seconds, Base.ISOSpeedRatings: 100})
+        PIL.Image.new("RGB", (8, 8)).save(tmp_path / name, exif=exif)
+        return tmp_path / name
+
+    seconds = [0.01, 0.02, 0.04, 0.05]
+    files = {"train": [write(f"{i}.jpg", time) for i, time in enumerate(seconds)]}
+    PIL.Image.new("RGB", (8, 8)).save(tmp_path / "without.jpg")
+    files["test"] = [write("far.jpg", 0.08), tmp_path / "without.jpg"]
+    names = {split: [path.stem for path in paths] for split, paths in files.items()}
+    scene = SimpleNamespace(metadata={"files": files}, names=names)
+    gains = np.log(seconds)[:, None] + [0.1, 0.0, -0.1]
+    gains -= gains.mean(0)
+    stated = stated_exposures(scene)
+    found = held_out_gains(scene, stated, fit_cameras(gains, stated["train"]))
+    assert found.keys() == {"test"} and found["test"].keys() == {"far"}
+    expected = gains[0] + np.log(8)
+    np.testing.assert_allclose(found["test"]["far"], expected, atol=1e-3)
 
 
 def test_exposures_are_kept(exposures, tmp_path):
     names = [str(view) for view in range(len(exposures.log_gains))]
+    exposures = exposures.replace(stated={"test": {"near": jnp.array([0.1, 0.2, 0.3])}})
     write_exposures(tmp_path, None, names)
     assert read_exposures(tmp_path, names) is None
     write_exposures(tmp_path, exposures, names)

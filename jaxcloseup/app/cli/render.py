@@ -96,8 +96,8 @@ with topic("Pictures"):
     flags.DEFINE_string(
         "exposure",
         "auto",
-        "exposure of images, where photographs differ in theirs: auto, as the camera would have "
-        "chosen it for each; middle, the mean of all photographs; or the name of a photograph",
+        "exposure of images, where photographs differ in theirs: auto, as the camera chose it, "
+        "or would have chosen; middle, the mean of all photographs; or the name of a photograph",
     )
 # Flags that only these camera sources accept.
 _ONLY_WITH = {

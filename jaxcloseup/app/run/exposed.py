@@ -3,6 +3,7 @@
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.fields.contract import Rendering
@@ -16,23 +17,37 @@ _predict_gain = jax.jit(predict_gain)
 _change_exposure = jax.jit(change_exposure)
 
 
-def expose(programs: Programs, rgb: Any, seen: Rendering) -> Any:
+def known_gain(programs: Programs, split: str | None, name: str) -> jax.Array | None:
+    """Return the gain `[3]` of a photograph of a split; None where nothing states it."""
+    exposures = programs.exposures
+    if exposures is None:
+        return None
+    if split == "train":
+        return jnp.exp(exposures.log_gains[programs.scene.names["train"].index(name)])
+    log_gain = exposures.stated.get(split or "", {}).get(name)
+    return None if log_gain is None else jnp.exp(log_gain)
+
+
+def expose(programs: Programs, rgb: Any, seen: Rendering, gain: jax.Array | None = None) -> Any:
     """Return colors of a whole image as the camera would have taken them.
 
     Args:
       programs: what rendered it; `programs.gain` is that of all views, if it is not None.
       rgb: `[H, W, 3]` colors at the middle exposure, such as those with detail.
-      seen: the rendering of the view, whose exposure is predicted.
+      seen: the rendering of the view.
+      gain: `[3]` of the view, see `known_gain`; None: predicted from `seen`.
     """
     if programs.exposures is None:
         return rgb
-    gain = programs.gain
+    gain = gain if programs.gain is None else programs.gain
     if gain is None:
         gain = _predict_gain(programs.exposures.metering, seen.rgb, seen.alpha)
     return _change_exposure(rgb, gain[None, None])
 
 
-def render_exposed(programs: Programs, state: TrainState, camera: Camera) -> Rendering:
-    """Render a whole image at its exposure."""
+def render_exposed(
+    programs: Programs, state: TrainState, camera: Camera, gain: jax.Array | None = None
+) -> Rendering:
+    """Render a whole image at its exposure, see `expose`."""
     seen = programs.render(state, camera)
-    return seen._replace(rgb=expose(programs, seen.rgb, seen))
+    return seen._replace(rgb=expose(programs, seen.rgb, seen, gain))

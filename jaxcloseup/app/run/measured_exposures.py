@@ -1,7 +1,8 @@
 """Exposures of a run's photographs, from the depth that stereo matched."""
 
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import chex
 import jax
@@ -10,6 +11,7 @@ import numpy as np
 
 from jaxcloseup.app import progress
 from jaxcloseup.app.run.stereo_depths import StereoDepths, draw_points
+from jaxcloseup.captures.photo_exif import read_exposure
 from jaxcloseup.io.files import read_object, write_json
 from jaxcloseup.photos.exposures import (
     Exposures,
@@ -18,17 +20,22 @@ from jaxcloseup.photos.exposures import (
     look_at_points,
     solve_gains,
 )
+from jaxcloseup.photos.scene import Scene
+from jaxcloseup.photos.stated_exposures import StatedExposure, fit_cameras, stated_differences
 from jaxcloseup.photos.views import camera_at, to_float
 
+
+Stated = Mapping[str, Sequence[StatedExposure | None]]  # of each photograph, by split
 
 NAME = "exposures.json"
 _POINTS = 5000  # at which photographs are compared
 _AGREE = 0.02  # standard deviation of log gains up to which photographs have one exposure
 
 
-def measure_exposures(stereo: StereoDepths) -> Exposures | None:
-    """Return how exposures of photographs differ; None where they agree."""
+def measure_exposures(stereo: StereoDepths, scene: Scene) -> Exposures | None:
+    """Return how exposures of a scene's photographs differ; None where they agree."""
     views = stereo.views
+    stated = stated_exposures(scene)
     points = jnp.asarray(draw_points(stereo, _POINTS)[0])
     depth = jnp.where(stereo.maps.confidence > 0, stereo.maps.depth, 0)
     look = jax.jit(look_at_points)
@@ -41,14 +48,46 @@ def measure_exposures(stereo: StereoDepths) -> Exposures | None:
         return np.asarray(look(camera, depth[view], *photograph(view), points))
 
     with progress.saying("comparing exposures"):
-        log_gains = solve_gains(np.stack(list(map(seen, range(len(views))))))
+        logs = np.stack(list(map(seen, range(len(views)))))
+        log_gains = solve_gains(logs, stated_differences(stated["train"]))
         spread = float(log_gains.std())
         if spread < _AGREE:
             return None
         unpadded = [_crop(*photograph(view)) for view in range(len(views))]
         metering = fit_metering(log_gains, unpadded)
-    print(_describe(log_gains, metering.slopes))
-    return Exposures(jnp.asarray(log_gains, jnp.float32), metering)
+        held_out = held_out_gains(scene, stated, fit_cameras(log_gains, stated["train"]))
+    print(_describe(log_gains, metering.slopes, held_out))
+    return Exposures(jnp.asarray(log_gains, jnp.float32), metering, held_out)
+
+
+def stated_exposures(scene: Scene) -> Stated:
+    """Return what the files of each split's photographs say of their exposure."""
+    files = scene.metadata.get("files", {})
+    return {
+        split: [*map(read_exposure, files[split])] if split in files else [None] * len(names)
+        for split, names in scene.names.items()
+    }
+
+
+def held_out_gains(
+    scene: Scene, stated: Stated, cameras: Mapping[str, np.ndarray]
+) -> dict[str, dict[str, jax.Array]]:
+    """Return the log gains of held-out photographs that follow from their files.
+
+    Args:
+      scene: the scene.
+      stated: what the files say.
+      cameras: by how much log gains `[3]` of each camera exceed the log exposures of its files.
+    """
+    return {
+        split: {
+            name: jnp.asarray(found.log_exposure + cameras[found.camera], jnp.float32)
+            for name, found in zip(scene.names[split], stated[split], strict=True)
+            if found and found.camera in cameras
+        }
+        for split in scene.names
+        if split != "train"
+    }
 
 
 def _crop(rgb: jax.Array, weight: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -66,7 +105,8 @@ def write_exposures(
         return
     plain = jax.tree.map(lambda leaf: np.asarray(leaf).tolist(), exposures)
     gains = dict(zip(names, plain.log_gains, strict=True))
-    write_json(folder / NAME, {"log_gains": gains, "metering": vars(plain.metering)})
+    kept = {"log_gains": gains, "metering": vars(plain.metering), "stated": plain.stated}
+    write_json(folder / NAME, kept)
 
 
 def read_exposures(folder: pathlib.Path, names: Sequence[str]) -> Exposures | None:
@@ -81,22 +121,31 @@ def read_exposures(folder: pathlib.Path, names: Sequence[str]) -> Exposures | No
     try:
         kept = read_object(path)
         gains = jnp.asarray([kept["log_gains"][name] for name in names], jnp.float32)
-        metering = Metering(**{k: jnp.asarray(v, jnp.float32) for k, v in kept["metering"].items()})
+        metering = Metering(**_arrays(kept["metering"]))
+        stated = {split: _arrays(named) for split, named in kept.get("stated", {}).items()}
         chex.assert_shape((gains, metering.content, metering.slopes), ((len(names), 3), (3,), (2,)))
         chex.assert_shape(metering.width, ())
+        chex.assert_shape(jax.tree.leaves(stated), (3,))
     except (KeyError, TypeError, ValueError, AttributeError, AssertionError):
         raise ValueError(
             f"{path} does not hold the exposures of these photographs: restore it from a copy of "
             "the run"
         ) from None
-    return Exposures(gains, metering)
+    return Exposures(gains, metering, stated)
 
 
-def _describe(log_gains: np.ndarray, slopes: jax.Array) -> str:
+def _arrays(values: Mapping[str, Any]) -> dict[str, jax.Array]:
+    return {name: jnp.asarray(value, jnp.float32) for name, value in values.items()}
+
+
+def _describe(
+    log_gains: np.ndarray, slopes: jax.Array, held_out: Mapping[str, Mapping[str, jax.Array]]
+) -> str:
     """Say by how much exposures differ, and whether those of new views are predicted."""
     ratio = np.exp(np.ptp(log_gains.mean(axis=1)))
+    count = sum(map(len, held_out.values()))
     predicted = "predicted" if np.any(np.asarray(slopes)) else "the middle one"
     return (
         f"photographs differ {ratio:.2g} times in exposure: they are brought to the "
         f"middle; the exposure of new views is {predicted}"
-    )
+    ) + f", that of {count} held-out photographs follows from their files" * (count > 0)

@@ -59,7 +59,9 @@ class ReadPhotographs:
         wanted = preset.stereo is not None and preset.stereo.exposures
         if wanted not in self._exposures:
             stereo = self.stereo(preset) if wanted else None
-            self._exposures[wanted] = None if stereo is None else measure_exposures(stereo)
+            self._exposures[wanted] = (
+                None if stereo is None else measure_exposures(stereo, self._scene)
+            )
         return self._exposures[wanted]
 
     def keep_exposures(self, exposures: Exposures | None) -> None:

@@ -2,13 +2,13 @@
 
 import functools
 import pathlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from jaxcloseup.app.run.exposed import render_exposed
+from jaxcloseup.app.run.exposed import known_gain, render_exposed
 from jaxcloseup.app.run.labels import LabelStart
 from jaxcloseup.app.run.loop import Training
 from jaxcloseup.app.run.programs import Programs
@@ -17,10 +17,8 @@ from jaxcloseup.app.run.timers import timed
 from jaxcloseup.app.score.ladder import describe_ladder, ladder_targets
 from jaxcloseup.app.score.metrics_text import REDUCED, describe_split
 from jaxcloseup.app.score.renders import write_renders
-from jaxcloseup.app.score.scores import Perceptual, evaluate
+from jaxcloseup.app.score.scores import Perceptual, RenderAtGain, evaluate
 from jaxcloseup.app.score.targets import Target, exact_depths, score_divisor, targets_by_split
-from jaxcloseup.fields.contract import Rendering
-from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.training.state import TrainState
 
 
@@ -47,7 +45,15 @@ def hold_out(programs: Programs, start: LabelStart) -> HeldOut:
     scene, render = programs.scene, functools.partial(programs.render, start.state)
     exact = exact_depths(scene, scene.train.cameras) if scene.surface else None
     divisor = score_divisor(scene, programs.preset.score_width)
-    targets = targets_by_split(scene, start.sources.depths, exact, render, divisor=divisor)
+    targets = {
+        split: [
+            view._replace(gain=known_gain(programs, split.removesuffix(REDUCED), view.name))
+            for view in views
+        ]
+        for split, views in targets_by_split(
+            scene, start.sources.depths, exact, render, divisor=divisor
+        ).items()
+    }
     return HeldOut(targets, {} if exact is None else ladder_targets(scene, exact), exact)
 
 
@@ -74,9 +80,7 @@ class Scorer:
         self.scores: dict[str, dict[str, Any]] = {}
         self.images: dict[tuple[str, str], Mapping[str, np.ndarray]] = {}
 
-    def score(
-        self, stage: str, state: TrainState, render: Callable[[Camera], Rendering] | None = None
-    ) -> None:
+    def score(self, stage: str, state: TrainState, render: RenderAtGain | None = None) -> None:
         """Render, score and keep one stage.
 
         By default the state renders, and is exported too.

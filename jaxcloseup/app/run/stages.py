@@ -83,9 +83,9 @@ class Run:
         self.scorer.score(stage, state)
         return state
 
-    def render(self, camera: Camera) -> Rendering:
-        """Render the latest state."""
-        return render_exposed(self.programs, self.state, camera)
+    def render(self, camera: Camera, gain: jax.Array | None = None) -> Rendering:
+        """Render the latest state, see `render_exposed`."""
+        return render_exposed(self.programs, self.state, camera, gain)
 
     def get_detail(self, stage: str, state: TrainState) -> GetDetail:
         """Return a function that finds the detail of a stage's state in the folder, or makes it."""
@@ -178,10 +178,10 @@ def add_detail_stage(run: Run, get_detail: GetDetail) -> tuple[dict[str, Any], R
     with timed(run.training.seconds, "detail"):
         detail, about = get_detail()
 
-    def render(camera: Camera) -> Rendering:
+    def render(camera: Camera, gain: jax.Array | None = None) -> Rendering:
         rendering = programs.render(state, camera)
         sharper = detailed(programs, detail, camera, rendering)
-        return rendering._replace(rgb=expose(programs, sharper.rgb, rendering))
+        return rendering._replace(rgb=expose(programs, sharper.rgb, rendering, gain))
 
     def detail_of(camera: Camera) -> Detailed:
         return detailed(programs, detail, camera, programs.render(state, camera))

@@ -40,6 +40,7 @@ class Target(NamedTuple):
     could_resolve: float | None = None
     # how near photographs come, see `describe_proximity`; None where that was not asked
     proximity: Mapping[str, float] | None = None
+    gain: jax.Array | None = None  # `[3]` its known gain over the middle exposure, or None
 
 
 def exact_depths(scene: Scene, cameras: Camera) -> jax.Array:

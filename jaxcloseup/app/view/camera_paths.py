@@ -39,6 +39,7 @@ class Shots(NamedTuple):
     fps: float | None = None  # frames per second that the camera path asks for, or None
     # width and height of each photograph without its padding; None if no image is padded
     sizes: list[tuple[int, int]] | None = None
+    split: str | None = None  # of the photographs whose cameras these are, or None
 
 
 def view_shots(scene: Scene, split: str) -> Shots:
@@ -58,7 +59,7 @@ def view_shots(scene: Scene, split: str) -> Shots:
     check_memory(width, height, "--width")
     intrinsics = jnp.stack([camera.intrinsics for camera in own])
     cameras = views.cameras.replace(intrinsics=intrinsics, width=width, height=height)
-    return Shots(cameras, list(scene.names[split]), sizes=sizes)
+    return Shots(cameras, list(scene.names[split]), sizes=sizes, split=split)
 
 
 def orbit(scene: Scene, frames: int, *, up: Sequence[float] | None = None) -> Shots:

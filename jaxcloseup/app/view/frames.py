@@ -1,5 +1,6 @@
 """Render the frames of a camera path: color, depth, normals and support as images."""
 
+import functools
 import pathlib
 from collections.abc import Sequence
 
@@ -7,7 +8,7 @@ import jax
 import numpy as np
 
 from jaxcloseup.app import progress
-from jaxcloseup.app.run.exposed import expose
+from jaxcloseup.app.run.exposed import expose, known_gain
 from jaxcloseup.app.run.kept_detail import detailed
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.view.camera_paths import Shots, named_cameras
@@ -62,6 +63,9 @@ def render_shots(
         label_depth(programs.render(state, cameras[i][1]), near=0, far=scene.far) for i in some
     ]
     limits = depth_range(depths, scene)
+    picture = functools.partial(
+        draw_pictures, programs, sources=sources, detail=detail, limits=limits
+    )
     sizes = shots.sizes or [(shots.cameras.width, shots.cameras.height)] * len(cameras)
     images: dict[str, Image] = {}
     empty = 0
@@ -72,11 +76,8 @@ def render_shots(
         (name, camera), size = frame
         camera = camera.replace(width=size[0], height=size[1])
         seen = programs.render(state, camera)
-        images = draw_pictures(
-            programs, seen, camera, sources=sources, detail=detail, limits=limits
-        )
-        solid = np.asarray(seen.alpha) >= SOLID
-        return name, images, not solid.any()
+        images = picture(seen, camera, gain=known_gain(programs, shots.split, name))
+        return name, images, not np.any(np.asarray(seen.alpha) >= SOLID)
 
     frames = list(zip(cameras, sizes, strict=True))
     largest = max(width * height for width, height in sizes)
@@ -102,6 +103,7 @@ def draw_pictures(
     sources: LabelSources | None,
     detail: Detail | None = None,
     limits: tuple[float, float] | None = None,
+    gain: jax.Array | None = None,
 ) -> dict[str, Image]:
     """Return a camera's images by kind: `rgb`, `depth`, `normals`, `support`, `trust`, `error`.
 
@@ -116,6 +118,7 @@ def draw_pictures(
       sources: the training photographs with their depths, or None to leave out support.
       detail: detail of the state, or None to draw the state alone.
       limits: nearest and farthest depth of the color scale; default: `depth_range` of the image.
+      gain: of the camera's photograph, see `expose`.
     """
     scene = programs.scene
     depth = label_depth(seen, near=0, far=scene.far)
@@ -134,7 +137,7 @@ def draw_pictures(
         sharper = detailed(programs, detail, camera, seen)
         images |= {"rgb": sharper.rgb, "trust": np.asarray(sharper.weight)}
         images["error"] = colorize_expected_error(sharper.error)
-    images["rgb"] = np.asarray(expose(programs, images["rgb"], seen))
+    images["rgb"] = np.asarray(expose(programs, images["rgb"], seen, gain))
     return images
 
 
