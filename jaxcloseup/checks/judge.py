@@ -178,7 +178,8 @@ def _coverage(evidence: Evidence, points: np.ndarray, figures: dict[str, Any]) -
     figures |= {"neighbor_degrees": angle, "without_matches": int(alone)}
     notes = []
     if alone:
-        notes.append(f"{alone} of {len(axes)} photographs share no features with others")
+        share = "shares" if alone == 1 else "share"
+        notes.append(f"{alone} of {len(axes)} photographs {share} no features with others")
     if len(points):
         count, degrees, nearest = coverage(points, cameras)
         figures |= {"views": count, "degrees": degrees, "nearest": nearest}

@@ -18,11 +18,12 @@ __all__, __getattr__, __dir__ = lazy_names(
             "Windows photograph_windows view_windows windows_that_see sample_window "
             "sample_window_pixels cut_window in_quarters"
         ),
-        "light": "to_light to_colors change_exposure",
+        "light": "to_light to_colors change_exposure light_by_curve colors_by_curve",
         "exposures": (
-            "Exposures Metering look_at_points solve_gains meter fit_metering predict_gain "
-            "at_middle_exposure"
+            "Exposures Taken Metering look_at_points solve_gains meter fit_metering predict_gain "
+            "at_middle_exposure take"
         ),
+        "responses": "fit_response straighten",
         "stated_exposures": "StatedExposure stated_differences fit_cameras",
         "gather": "gather_parts",
         "gather_sums": "GatherSettings Gathered Reader gather_points",

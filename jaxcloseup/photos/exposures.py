@@ -4,6 +4,7 @@ A gain is the factor of a photograph's light over the same light at the middle e
 logarithms of gains are 0 on average. Light is what colors of sRGB encode.
 """
 
+import collections
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -16,11 +17,17 @@ from jaxcloseup.geometry.cameras import Camera, points_to_pixels
 from jaxcloseup.geometry.masks import depth_consistent, in_bounds
 from jaxcloseup.geometry.numerics import safe_divide
 from jaxcloseup.geometry.warp import backward_warp
-from jaxcloseup.photos.light import change_exposure, to_light
+from jaxcloseup.photos.light import (
+    change_exposure,
+    colors_by_curve,
+    light_by_curve,
+    to_colors,
+    to_light,
+)
 from jaxcloseup.photos.views import Views, to_float
 
 
-_USABLE = 0.03, 0.97  # colors beyond are noise, or clipped
+USABLE = 0.03, 0.97  # colors beyond are noise, or clipped
 _LEAST = 0.05  # residual of log light below which all count alike
 _ROUNDS = 10  # of reweighting
 _HELD = 1.0  # weight of the middle in each gain, in points
@@ -44,6 +51,13 @@ class Metering(struct.PyTreeNode):
     slopes: jax.Array
 
 
+class Taken(NamedTuple):
+    """How a camera takes a view."""
+
+    gain: jax.Array | None  # `[3]` over the middle exposure; None: predicted from the render
+    curve: jax.Array | None  # `[L]` light of its colors; None: that of sRGB
+
+
 class Exposures(struct.PyTreeNode):
     """Exposures of V photographs.
 
@@ -52,11 +66,34 @@ class Exposures(struct.PyTreeNode):
       metering: how the camera chose them.
       stated: `[3]` log gains of held-out photographs whose files state their exposure, by split and
         name.
+      curves: `[L]` light of the colors of each camera whose curve is not that of sRGB.
+      cameras: by split and name of a photograph, which camera took it.
     """
 
     log_gains: jax.Array
     metering: Metering
     stated: Mapping[str, Mapping[str, jax.Array]] = struct.field(default_factory=dict)
+    curves: Mapping[str, jax.Array] = struct.field(default_factory=dict)
+    cameras: Mapping[str, Mapping[str, str]] = struct.field(pytree_node=False, default_factory=dict)
+
+    def train_curves(self, names: Sequence[str]) -> jax.Array | None:
+        """Return the curves `[V, L]` of training photographs; None where all are that of sRGB."""
+        cameras = self.cameras.get("train", {})
+        return stack_curves(self.curves, [cameras[name] for name in names]) if cameras else None
+
+    def curve_of(self, split: str | None, name: str | None) -> jax.Array | None:
+        """Return the curve of a photograph's camera, or of the camera that took most."""
+        took = self.cameras.get("train", {})
+        most = collections.Counter(took.values()).most_common(1)
+        camera = self.cameras.get(split or "", {}).get(name or "", most[0][0] if most else "")
+        return self.curves.get(camera)
+
+
+def stack_curves(curves: Mapping[str, jax.Array], cameras: Sequence[str]) -> jax.Array:
+    """Return the curves `[V, L]` of V photographs by their cameras; some may be that of sRGB."""
+    levels = len(next(iter(curves.values())))
+    srgb = to_light(jnp.linspace(0, 1, levels))
+    return jnp.stack([curves.get(camera, srgb) for camera in cameras])
 
 
 def look_at_points(
@@ -83,8 +120,8 @@ def look_at_points(
     colors = backward_warp(rgb, pixels)
     seen = in_bounds(pixels, *depth.shape) & (observed[:, 1] > 0)
     seen &= depth_consistent(observed[:, 0], expected, tolerance)
-    seen &= (jnp.min(colors, -1) > _USABLE[0]) & (jnp.max(colors, -1) < _USABLE[1])
-    return jnp.where(seen[:, None], jnp.log(to_light(jnp.maximum(colors, _USABLE[0]))), jnp.nan)
+    seen &= (jnp.min(colors, -1) > USABLE[0]) & (jnp.max(colors, -1) < USABLE[1])
+    return jnp.where(seen[:, None], jnp.log(to_light(jnp.maximum(colors, USABLE[0]))), jnp.nan)
 
 
 def solve_gains(logs: np.ndarray, expected: np.ndarray | float = 0.0) -> np.ndarray:
@@ -197,12 +234,25 @@ def predict_gain(metering: Metering, rgb: jax.Array, weight: jax.Array) -> jax.A
     return jnp.where(total > 0, jnp.exp(log_gain), 1)
 
 
-def at_middle_exposure(views: Views, log_gains: jax.Array) -> Views:
+def at_middle_exposure(
+    views: Views, log_gains: jax.Array, curves: jax.Array | None = None
+) -> Views:
     """Return photographs with float colors as they would be at the middle exposure.
 
     Args:
       views: V photographs.
       log_gains: `[V, 3]`.
+      curves: `[V, L]` light of their cameras' colors; None: that of sRGB.
     """
-    gains = jnp.exp(-log_gains)[:, None, None]
-    return views.replace(rgb=change_exposure(to_float(views.rgb), gains))
+    gains, rgb = jnp.exp(-log_gains)[:, None, None], to_float(views.rgb)
+    if curves is None:
+        return views.replace(rgb=change_exposure(rgb, gains))
+    rows = jnp.arange(len(views))[:, None, None]
+    return views.replace(rgb=to_colors(light_by_curve(rgb, curves, rows) * gains))
+
+
+def take(rgb: jax.Array, taken: Taken) -> jax.Array:
+    """Return colors `[..., 3]` of the middle exposure as a camera takes them; its gain is known."""
+    assert taken.gain is not None
+    light = to_light(rgb) * taken.gain.reshape((1,) * (rgb.ndim - 1) + (3,))
+    return to_colors(light) if taken.curve is None else colors_by_curve(light, taken.curve)

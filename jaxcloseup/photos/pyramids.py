@@ -11,7 +11,7 @@ from flax import struct
 
 from jaxcloseup.geometry.cameras import Camera, mean_focal
 from jaxcloseup.io.buffers import empty_for_jax
-from jaxcloseup.photos.light import change_exposure
+from jaxcloseup.photos.light import change_exposure, light_by_curve, to_colors
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.views import Photograph, Views, to_float, unpadded
 
@@ -34,12 +34,14 @@ class Pyramid:
       extents: `[V, L, 2]` int32 height and width of each image.
       gains: `[V, 3]` factor of the light of each view's first three values over that at the middle
         exposure, at which `image` and windows show them; None: all have one exposure.
+      curves: `[V, N]` light of each view's colors, from black to white; None: that of sRGB.
     """
 
     values: jax.Array
     intrinsics: jax.Array
     extents: jax.Array
     gains: jax.Array | None = None
+    curves: jax.Array | None = None
 
     def __len__(self) -> int:
         """Return the number of views."""
@@ -83,7 +85,10 @@ class Pyramid:
             return values
         values = to_float(values)
         gain = jnp.broadcast_to(1 / self.gains[view], (*values.shape[:-1], 3))
-        rgb = change_exposure(values[..., :3], gain)
+        if self.curves is None:
+            rgb = change_exposure(values[..., :3], gain)
+        else:
+            rgb = to_colors(light_by_curve(values[..., :3], self.curves, view) * gain)
         return jnp.concatenate([rgb, values[..., 3:]], axis=-1)
 
     def camera(self, camera: Camera, view: int, index: int) -> Camera:

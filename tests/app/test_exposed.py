@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxcloseup.app.run import scoring
-from jaxcloseup.app.run.exposed import expose, known_gain, render_exposed
+from jaxcloseup.app.run.exposed import expose, how_taken, render_exposed
 from jaxcloseup.app.run.measured_exposures import write_exposures
 from jaxcloseup.app.score.scores import evaluate
 from jaxcloseup.app.score.targets import Target
@@ -35,7 +35,7 @@ def programs():
     """What `expose` and `choose_exposure` ask of programs: a camera that halves its exposures."""
     scene = types.SimpleNamespace(name="plane", names={"train": list("01234")})
     exposures = Exposures(jnp.asarray(GAINS), metering(-1.0))
-    return types.SimpleNamespace(scene=scene, exposures=exposures, gain=None)
+    return types.SimpleNamespace(scene=scene, exposures=exposures, taken=None)
 
 
 @pytest.fixture
@@ -69,16 +69,31 @@ def test_exposures_are_chosen(programs, seen):
 def test_a_photograph_whose_exposure_is_known_gets_it(programs, seen):
     stated = {"test": {"near": jnp.log(jnp.array([2.0, 1.0, 0.5]))}}
     programs.exposures = programs.exposures.replace(stated=stated)
-    gain = known_gain(programs, "test", "near")
+    near = how_taken(programs, "test", "near")
     expected = np.broadcast_to(colors_of(LIGHT * np.array([2, 1, 0.5])), (6, 8, 3))
-    np.testing.assert_allclose(expose(programs, seen.rgb, seen, gain), expected, rtol=1e-4)
-    np.testing.assert_allclose(known_gain(programs, "train", "3"), np.exp(GAINS[3]), rtol=1e-6)
+    np.testing.assert_allclose(expose(programs, seen.rgb, seen, near), expected, rtol=1e-4)
+    np.testing.assert_allclose(how_taken(programs, "train", "3").gain, np.exp(GAINS[3]), rtol=1e-6)
     for split, name in (("test", "far"), ("test_far", "near"), (None, "near")):
-        assert known_gain(programs, split, name) is None
+        assert how_taken(programs, split, name).gain is None
     choose_exposure(programs, "middle")  # what the user asks for goes first
-    np.testing.assert_allclose(expose(programs, seen.rgb, seen, gain), seen.rgb, rtol=1e-5)
+    np.testing.assert_allclose(expose(programs, seen.rgb, seen, near), seen.rgb, rtol=1e-5)
     programs.exposures = None
-    assert known_gain(programs, "train", "3") is None
+    assert how_taken(programs, "train", "3") is None
+
+
+def test_a_camera_with_a_curve_takes_its_own_photographs(programs, seen):
+    """Another camera's views stay as sRGB encodes them, and a view of none has the usual curve."""
+    curve = jnp.linspace(0, 1, 256) ** 3
+    cameras = {"train": dict.fromkeys("0123", "film") | {"4": "plain"}, "test": {"near": "plain"}}
+    programs.exposures = programs.exposures.replace(curves={"film": curve}, cameras=cameras)
+    light = LIGHT * np.exp(GAINS)
+    for name, colors in (("3", light[3] ** (1 / 3)), ("4", colors_of(light[4]))):
+        taken = how_taken(programs, "train", name)
+        found = expose(programs, seen.rgb, seen, taken)
+        np.testing.assert_allclose(found[2, 3], colors, atol=1e-3)
+    assert how_taken(programs, "test", "near").curve is None
+    choose_exposure(programs, "middle")
+    np.testing.assert_allclose(expose(programs, seen.rgb, seen), LIGHT ** (1 / 3), atol=1e-3)
 
 
 def test_held_out_views_are_scored_at_their_known_exposure(programs, seen, monkeypatch):

@@ -1,5 +1,6 @@
 """Depth by stereo in a run: what training begins with, on walls drawn by ray casting."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import jax
@@ -23,7 +24,8 @@ from jaxcloseup.app.run.measured_exposures import (
 from jaxcloseup.app.run.stereo_depths import draw_points, match_photographs, matched_divisor
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.native import library
-from jaxcloseup.photos.light import change_exposure
+from jaxcloseup.photos.exposures import at_middle_exposure
+from jaxcloseup.photos.light import change_exposure, to_light
 from jaxcloseup.photos.pyramids import photograph_pyramid
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.stated_exposures import fit_cameras
@@ -104,6 +106,27 @@ def test_photographs_of_one_exposure_stay_as_they_are(stereo):
     assert measure_exposures(stereo, SimpleNamespace(metadata={}, names=names)) is None
 
 
+def test_a_camera_s_curve_is_recovered_with_its_exposures(stereo, log_gains):
+    """Straightened photographs show the scene within 2 %, but for a power that nothing tells."""
+    light = to_light(stereo.views.rgb.astype(jnp.float32) / 255) * 0.5 + 0.01
+    gained = light * jnp.exp(jnp.asarray(log_gains, jnp.float32))[:, None, None]
+    colors = 1.3 * gained**0.8 / (gained**0.8 + 0.5)  # highlights are compressed
+    taken = jnp.round(255 * jnp.clip(colors, 0, 1)).astype(jnp.uint8)
+    names = {"train": [str(view) for view in range(len(log_gains))]}
+    scene = SimpleNamespace(metadata={}, names=names)
+    views = stereo.views.replace(rgb=taken)
+    found = measure_exposures(stereo._replace(views=views), scene)
+    curves = found.train_curves(names["train"])
+    middle = to_light(at_middle_exposure(views, found.log_gains, curves).rgb)
+    counts = (stereo.maps.confidence > 0) & (taken > 12).all(-1) & (taken < 243).all(-1)
+    x, y = (np.log(np.asarray(image)[np.asarray(counts)].ravel()) for image in (middle, light))
+    design = np.stack([x, np.ones_like(x)], 1)
+    error = np.abs(design @ np.linalg.lstsq(design, y, rcond=None)[0] - y)
+    assert np.median(error) < 0.02
+    straight = dataclasses.replace(found, curves={}, cameras={})
+    assert straight.train_curves(names["train"]) is None
+
+
 def test_held_out_photographs_get_the_exposure_of_their_files(tmp_path):
     """Time and sensitivity explain the gains of the others, but for a factor of the camera."""
 
@@ -130,7 +153,11 @@ def test_held_out_photographs_get_the_exposure_of_their_files(tmp_path):
 
 def test_exposures_are_kept(exposures, tmp_path):
     names = [str(view) for view in range(len(exposures.log_gains))]
-    exposures = exposures.replace(stated={"test": {"near": jnp.array([0.1, 0.2, 0.3])}})
+    exposures = exposures.replace(
+        stated={"test": {"near": jnp.array([0.1, 0.2, 0.3])}},
+        curves={"film": jnp.linspace(0, 1, 256) ** 3},
+        cameras={"train": dict.fromkeys(names, "film"), "test": {"near": ""}},
+    )
     write_exposures(tmp_path, None, names)
     assert read_exposures(tmp_path, names) is None
     write_exposures(tmp_path, exposures, names)

@@ -9,12 +9,15 @@ import plane
 import pytest
 
 from jaxcloseup.photos.exposures import (
+    Taken,
     at_middle_exposure,
     fit_metering,
     look_at_points,
     meter,
     predict_gain,
     solve_gains,
+    stack_curves,
+    take,
 )
 from jaxcloseup.photos.pyramids import photograph_pyramid
 from jaxcloseup.photos.views import camera_at
@@ -181,6 +184,28 @@ def test_a_choice_that_has_nothing_to_do_with_the_view_is_not_predicted():
     np.testing.assert_array_equal(predict_gain(metering, image, taken[0][1]), 1)
     metering = metering.replace(slopes=jnp.array([-1.0, -1.0]))
     np.testing.assert_array_equal(predict_gain(metering, image, jnp.zeros((12, 16))), 1)
+
+
+def test_photographs_of_a_curve_are_straightened_and_taken_again(plain):
+    """The camera encodes light by a cube root; another one in the same capture by sRGB."""
+    views, _ = plain
+    curve = jnp.linspace(0, 1, 256) ** 3
+    log_gains = jnp.asarray(known_gains(1.0), jnp.float32)
+    curves = stack_curves({"film": curve}, ["film", "other"] * (VIEWS // 2))
+    pyramid = photograph_pyramid(views)
+    taken = jnp.asarray(as_bytes(np.asarray(views.rgb)))
+    middle = at_middle_exposure(views.replace(rgb=taken), log_gains, curves)
+    colors = np.asarray(taken, np.float64)
+    light = np.where(colors < 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+    light[::2] = colors[::2] ** 3
+    light *= np.exp(-np.asarray(log_gains, np.float64))[:, None, None]
+    expected = np.where(light < 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    np.testing.assert_allclose(middle.rgb, expected, atol=1e-3)
+    shown = dataclasses.replace(pyramid, gains=jnp.exp(log_gains), curves=curves)
+    for view in (2, 3):
+        np.testing.assert_allclose(shown.image(view, 0)[..., :3], middle.rgb[view], atol=3e-3)
+        how = Taken(jnp.exp(log_gains[view]), curves[view])
+        np.testing.assert_allclose(take(middle.rgb[view], how), taken[view], atol=5e-3)
 
 
 def test_windows_show_photographs_at_the_middle_exposure(plain):

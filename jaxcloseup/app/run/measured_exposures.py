@@ -16,10 +16,13 @@ from jaxcloseup.io.files import read_object, write_json
 from jaxcloseup.photos.exposures import (
     Exposures,
     Metering,
+    at_middle_exposure,
     fit_metering,
     look_at_points,
     solve_gains,
+    stack_curves,
 )
+from jaxcloseup.photos.responses import fit_response, straighten
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.stated_exposures import StatedExposure, fit_cameras, stated_differences
 from jaxcloseup.photos.views import camera_at, to_float
@@ -47,17 +50,43 @@ def measure_exposures(stereo: StereoDepths, scene: Scene) -> Exposures | None:
         camera = camera_at(views.cameras, view)
         return np.asarray(look(camera, depth[view], *photograph(view), points))
 
+    cameras = {
+        split: {
+            name: found.camera if found else ""
+            for name, found in zip(scene.names[split], stated[split], strict=True)
+        }
+        for split in stated
+    }
     with progress.saying("comparing exposures"):
         logs = np.stack(list(map(seen, range(len(views)))))
         log_gains = solve_gains(logs, stated_differences(stated["train"]))
-        spread = float(log_gains.std())
-        if spread < _AGREE:
+        if float(log_gains.std()) < _AGREE:
             return None
+        took = list(cameras["train"].values())
+        curves, logs = _straighten(logs, took)
+        if curves:
+            log_gains = solve_gains(logs, stated_differences(stated["train"]))
+            same = jnp.zeros(log_gains.shape, jnp.float32)
+            views = at_middle_exposure(views, same, stack_curves(curves, took))
         unpadded = [_crop(*photograph(view)) for view in range(len(views))]
         metering = fit_metering(log_gains, unpadded)
         held_out = held_out_gains(scene, stated, fit_cameras(log_gains, stated["train"]))
-    print(_describe(log_gains, metering.slopes, held_out))
-    return Exposures(jnp.asarray(log_gains, jnp.float32), metering, held_out)
+    print(_describe(log_gains, metering.slopes, held_out, curves))
+    gains = jnp.asarray(log_gains, jnp.float32)
+    return Exposures(gains, metering, held_out, curves, cameras if curves else {})
+
+
+def _straighten(
+    logs: np.ndarray, cameras: Sequence[str]
+) -> tuple[dict[str, jax.Array], np.ndarray]:
+    """Return curves of cameras that have one, and log light `[V, P, 3]` by them."""
+    curves, logs = {}, logs.copy()
+    for camera in sorted(set(cameras)):
+        rows = [view for view, other in enumerate(cameras) if other == camera]
+        if (curve := fit_response(logs[rows])) is not None:
+            curves[camera] = jnp.asarray(curve, jnp.float32)
+            logs[rows] = straighten(logs[rows], curve)
+    return curves, logs
 
 
 def stated_exposures(scene: Scene) -> Stated:
@@ -106,6 +135,7 @@ def write_exposures(
     plain = jax.tree.map(lambda leaf: np.asarray(leaf).tolist(), exposures)
     gains = dict(zip(names, plain.log_gains, strict=True))
     kept = {"log_gains": gains, "metering": vars(plain.metering), "stated": plain.stated}
+    kept |= {"curves": plain.curves, "cameras": exposures.cameras}
     write_json(folder / NAME, kept)
 
 
@@ -123,6 +153,9 @@ def read_exposures(folder: pathlib.Path, names: Sequence[str]) -> Exposures | No
         gains = jnp.asarray([kept["log_gains"][name] for name in names], jnp.float32)
         metering = Metering(**_arrays(kept["metering"]))
         stated = {split: _arrays(named) for split, named in kept.get("stated", {}).items()}
+        curves, cameras = _arrays(kept.get("curves", {})), kept.get("cameras", {})
+        if curves:
+            stack_curves(curves, [cameras["train"][name] for name in names])
         chex.assert_shape((gains, metering.content, metering.slopes), ((len(names), 3), (3,), (2,)))
         chex.assert_shape(metering.width, ())
         chex.assert_shape(jax.tree.leaves(stated), (3,))
@@ -131,7 +164,7 @@ def read_exposures(folder: pathlib.Path, names: Sequence[str]) -> Exposures | No
             f"{path} does not hold the exposures of these photographs: restore it from a copy of "
             "the run"
         ) from None
-    return Exposures(gains, metering, stated)
+    return Exposures(gains, metering, stated, curves, cameras)
 
 
 def _arrays(values: Mapping[str, Any]) -> dict[str, jax.Array]:
@@ -139,7 +172,10 @@ def _arrays(values: Mapping[str, Any]) -> dict[str, jax.Array]:
 
 
 def _describe(
-    log_gains: np.ndarray, slopes: jax.Array, held_out: Mapping[str, Mapping[str, jax.Array]]
+    log_gains: np.ndarray,
+    slopes: jax.Array,
+    held_out: Mapping[str, Mapping[str, jax.Array]],
+    curves: Mapping[str, jax.Array],
 ) -> str:
     """Say by how much exposures differ, and whether those of new views are predicted."""
     ratio = np.exp(np.ptp(log_gains.mean(axis=1)))
@@ -148,4 +184,7 @@ def _describe(
     return (
         f"photographs differ {ratio:.2g} times in exposure: they are brought to the "
         f"middle; the exposure of new views is {predicted}"
-    ) + f", that of {count} held-out photographs follows from their files" * (count > 0)
+    ) + (
+        f", that of {count} held-out photographs follows from their files" * (count > 0)
+        + "; their colors have a curve of their own" * bool(curves)
+    )

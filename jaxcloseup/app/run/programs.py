@@ -30,7 +30,7 @@ from jaxcloseup.app.run.stereo_depths import StereoDepths
 from jaxcloseup.app.run.taken_steps import check_steps, run_in_parts
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
-from jaxcloseup.photos.exposures import Exposures, at_middle_exposure
+from jaxcloseup.photos.exposures import Exposures, Taken, at_middle_exposure
 from jaxcloseup.photos.pyramids import Pyramid, photograph_pyramid
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.views import Views, unpadded
@@ -71,7 +71,7 @@ class Programs:
         self.growth = 1
         self._growing = threading.Lock()
         self._width = width or scene.train.cameras.width
-        self.gain: jax.Array | None = None  # `[3]` of all views; None: predicted for each
+        self.taken: Taken | None = None  # how all views are taken; None: each as is known of it
         self._larger: dict[int, Programs] = {}
         self.read = read or ReadPhotographs(scene)
         self._compile()
@@ -138,13 +138,17 @@ class Programs:
         """Return the scene's training photographs at the middle exposure."""
         if self.exposures is None:
             return self.scene.train
-        return at_middle_exposure(self.scene.train, self.exposures.log_gains)
+        exposures = self.exposures
+        curves = exposures.train_curves(self.scene.names["train"])
+        return at_middle_exposure(self.scene.train, exposures.log_gains, curves)
 
     def at_middle(self, pyramid: Pyramid) -> Pyramid:
         """Return a pyramid of the training photographs that shows them at the middle exposure."""
         if self.exposures is None:
             return pyramid
-        return dataclasses.replace(pyramid, gains=jnp.exp(self.exposures.log_gains))
+        curves = self.exposures.train_curves(self.scene.names["train"])
+        gains = jnp.exp(self.exposures.log_gains)
+        return dataclasses.replace(pyramid, gains=gains, curves=curves)
 
     @functools.cached_property
     def coarse(self) -> "Programs":

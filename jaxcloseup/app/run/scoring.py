@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxcloseup.app.run.exposed import known_gain, render_exposed
+from jaxcloseup.app.run.exposed import how_taken, render_exposed
 from jaxcloseup.app.run.labels import LabelStart
 from jaxcloseup.app.run.loop import Training
 from jaxcloseup.app.run.programs import Programs
@@ -17,7 +17,7 @@ from jaxcloseup.app.run.timers import timed
 from jaxcloseup.app.score.ladder import describe_ladder, ladder_targets
 from jaxcloseup.app.score.metrics_text import REDUCED, describe_split
 from jaxcloseup.app.score.renders import write_renders
-from jaxcloseup.app.score.scores import Perceptual, RenderAtGain, evaluate
+from jaxcloseup.app.score.scores import Perceptual, RenderTaken, evaluate
 from jaxcloseup.app.score.targets import Target, exact_depths, score_divisor, targets_by_split
 from jaxcloseup.training.state import TrainState
 
@@ -47,7 +47,7 @@ def hold_out(programs: Programs, start: LabelStart) -> HeldOut:
     divisor = score_divisor(scene, programs.preset.score_width)
     targets = {
         split: [
-            view._replace(gain=known_gain(programs, split.removesuffix(REDUCED), view.name))
+            view._replace(taken=how_taken(programs, split.removesuffix(REDUCED), view.name))
             for view in views
         ]
         for split, views in targets_by_split(
@@ -80,7 +80,7 @@ class Scorer:
         self.scores: dict[str, dict[str, Any]] = {}
         self.images: dict[tuple[str, str], Mapping[str, np.ndarray]] = {}
 
-    def score(self, stage: str, state: TrainState, render: RenderAtGain | None = None) -> None:
+    def score(self, stage: str, state: TrainState, render: RenderTaken | None = None) -> None:
         """Render, score and keep one stage.
 
         By default the state renders, and is exported too.

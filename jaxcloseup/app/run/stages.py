@@ -32,6 +32,7 @@ from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.labels.make import PseudoSettings, label_sources
 from jaxcloseup.labels.rules import label_depth
+from jaxcloseup.photos.exposures import Taken
 from jaxcloseup.training.state import TrainState
 
 
@@ -83,9 +84,9 @@ class Run:
         self.scorer.score(stage, state)
         return state
 
-    def render(self, camera: Camera, gain: jax.Array | None = None) -> Rendering:
+    def render(self, camera: Camera, taken: Taken | None = None) -> Rendering:
         """Render the latest state, see `render_exposed`."""
-        return render_exposed(self.programs, self.state, camera, gain)
+        return render_exposed(self.programs, self.state, camera, taken)
 
     def get_detail(self, stage: str, state: TrainState) -> GetDetail:
         """Return a function that finds the detail of a stage's state in the folder, or makes it."""
@@ -178,10 +179,10 @@ def add_detail_stage(run: Run, get_detail: GetDetail) -> tuple[dict[str, Any], R
     with timed(run.training.seconds, "detail"):
         detail, about = get_detail()
 
-    def render(camera: Camera, gain: jax.Array | None = None) -> Rendering:
+    def render(camera: Camera, taken: Taken | None = None) -> Rendering:
         rendering = programs.render(state, camera)
         sharper = detailed(programs, detail, camera, rendering)
-        return rendering._replace(rgb=expose(programs, sharper.rgb, rendering, gain))
+        return rendering._replace(rgb=expose(programs, sharper.rgb, rendering, taken))
 
     def detail_of(camera: Camera) -> Detailed:
         return detailed(programs, detail, camera, programs.render(state, camera))

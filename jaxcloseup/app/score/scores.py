@@ -25,11 +25,12 @@ from jaxcloseup.metrics.perceptual import (
 )
 from jaxcloseup.metrics.resolution import SMALLEST as SMALLEST_RINGS
 from jaxcloseup.metrics.resolution import resolved_period, ring_correlation
+from jaxcloseup.photos.exposures import Taken
 from jaxcloseup.photos.views import to_float
 
 
-# Renders a camera at the gain `[3]` of its photograph, or None where that is not known.
-RenderAtGain = Callable[[Camera, jax.Array | None], Rendering]
+# Renders a camera as its photograph was taken, if that is known.
+RenderTaken = Callable[[Camera, Taken | None], Rendering]
 Metrics = dict[str, jax.Array | float]
 View = dict[str, float | str | list[float] | None]  # metrics of one view by name
 SEEN_BY = (1, 3)  # least numbers of photographs, for metrics of the seen pixels alone
@@ -201,17 +202,17 @@ def summarize(views: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def evaluate(
-    render: RenderAtGain, targets: Sequence[Target], perceptual: Perceptual = NO_PERCEPTUAL
+    render: RenderTaken, targets: Sequence[Target], perceptual: Perceptual = NO_PERCEPTUAL
 ) -> tuple[dict[str, Any], dict[str, Rendering]]:
     """Render and score every target; return the summary and the renderings by name.
 
-    `render` gets a camera and the gain of its photograph, see `Target.gain`.
+    `render` gets a camera and how its photograph was taken, see `Target.taken`.
 
     Renderings have the size of their target, colors of 8 bits, and neither `aux` nor normals.
     """
 
     def scored(target: Target) -> tuple[View, Rendering]:
-        seen = jax.device_get(render(target.camera, target.gain)._replace(aux=()))
+        seen = jax.device_get(render(target.camera, target.taken)._replace(aux=()))
         kept = seen._replace(rgb=to_uint8(seen.rgb), normal=None)
         return score(seen, target, perceptual), kept
 

@@ -13,6 +13,7 @@ from jaxcloseup.app.score.metrics_text import REDUCED
 from jaxcloseup.app.score.surface_error import Landmarks, find_landmarks
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
+from jaxcloseup.photos.exposures import Taken
 from jaxcloseup.photos.proximity import Proximity, measure_proximity
 from jaxcloseup.photos.scene import Scene, SceneError, Surface
 from jaxcloseup.photos.support import find_support
@@ -40,7 +41,7 @@ class Target(NamedTuple):
     could_resolve: float | None = None
     # how near photographs come, see `describe_proximity`; None where that was not asked
     proximity: Mapping[str, float] | None = None
-    gain: jax.Array | None = None  # `[3]` its known gain over the middle exposure, or None
+    taken: Taken | None = None  # how it was taken, or None where all have one exposure
 
 
 def exact_depths(scene: Scene, cameras: Camera) -> jax.Array:

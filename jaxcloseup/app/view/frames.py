@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from jaxcloseup.app import progress
-from jaxcloseup.app.run.exposed import expose, known_gain
+from jaxcloseup.app.run.exposed import expose, how_taken
 from jaxcloseup.app.run.kept_detail import detailed
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.view.camera_paths import Shots, named_cameras
@@ -25,6 +25,7 @@ from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.labels.make import LabelSources
 from jaxcloseup.labels.rules import label_depth
+from jaxcloseup.photos.exposures import Taken
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.support import find_support
 from jaxcloseup.training.state import TrainState
@@ -76,7 +77,7 @@ def render_shots(
         (name, camera), size = frame
         camera = camera.replace(width=size[0], height=size[1])
         seen = programs.render(state, camera)
-        images = picture(seen, camera, gain=known_gain(programs, shots.split, name))
+        images = picture(seen, camera, taken=how_taken(programs, shots.split, name))
         return name, images, not np.any(np.asarray(seen.alpha) >= SOLID)
 
     frames = list(zip(cameras, sizes, strict=True))
@@ -103,7 +104,7 @@ def draw_pictures(
     sources: LabelSources | None,
     detail: Detail | None = None,
     limits: tuple[float, float] | None = None,
-    gain: jax.Array | None = None,
+    taken: Taken | None = None,
 ) -> dict[str, Image]:
     """Return a camera's images by kind: `rgb`, `depth`, `normals`, `support`, `trust`, `error`.
 
@@ -118,7 +119,7 @@ def draw_pictures(
       sources: the training photographs with their depths, or None to leave out support.
       detail: detail of the state, or None to draw the state alone.
       limits: nearest and farthest depth of the color scale; default: `depth_range` of the image.
-      gain: of the camera's photograph, see `expose`.
+      taken: how the camera's photograph was taken, see `expose`.
     """
     scene = programs.scene
     depth = label_depth(seen, near=0, far=scene.far)
@@ -137,7 +138,7 @@ def draw_pictures(
         sharper = detailed(programs, detail, camera, seen)
         images |= {"rgb": sharper.rgb, "trust": np.asarray(sharper.weight)}
         images["error"] = colorize_expected_error(sharper.error)
-    images["rgb"] = np.asarray(expose(programs, images["rgb"], seen, gain))
+    images["rgb"] = np.asarray(expose(programs, images["rgb"], seen, taken))
     return images
 
 

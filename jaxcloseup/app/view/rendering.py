@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcloseup.app import progress
+from jaxcloseup.app.run.exposed import how_taken
 from jaxcloseup.app.run.fine_tuning import fine_tune, tuned_detail
 from jaxcloseup.app.run.kept_detail import detail_getter, detail_path
 from jaxcloseup.app.run.keys import run_keys
@@ -128,12 +129,11 @@ def choose_exposure(programs: Programs, exposure: str) -> None:
     """
     if exposure == AUTO:
         return
-    gain = jnp.ones(3)
     if exposure != MIDDLE:
         view = find_view(programs.scene, exposure, flag="exposure")
-        if programs.exposures is not None:
-            gain = jnp.exp(programs.exposures.log_gains[view])
-    programs.gain = gain
+        programs.taken = how_taken(programs, "train", programs.scene.names["train"][view])
+    elif (taken := how_taken(programs, None, None)) is not None:
+        programs.taken = taken._replace(gain=jnp.ones(3))
 
 
 def write_videos(shots: Shots, folders: list[pathlib.Path], *, fps: float) -> None:
