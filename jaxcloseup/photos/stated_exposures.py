@@ -1,13 +1,12 @@
 """Exposures that the files of photographs state, as an explanation of gains that were solved."""
 
-import collections
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 
-_BETTER = 0.7  # share of the error left out one by one that files must leave, to be believed
+_BETTER = 0.5  # share of the error left out one by one that files must leave, to be believed
 
 
 class StatedExposure(NamedTuple):
@@ -35,29 +34,26 @@ def stated_differences(stated: Sequence[StatedExposure | None]) -> np.ndarray:
 def fit_cameras(
     log_gains: np.ndarray, stated: Sequence[StatedExposure | None]
 ) -> dict[str, np.ndarray]:
-    """Return by how much log gains `[3]` of each camera exceed the log exposures of its files.
+    """Return by how much log gains `[3]` of cameras exceed the log exposures of their files.
 
-    Returns nothing unless the gains of left-out photographs follow better from their files, and the
-    other photographs of their camera, than from the middle of all photographs.
+    A camera is left out unless gains of its left-out photographs follow better from their files,
+    and its other photographs, than from the middle of all photographs: phones brighten what they
+    show after the exposure.
 
     Args:
       log_gains: `[V, 3]`.
       stated: what each photograph's file says.
     """
-    pairs = [(gain, found) for gain, found in zip(log_gains, stated, strict=True) if found]
-    counts = collections.Counter(found.camera for _, found in pairs)
-    pairs = [(gain, found) for gain, found in pairs if counts[found.camera] > 1]
-    if not pairs:
-        return {}
-    beyond = {
-        camera: np.array([g - found.log_exposure for g, found in pairs if found.camera == camera])
-        for camera in {found.camera for _, found in pairs}
-    }
-    of_files = np.concatenate([_left_out(rows) for rows in beyond.values()])
-    of_middle = _left_out(np.array([gain for gain, _ in pairs]))
-    if (of_files**2).sum() > _BETTER**2 * (of_middle**2).sum():
-        return {}
-    return {camera: rows.mean(axis=0) for camera, rows in beyond.items()}
+    of_middle, offsets = _left_out(log_gains), {}
+    for camera in {found.camera for found in stated if found}:
+        rows = [view for view, found in enumerate(stated) if found and found.camera == camera]
+        exposures = [found.log_exposure for found in stated if found and found.camera == camera]
+        beyond = log_gains[rows] - np.array(exposures)[:, None]
+        if len(rows) > 1:
+            error, usual = (_left_out(beyond) ** 2).sum(), (of_middle[rows] ** 2).sum()
+            if error <= _BETTER**2 * usual:
+                offsets[camera] = beyond.mean(axis=0)
+    return offsets
 
 
 def _left_out(rows: np.ndarray) -> np.ndarray:
