@@ -5,7 +5,8 @@ from types import SimpleNamespace
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcloseup.app.share import places
+from jaxcloseup.app.share import closeups, places
+from jaxcloseup.detail.add import Detailed
 from jaxcloseup.geometry.cameras import Camera
 
 
@@ -27,3 +28,32 @@ def test_the_middle_of_a_photograph_is_that_of_its_own_size():
     np.testing.assert_array_equal(
         places._looked_at(detail, np.array([ahead, aside, behind])), [1, 0.5, 0]
     )
+
+
+def test_places_whose_contrast_is_trusted_are_chosen(monkeypatch):
+    """Swirls have most contrast, and photographs confirm them least."""
+    rng = np.random.default_rng(0)
+    kinds = {  # contrast, trust, expected error
+        "swirls": (0.30, 0.4, 0.08),
+        "sharp": (0.25, 0.8, 0.08),
+        "plain": (0.02, 0.9, 0.05),
+        "doubtful": (0.25, 0.8, 0.20),
+    }
+    looks = iter(kinds.values())
+
+    def look(*_):
+        contrast, trust, error = next(looks)
+        rgb = 0.5 + contrast * rng.choice([-1, 1], (20, 30, 1)).repeat(3, -1)
+        return Detailed(rgb, np.full((20, 30), trust), None, np.full((20, 30), error))
+
+    camera = SimpleNamespace(width=30)
+    programs = SimpleNamespace(
+        scene=SimpleNamespace(own_camera=lambda *_: camera), render=lambda *_: None
+    )
+    monkeypatch.setattr(closeups, "resized", lambda camera, *_: camera)
+    monkeypatch.setattr(closeups, "_look", lambda *_: (camera, None))
+    monkeypatch.setattr(closeups, "detailed", look)
+    there = [places.Place(view, 0.5, 0.5) for view in range(len(kinds))]
+    chosen = closeups.choose_places(programs, None, None, there, near=4, count=3)
+    names = [list(kinds)[place.view] for place in chosen]
+    assert names == ["sharp", "swirls", "doubtful"]

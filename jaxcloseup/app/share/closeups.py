@@ -70,7 +70,10 @@ def choose_places(
     near: float,
     count: int,
 ) -> list[Place]:
-    """Return the places whose small close-ups have most contrast beside their expected error.
+    """Return the places whose small close-ups have most contrast that photographs confirm.
+
+    Contrast counts as far as detail is trusted, beside the expected error: where depth is rough,
+    photographs are torn to fine swirls that are not there.
 
     Arguments are as for `make_closeups`; places without a surface are left out.
     """
@@ -84,8 +87,8 @@ def choose_places(
             return 0.0
         sharper = detailed(programs, detail, camera, programs.render(state, camera))
         gray = np.asarray(sharper.rgb).mean(axis=-1)
-        fine = np.abs(gray - cv2.GaussianBlur(gray, (0, 0), 2)).mean()
-        return float(fine / np.mean(np.nan_to_num(np.asarray(sharper.error), nan=_UNKNOWN)))
+        fine = np.abs(gray - cv2.GaussianBlur(gray, (0, 0), 2)) * np.asarray(sharper.weight)
+        return float(fine.mean() / np.mean(np.nan_to_num(np.asarray(sharper.error), nan=_UNKNOWN)))
 
     merits = list(progress.each(merit, places, "places to look at"))
     best = sorted(range(len(places)), key=lambda i: -merits[i])[:count]
