@@ -13,6 +13,7 @@ from tiny_runs import TINY, programs_of
 from experiments.studies import (
     default_runs,
     few_photographs,
+    interruptions,
     methods_table,
     paper_nerf,
     paper_regime,
@@ -43,6 +44,24 @@ def write_run(folder, scene, gate=None):
     results = {"scene": scene, "stages": stages, "gate": gate}
     (folder / "results.json").write_text(json.dumps(results))
     return str(folder)
+
+
+def test_what_closeups_made_is_compared_but_for_times(tmp_path):
+    """Checkpoints and logs, which depend on when a program was stopped, do not count."""
+    one, other = tmp_path / "one", tmp_path / "other"
+    for folder, seconds in ((one, 10), (other, 20)):
+        for name in ("share/a/page.js", "closeups/a.png", "run/checkpoints/a", "capture/log.txt"):
+            path = folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(str(seconds) if "check" in name or "log" in name else "same")
+        results = {"psnr": 20.0, "seconds": {"baseline": seconds}, "rows": [{"time": seconds}]}
+        (folder / "run" / "results.json").write_text(json.dumps(results))
+    assert interruptions.differing(one, other) == []
+    (other / "closeups" / "b.png").write_text("more")
+    (other / "share" / "a" / "page.js").write_text("changed")
+    (other / "run" / "results.json").write_text('{"psnr": 20.1, "rows": [{}]}')
+    expected = ["closeups/b.png", "run/results.json", "share/a/page.js"]
+    assert interruptions.differing(one, other) == expected == interruptions.differing(other, one)
 
 
 def test_tables_of_default_runs(tmp_path, capsys):
