@@ -8,6 +8,7 @@ splats, poses and scores are compared to the last byte, but for what says how lo
 and videos frame by frame. What is there in `--output_dir` is not made again.
 """
 
+import itertools
 import os
 import pathlib
 import shutil
@@ -48,12 +49,14 @@ def main(_: list[str]) -> None:
     root, rng = pathlib.Path(FLAGS.output_dir), np.random.default_rng(FLAGS.seed)
     root.mkdir(parents=True, exist_ok=True)
     whole, rows = root / "whole", list[list[str]]()
-    if not (whole / "share").exists():
+    if not (whole / "share" / "index.html").exists():
         _wait(_start(whole), None)
-    for number in range(FLAGS.interruptions):
+    for number in itertools.count():
+        folder = root / str(number)
         if len(rows) >= FLAGS.interruptions:
             break
-        folder = root / str(number)
+        if folder.exists():
+            continue
         (folder / _SETTINGS.parent).mkdir(parents=True)
         shutil.copy(whole / _SETTINGS, folder / _SETTINGS)
         moments = [*_interrupted(folder, rng)]
@@ -95,6 +98,9 @@ def _wait(process: subprocess.Popen, seconds: float | None) -> bool:
             sys.exit(f"the command failed with exit code {process.returncode}")
     except subprocess.TimeoutExpired:
         return False
+    except KeyboardInterrupt:
+        os.killpg(process.pid, signal.SIGKILL)
+        raise
     return True
 
 

@@ -13,7 +13,7 @@ from jaxcloseup.photos.stated_exposures import StatedExposure
 def read_exposure(path: pathlib.Path) -> StatedExposure | None:
     """Return camera and exposure of a photograph; None where its file does not say them.
 
-    A file without f-number, as of a phone whose aperture is fixed, counts as f/1.
+    Files without f-number, as of a fixed aperture, count as f/1 and as those of another camera.
     """
     try:
         with warnings.catch_warnings(), PIL.Image.open(path) as image:
@@ -24,8 +24,10 @@ def read_exposure(path: pathlib.Path) -> StatedExposure | None:
             sensitivity = detail[Base.ISOSpeedRatings]
             iso = float(sensitivity[0] if isinstance(sensitivity, tuple) else sensitivity)
             aperture = float(detail.get(Base.FNumber, 1))
+            known = "" if Base.FNumber in detail else ", f-number unknown"
             log_exposure = math.log(seconds * iso / aperture**2)
             camera = " ".join(str(exif.get(tag, "")).strip() for tag in (Base.Make, Base.Model))
+            camera += known
     except Exception:  # no EXIF, damaged EXIF, or numbers without a logarithm
         return None
     return StatedExposure(camera, log_exposure) if math.isfinite(log_exposure) else None

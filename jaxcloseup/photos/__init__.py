@@ -24,7 +24,7 @@ __all__, __getattr__, __dir__ = lazy_names(
             "at_middle_exposure take"
         ),
         "responses": "fit_response straighten",
-        "stated_exposures": "StatedExposure stated_differences fit_cameras",
+        "stated_exposures": "StatedExposure fit_cameras gains_of_files",
         "gather": "gather_parts",
         "gather_sums": "GatherSettings Gathered Reader gather_points",
         "support": "Support find_support count_seen",

@@ -30,7 +30,7 @@ from jaxcloseup.photos.views import Views, to_float
 USABLE = 0.03, 0.97  # colors beyond are noise, or clipped
 _LEAST = 0.05  # residual of log light below which all count alike
 _ROUNDS = 10  # of reweighting
-_HELD = 1.0  # weight of the middle in each gain, in points
+_HELD = 1.0  # weight of what is expected in each gain, in points
 _WIDTHS = 0.2, 0.35, 0.5, 10.0  # candidates for `Metering.width`
 _BETTER = 0.7  # share of the error left out one by one that a slope must leave, to be believed
 
@@ -82,11 +82,12 @@ class Exposures(struct.PyTreeNode):
         return stack_curves(self.curves, [cameras[name] for name in names]) if cameras else None
 
     def curve_of(self, split: str | None, name: str | None) -> jax.Array | None:
-        """Return the curve of a photograph's camera, or of the camera that took most."""
-        took = self.cameras.get("train", {})
-        most = collections.Counter(took.values()).most_common(1)
-        camera = self.cameras.get(split or "", {}).get(name or "", most[0][0] if most else "")
-        return self.curves.get(camera)
+        """Return the curve of a photograph's camera; of one that is not known, of the usual one."""
+        took = collections.Counter(self.cameras.get("train", {}).values())
+        camera = self.cameras.get(split or "", {}).get(name or "")
+        if took and camera not in took:
+            camera = took.most_common(1)[0][0]
+        return self.curves.get(camera or "")
 
 
 def stack_curves(curves: Mapping[str, jax.Array], cameras: Sequence[str]) -> jax.Array:

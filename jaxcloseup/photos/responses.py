@@ -15,7 +15,7 @@ LEVELS = 256  # colors at which a curve says what light they stand for, from bla
 _KNOTS = 6  # colors, from black to white, between which slopes are linear
 _PAIRINGS = 8  # other photographs that each is compared with
 _MOST = 60_000  # points of photographs that are compared
-_FEWEST = 200  # points that tell something
+_FEWEST = 200  # points and pairs that tell something
 _LEAST = 0.05  # residual of log light below which all count alike
 _APART = 0.1  # least difference of log gains whose pair tells a slope
 _ROUNDS, _TURNS = 6, 3  # of reweighting; of gains and curve
@@ -53,7 +53,7 @@ def fit_response(logs: np.ndarray) -> np.ndarray | None:
     slopes, gains = _solve(logs[:, half])
     left_out = _compare(logs[:, ~half], gains)
     straight = _compare(logs[:, ~half], solve_gains(logs[:, half]))
-    if not len(left_out.change):
+    if min(len(left_out.change), len(straight.change)) < _FEWEST:
         return None
     if left_out.error(slopes) > _BETTER * straight.error(np.ones(_KNOTS)):
         return None

@@ -1,6 +1,6 @@
 """Exposures that the files of photographs state, as an explanation of gains that were solved."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,21 +16,6 @@ class StatedExposure(NamedTuple):
     log_exposure: float  # log of seconds x ISO / f-number squared
 
 
-def stated_differences(stated: Sequence[StatedExposure | None]) -> np.ndarray:
-    """Return how log exposures `[V, 1]` differ from their camera's mean; 0 where a file says none.
-
-    Cameras differ in what they make of the same exposure.
-    """
-    means = {
-        camera: np.mean(
-            [found.log_exposure for found in stated if found and found.camera == camera]
-        )
-        for camera in {found.camera for found in stated if found}
-    }
-    known = [found.log_exposure - means[found.camera] if found else 0.0 for found in stated]
-    return np.array(known)[:, None]
-
-
 def fit_cameras(
     log_gains: np.ndarray, stated: Sequence[StatedExposure | None]
 ) -> dict[str, np.ndarray]:
@@ -44,7 +29,10 @@ def fit_cameras(
       log_gains: `[V, 3]`.
       stated: what each photograph's file says.
     """
-    of_middle, offsets = _left_out(log_gains), {}
+    offsets: dict[str, np.ndarray] = {}
+    if len(log_gains) < 2:
+        return offsets
+    of_middle = _left_out(log_gains)
     for camera in {found.camera for found in stated if found}:
         rows = [view for view, found in enumerate(stated) if found and found.camera == camera]
         exposures = [found.log_exposure for found in stated if found and found.camera == camera]
@@ -54,6 +42,17 @@ def fit_cameras(
             if error <= _BETTER**2 * usual:
                 offsets[camera] = beyond.mean(axis=0)
     return offsets
+
+
+def gains_of_files(
+    stated: Sequence[StatedExposure | None], offsets: Mapping[str, np.ndarray]
+) -> np.ndarray:
+    """Return the log gains `[V, 3]` that follow from files; 0 where no camera is in `offsets`."""
+    found = [
+        one.log_exposure + offsets[one.camera] if one and one.camera in offsets else np.zeros(3)
+        for one in stated
+    ]
+    return np.stack(found)
 
 
 def _left_out(rows: np.ndarray) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Depth by stereo in a run: what training begins with, on walls drawn by ray casting."""
 
 import dataclasses
+import json
 from types import SimpleNamespace
 
 import jax
@@ -162,7 +163,14 @@ def test_exposures_are_kept(exposures, tmp_path):
     assert read_exposures(tmp_path, names) is None
     write_exposures(tmp_path, exposures, names)
     jax.tree.map(np.testing.assert_array_equal, read_exposures(tmp_path, names), exposures)
-    for damage in ("{}", "[", '{"log_gains": {}, "metering": {}}'):
+    kept = json.loads((tmp_path / NAME).read_text())
+    short = {**kept, "curves": {"film": [0.0, 1.0]}}
+    wrong = [
+        json.dumps({**kept, "cameras": None}),
+        json.dumps({**kept, "curves": {}}),
+        json.dumps(short),
+    ]
+    for damage in ("{}", "[", '{"log_gains": {}, "metering": {}}', *wrong):
         (tmp_path / NAME).write_text(damage)
         with pytest.raises(ValueError, match="does not hold the exposures of these photographs"):
             read_exposures(tmp_path, names)

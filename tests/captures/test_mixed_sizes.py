@@ -43,7 +43,7 @@ def scene(tmp_path):
     return load_scene(tmp_path, downscale=2)
 
 
-def render(camera, gain=None):
+def render(camera, taken=None):
     """White where a photograph is, and black in the padding."""
     side = camera.height, camera.width
     width, height = (round(2 * float(center)) for center in camera.intrinsics[2:])

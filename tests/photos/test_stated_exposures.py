@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from jaxcloseup.app.run import measured_exposures
 from jaxcloseup.photos.exposures import solve_gains
-from jaxcloseup.photos.stated_exposures import StatedExposure, fit_cameras, stated_differences
+from jaxcloseup.photos.stated_exposures import StatedExposure, fit_cameras, gains_of_files
 
 
 OFFSETS = {"one": np.array([0.3, 0.2, 0.1]), "other": np.array([-1.0, -0.9, -1.1])}
@@ -46,21 +47,35 @@ def test_files_that_do_not_explain_the_gains_are_not_believed(taken):
     )
 
 
-def test_differences_are_within_each_camera(taken):
+def test_one_photograph_tells_no_camera(taken):
+    gains, stated = taken
+    assert fit_cameras(gains[:1], stated[:1]) == {}
+    assert fit_cameras(gains[:0], []) == {}
+
+
+def test_gains_follow_from_files_of_known_cameras(taken):
     _, stated = taken
-    found = stated_differences([*stated, None])
-    assert found.shape == (16, 1) and found[-1] == 0
-    for members in (slice(0, 6), slice(6, 15)):
-        known = np.array([one.log_exposure for one in stated[members]])
-        np.testing.assert_allclose(found[members, 0], known - known.mean(), atol=1e-12)
+    found = gains_of_files([*stated, None], {"other": OFFSETS["other"]})
+    assert found.shape == (16, 3) and not found[:6].any() and not found[15].any()
+    np.testing.assert_allclose(found[8], OFFSETS["other"] + stated[8].log_exposure)
 
 
 def test_a_photograph_without_matches_has_the_exposure_of_its_file(taken):
     gains, stated = taken
-    gains, stated = gains[:6], stated[:6]
     logs = gains[:, None] + np.random.default_rng(3).normal(-1, 0.4, (300, 3))
     logs[2] = np.nan
-    found = solve_gains(logs, stated_differences(stated))
+    found, offsets = measured_exposures._solve(logs, stated)
+    assert offsets.keys() == OFFSETS.keys()
     np.testing.assert_allclose(found.mean(0), 0, atol=1e-12)
     np.testing.assert_allclose(found, gains - gains.mean(0), atol=0.1)
     assert np.abs(solve_gains(logs)[2] - (gains - gains.mean(0))[2]).max() > 0.2
+
+
+def test_files_that_are_not_believed_change_no_gain(taken):
+    """Photographs that an editor evened out, three of which match no other."""
+    _, stated = taken
+    rng = np.random.default_rng(4)
+    logs = rng.normal(-1, 0.4, (300, 3)) + 0.02 * rng.standard_normal((15, 300, 3))
+    logs[[1, 7, 9]] = np.nan
+    found, offsets = measured_exposures._solve(logs, stated)
+    assert offsets == {} and np.abs(found).max() < 0.02

@@ -22,9 +22,9 @@ from jaxcloseup.photos.exposures import (
     solve_gains,
     stack_curves,
 )
-from jaxcloseup.photos.responses import fit_response, straighten
+from jaxcloseup.photos.responses import LEVELS, fit_response, straighten
 from jaxcloseup.photos.scene import Scene
-from jaxcloseup.photos.stated_exposures import StatedExposure, fit_cameras, stated_differences
+from jaxcloseup.photos.stated_exposures import StatedExposure, fit_cameras, gains_of_files
 from jaxcloseup.photos.views import camera_at, to_float
 
 
@@ -32,6 +32,7 @@ Stated = Mapping[str, Sequence[StatedExposure | None]]  # of each photograph, by
 
 NAME = "exposures.json"
 _POINTS = 5000  # at which photographs are compared
+_MATCHED = 50  # of them that a photograph must show for its gain to be evidence
 _AGREE = 0.02  # standard deviation of log gains up to which photographs have one exposure
 
 
@@ -59,21 +60,41 @@ def measure_exposures(stereo: StereoDepths, scene: Scene) -> Exposures | None:
     }
     with progress.saying("comparing exposures"):
         logs = np.stack(list(map(seen, range(len(views)))))
-        log_gains = solve_gains(logs, stated_differences(stated["train"]))
-        if float(log_gains.std()) < _AGREE:
+        if float(solve_gains(logs).std()) < _AGREE:
             return None
         took = list(cameras["train"].values())
         curves, logs = _straighten(logs, took)
         if curves:
-            log_gains = solve_gains(logs, stated_differences(stated["train"]))
-            same = jnp.zeros(log_gains.shape, jnp.float32)
+            same = jnp.zeros((len(views), 3), jnp.float32)
             views = at_middle_exposure(views, same, stack_curves(curves, took))
+        log_gains, offsets = _solve(logs, stated["train"])
         unpadded = [_crop(*photograph(view)) for view in range(len(views))]
         metering = fit_metering(log_gains, unpadded)
-        held_out = held_out_gains(scene, stated, fit_cameras(log_gains, stated["train"]))
+        held_out = held_out_gains(scene, stated, offsets)
     print(_describe(log_gains, metering.slopes, held_out, curves))
     gains = jnp.asarray(log_gains, jnp.float32)
     return Exposures(gains, metering, held_out, curves, cameras if curves else {})
+
+
+def _solve(
+    logs: np.ndarray, stated: Sequence[StatedExposure | None]
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return log gains, and the offsets of cameras whose files explain them.
+
+    A photograph that shows few of the points stays near what its file states, if that is believed,
+    and is no evidence for it.
+    """
+    counts = np.isfinite(logs[..., 0]).sum(axis=1)
+    matched = [view for view, count in enumerate(counts) if count >= _MATCHED]
+
+    def believed(log_gains: np.ndarray) -> dict[str, np.ndarray]:
+        return fit_cameras(log_gains[matched], [stated[view] for view in matched])
+
+    log_gains = solve_gains(logs)
+    if offsets := believed(log_gains):
+        log_gains = solve_gains(logs, gains_of_files(stated, offsets))
+        offsets = believed(log_gains)
+    return log_gains, offsets
 
 
 def _straighten(
@@ -154,12 +175,13 @@ def read_exposures(folder: pathlib.Path, names: Sequence[str]) -> Exposures | No
         metering = Metering(**_arrays(kept["metering"]))
         stated = {split: _arrays(named) for split, named in kept.get("stated", {}).items()}
         curves, cameras = _arrays(kept.get("curves", {})), kept.get("cameras", {})
-        if curves:
+        if curves or cameras:
+            chex.assert_shape(list(curves.values()), (LEVELS,))
             stack_curves(curves, [cameras["train"][name] for name in names])
         chex.assert_shape((gains, metering.content, metering.slopes), ((len(names), 3), (3,), (2,)))
         chex.assert_shape(metering.width, ())
         chex.assert_shape(jax.tree.leaves(stated), (3,))
-    except (KeyError, TypeError, ValueError, AttributeError, AssertionError):
+    except (KeyError, TypeError, ValueError, AttributeError, AssertionError, StopIteration):
         raise ValueError(
             f"{path} does not hold the exposures of these photographs: restore it from a copy of "
             "the run"

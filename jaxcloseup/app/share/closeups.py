@@ -23,6 +23,7 @@ from jaxcloseup.training.state import TrainState
 
 _SMALL = 480  # width in pixels of close-ups that are compared
 _UNKNOWN = 0.3  # error of what no photograph shows
+_DOUBT = 0.05  # least trust of what is compared, so that something is chosen
 
 
 class CloseUp(NamedTuple):
@@ -87,7 +88,8 @@ def choose_places(
             return 0.0
         sharper = detailed(programs, detail, camera, programs.render(state, camera))
         gray = np.asarray(sharper.rgb).mean(axis=-1)
-        fine = np.abs(gray - cv2.GaussianBlur(gray, (0, 0), 2)) * np.asarray(sharper.weight)
+        fine = np.abs(gray - cv2.GaussianBlur(gray, (0, 0), 2))
+        fine = fine * np.maximum(np.asarray(sharper.weight), _DOUBT)
         return float(fine.mean() / np.mean(np.nan_to_num(np.asarray(sharper.error), nan=_UNKNOWN)))
 
     merits = list(progress.each(merit, places, "places to look at"))

@@ -47,7 +47,7 @@ def approach(
     camera = target.camera
     depth = label_depth(render(camera), near=0, far=far)
     view = int(jax.jit(best_source)(camera, sources.views, sources.depths, depth=depth))
-    # Frames of the close-up's lens and size have one shape, for which programs are there.
+    # The lens of the close-up gives all frames one shape.
     start = camera.replace(camtoworld=sources.views.cameras.camtoworld[view])
     row, column = camera.height // 2, camera.width // 2
     middle = pixels_to_points(camera, jnp.array([column + 0.5, row + 0.5]), depth[row, column])
