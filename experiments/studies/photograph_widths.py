@@ -192,7 +192,10 @@ def _core_seconds() -> float:
 
 
 def _closeups(scene: Scene) -> Iterator[tuple[Camera, np.ndarray]]:
-    """Return cameras of about `_SHOWN` pixels' width with their true images `[H, W, 3]`."""
+    """Return cameras of about `_SHOWN` pixels' width with their true images `[H, W, 3]`.
+
+    Cameras are in the coordinates of the capture's files, from which each run moves its scene.
+    """
     if scene.surface is not None:
         for camera in _views(scene, _SHOWN)["test"]:
             yield camera, _draw(scene, camera)
@@ -200,7 +203,8 @@ def _closeups(scene: Scene) -> Iterator[tuple[Camera, np.ndarray]]:
     assert scene.photographs_at is not None
     divisor = score_divisor(scene, _SHOWN)
     for photograph in scene.photographs_at(divisor or scene.metadata["downscale"], "test"):
-        yield photograph.camera, np.asarray(to_float(photograph.rgb))
+        poses = scene.placement.poses_to_capture(np.asarray(photograph.camera.camtoworld))
+        yield photograph.camera.replace(camtoworld=poses), np.asarray(to_float(photograph.rgb))
 
 
 def _score(folder: pathlib.Path, closeups: Iterator[tuple[Camera, np.ndarray]]) -> list[str]:
@@ -208,7 +212,10 @@ def _score(folder: pathlib.Path, closeups: Iterator[tuple[Camera, np.ndarray]]) 
     run, resolved = open_run(folder, "baseline"), jax.jit(ring_correlation)
     errors: dict[str, list[float]] = {"field": [], "detail": []}
     curves: dict[str, list[np.ndarray]] = {"field": [], "detail": []}
+    placement = run.programs.scene.placement
     for camera, photograph in closeups:
+        pose = placement.poses_to_scene(np.asarray(camera.camtoworld))
+        camera = camera.replace(camtoworld=jnp.asarray(pose, jnp.float32))
         truth = quantize(jnp.asarray(photograph))
         sharp = render_detailed(run, camera).rgb
         plain = run.programs.render(run.state, camera).rgb

@@ -48,7 +48,7 @@ def stop(process):
     """Press Ctrl-C; returns what is left of the outputs."""
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=SECONDS)
-    assert process.returncode == 130
+    assert process.returncode == 130, err
     assert "Traceback" not in err and "Traceback" not in out
     return out, err
 
