@@ -4,7 +4,7 @@
 
 Half of the interruptions are Ctrl-C, half kill the program at once. All trainings take the settings
 of the unstopped one, because `--minutes` chooses others whenever it times steps. Pictures, page,
-splats, poses and scores are compared to the last byte, but for what says how long something took,
+splats, poses and scores are compared to the last byte, without what says how long something took,
 and videos frame by frame. What is there in `--output_dir` is not made again.
 """
 

@@ -1,7 +1,7 @@
 """Response curves: what light a camera's colors stand for, where it is not what sRGB encodes.
 
 Two photographs of one point at different exposures tell the slope of the curve between their
-colors. So the curve follows but for a power of the light, which exposures that nobody knows hide.
+colors. The curve is then known up to a power of the light, which needs exposures that are known.
 """
 
 from typing import NamedTuple
@@ -75,8 +75,7 @@ class _Pairs(NamedTuple):
 
     def residual(self, slopes: np.ndarray) -> np.ndarray:
         """Return `[N]` what slopes at the knots leave of the changes."""
-        slope = slopes[self.knot] * (1 - self.share) + slopes[self.knot + 1] * self.share
-        return self.change - self.gain * slope
+        return self.change - self.gain * _slope(slopes, self.knot, self.share)
 
     def error(self, slopes: np.ndarray) -> float:
         """Return the median absolute residual; wrong matches do not count."""
@@ -120,6 +119,10 @@ def _at_knots(colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return knot, place - knot
 
 
+def _slope(slopes: np.ndarray, knot: np.ndarray, share: np.ndarray) -> np.ndarray:
+    return slopes[knot] * (1 - share) + slopes[knot + 1] * share
+
+
 def _fit_slopes(pairs: _Pairs) -> np.ndarray:
     """Fit slopes `[_KNOTS]` with small absolute residuals, smooth where few pairs tell them."""
     slopes = np.ones(_KNOTS)
@@ -137,16 +140,14 @@ def _fit_slopes(pairs: _Pairs) -> np.ndarray:
         system += held * (bend.T @ bend + 0.2 * np.eye(_KNOTS))
         slopes = np.linalg.solve(system, wanted + 0.2 * held)
         slopes = np.clip(slopes, 1 / _STEEP, _STEEP)
-        mean = slopes[pairs.knot] * (1 - pairs.share) + slopes[pairs.knot + 1] * pairs.share
-        scale = np.average(mean, weights=weight * pairs.gain**2)
+        scale = np.average(_slope(slopes, pairs.knot, pairs.share), weights=weight * pairs.gain**2)
     return slopes / scale if len(pairs.change) else slopes
 
 
 def _curve(slopes: np.ndarray, logs: np.ndarray) -> np.ndarray:
     """Return the light `[LEVELS]` of colors by slopes at the knots."""
     colors = np.linspace(0, 1, 16 * LEVELS + 1)[1:]
-    knot, share = _at_knots(colors)
-    slope = slopes[knot] * (1 - share) + slopes[knot + 1] * share
+    slope = _slope(slopes, *_at_knots(colors))
     encoded = np.log(srgb_curve(colors))
     steps = np.diff(encoded) * 2 / (slope[1:] + slope[:-1])
     light = np.concatenate([[0], np.cumsum(steps)])

@@ -108,7 +108,7 @@ def test_photographs_of_one_exposure_stay_as_they_are(stereo):
 
 
 def test_a_camera_s_curve_is_recovered_with_its_exposures(stereo, log_gains):
-    """Straightened photographs show the scene within 2 %, but for a power that nothing tells."""
+    """Straightened photographs show the scene within 2 %, up to a power of its light."""
     light = to_light(stereo.views.rgb.astype(jnp.float32) / 255) * 0.5 + 0.01
     gained = light * jnp.exp(jnp.asarray(log_gains, jnp.float32))[:, None, None]
     colors = 0.55 + 0.25 * jnp.log10(gained)  # as cameras write video that is to be graded
@@ -129,7 +129,7 @@ def test_a_camera_s_curve_is_recovered_with_its_exposures(stereo, log_gains):
 
 
 def test_held_out_photographs_get_the_exposure_of_their_files(tmp_path):
-    """Time and sensitivity explain the gains of the others, but for a factor of the camera."""
+    """Time and sensitivity explain the gains of the others, up to one factor of the camera."""
 
     def write(name, seconds):
         exif = PIL.Image.Exif()

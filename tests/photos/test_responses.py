@@ -32,7 +32,7 @@ def take(response, *, noise=0.0, seed=0):
 
 
 def far_off(found, light):
-    """Return by how much light `[N]` is off, but for a power and a scale, which are not known."""
+    """Return by how much light `[N]` is off after the best power and scale are applied."""
     design = np.stack([found, np.ones_like(found)], 1)
     return np.abs(design @ np.linalg.lstsq(design, light, rcond=None)[0] - light)
 
