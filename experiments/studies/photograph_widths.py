@@ -172,13 +172,11 @@ def _train(capture: pathlib.Path, run: pathlib.Path) -> dict[str, Any]:
         given.append(f"--split={FLAGS.split}")
         begun, before = time.perf_counter(), _core_seconds()
         subprocess.run([sys.executable, "-m", "experiments.run", *given], check=True)
-        # This is of the largest process so far, so the largest photographs come last.
-        most = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 2**10
         size = "x".join(map(str, read_object(run / "results.json")["resolution"]))
         found = {
             "seconds": time.perf_counter() - begun,
             "core_seconds": _core_seconds() - before,
-            "bytes": most,
+            "bytes": read_object(run / "manifest.json")["peak_bytes"],
             "reduced": size,
         }
         record.write_text(json.dumps(found))

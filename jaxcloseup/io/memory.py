@@ -1,9 +1,11 @@
-"""Read how much memory is installed, and keep or return freed memory."""
+"""Read how much memory is installed and was taken, and keep or return freed memory."""
 
 import contextlib
 import ctypes
 import os
 import pathlib
+import platform
+import re
 
 
 def installed_memory() -> int:
@@ -12,6 +14,23 @@ def installed_memory() -> int:
     with contextlib.suppress(OSError, ValueError):  # the file says "max" without a limit
         held = min(held, int(pathlib.Path("/sys/fs/cgroup/memory.max").read_text()))
     return held
+
+
+def peak_memory() -> int | None:
+    """Return the largest resident memory of this process so far in bytes; None if unknown.
+
+    On Linux it is VmHWM of proc(5), for getrusage(2) counts what the starting program had, too.
+    """
+    with contextlib.suppress(OSError):
+        status = pathlib.Path("/proc/self/status").read_text()
+        if found := re.search(r"^VmHWM:\s*(\d+) kB$", status, re.MULTILINE):
+            return int(found[1]) * 2**10
+    try:
+        import resource
+    except ImportError:  # not a Unix
+        return None
+    unit = 1 if platform.system() == "Darwin" else 2**10
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
 # Parameters of glibc's mallopt.

@@ -1,5 +1,7 @@
 """Freed memory is kept or given back by calls of the C library, where it is glibc."""
 
+import subprocess
+import sys
 import types
 
 import jax
@@ -44,3 +46,24 @@ def test_jax_on_a_cpu_takes_arrays_without_a_copy():
 
 def test_installed_memory_is_known():
     assert memory.installed_memory() > 2**26
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="VmHWM is Linux's")
+def test_peak_memory_is_of_this_process_alone():
+    held = np.ones(2**25)  # 256 MiB here must not count in a program that is started from here
+    before = memory.peak_memory()
+    assert held.nbytes < before
+    code = """
+import sys
+from jaxcloseup.io import memory
+before = memory.peak_memory()
+taken = bytearray(b"1" * 2**27)
+del taken
+print(before, memory.peak_memory())
+"""
+    shown = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout
+    first, last = map(int, shown.split())
+    assert first < held.nbytes < before
+    assert 2**27 < last - first < 2**29

@@ -16,6 +16,7 @@ import jaxcloseup
 from jaxcloseup.app.methods.method import Preset
 from jaxcloseup.app.methods.settings import plain_config
 from jaxcloseup.io.files import read_object, write_json
+from jaxcloseup.io.memory import peak_memory
 from jaxcloseup.photos.scene import Scene
 
 
@@ -140,15 +141,14 @@ def _hash(arrays: Mapping[str, Any]) -> str:
     return digest.hexdigest()
 
 
-def _resources_used() -> dict[str, float]:
+def _resources_used() -> dict[str, float | None]:
     """Return the core-seconds and the largest resident memory in bytes of this process so far."""
     try:
         import resource
     except ImportError:  # not a Unix: what a run uses is not measured
         return {}
     used = resource.getrusage(resource.RUSAGE_SELF)
-    unit = 1 if platform.system() == "Darwin" else 1024
-    return {"core_seconds": used.ru_utime + used.ru_stime, "peak_bytes": used.ru_maxrss * unit}
+    return {"core_seconds": used.ru_utime + used.ru_stime, "peak_bytes": peak_memory()}
 
 
 def git_commit(folder: pathlib.Path) -> tuple[str | None, bool | None]:
