@@ -13,6 +13,7 @@ _ROUNDS = 5  # of multinerf's fit
 _CLIPPED = 0.5 / 255  # from black and white, colors that do not count in it
 _REGULAR = 1e-7  # share of the largest singular value below which colors do not tell features apart
 _FIRST, _SECOND = np.triu_indices(3)
+_ROWS = 16  # of an image whose terms are in memory at once
 
 
 def gsplat_cc_psnr(image: jax.Array, target: jax.Array, *, weight: jax.Array) -> jax.Array:
@@ -56,19 +57,32 @@ def _is_usable(image: jax.Array) -> jax.Array:
 def _fit_quadratic(image: jax.Array, target: jax.Array, weight: jax.Array) -> jax.Array:
     """Return an image corrected once; `weight` `[H, W, 3]` is of each channel's pixels."""
     # Centered colors span the same polynomials, and keep sums of 32 bits exact enough.
-    centered = image - jnp.mean(image, axis=(0, 1), keepdims=True)
-    squares = centered[..., _FIRST] * centered[..., _SECOND]
-    features = jnp.concatenate([squares, centered, jnp.ones_like(image[..., :1])], axis=-1)
-    features = jnp.moveaxis(features, -1, 1)  # [H, 10, W], one product of matrices a row
-    weighted = features[:, None] * jnp.moveaxis(weight, -1, 1)[:, :, None]
-    # Rows are summed first, as one sum of 32 bits over all pixels would lose too much.
-    rows = jnp.einsum("hciw,hjw->hcij", weighted, features, precision=HIGHEST)
-    system = jnp.sum(jax.lax.optimization_barrier(rows), axis=0)
-    change = jnp.moveaxis(target - image, -1, 1)
-    reached = jnp.sum(jnp.sum(weighted * change[:, :, None], axis=-1), axis=0)
+    middle = jnp.mean(image, axis=(0, 1))[None]
+
+    def features(row: jax.Array) -> jax.Array:
+        """Return the polynomials' terms `[10, W]` of a row of colors `[W, 3]`."""
+        centered = (row - middle).T
+        squares = centered[_FIRST] * centered[_SECOND]
+        return jnp.concatenate([squares, centered, jnp.ones_like(centered[:1])])
+
+    def count(row: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        """Return the sums of a row in the normal equations of each channel."""
+        colors, wanted, counted = row
+        terms = features(colors)
+        weighted = terms[None] * counted.T[:, None]  # [3, 10, W]
+        products = jnp.einsum("ciw,jw->cij", weighted, terms, precision=HIGHEST)
+        return products, jnp.sum(weighted * (wanted - colors).T[:, None], axis=-1)
+
+    # Row by row, as all terms of large images take a gigabyte, and one sum of 32 bits over all
+    # pixels would lose too much.
+    rows, reached = jax.lax.map(count, (image, target, weight), batch_size=_ROWS)
+    system, reached = jnp.sum(rows, axis=0), jnp.sum(reached, axis=0)
     scale = jnp.sqrt(jnp.maximum(jnp.diagonal(system, axis1=1, axis2=2), 1e-12))
     system = system / (scale[..., None] * scale[:, None])
     inverse = jnp.linalg.pinv(system, rtol=_REGULAR, hermitian=True)
     solved = jnp.einsum("cij,cj->ci", inverse, reached / scale, precision=HIGHEST) / scale
-    changed = jnp.einsum("ci,hiw->hwc", solved, features, precision=HIGHEST)
-    return jnp.clip(image + changed, 0, 1)
+
+    def change(row: jax.Array) -> jax.Array:
+        return jnp.einsum("ci,iw->wc", solved, features(row), precision=HIGHEST)
+
+    return jnp.clip(image + jax.lax.map(change, image, batch_size=_ROWS), 0, 1)

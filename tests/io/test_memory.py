@@ -19,8 +19,12 @@ def test_glibc_keeps_freed_memory_until_it_is_given_back(monkeypatch):
     )
     monkeypatch.setattr(memory.ctypes, "CDLL", lambda name: library)
     memory.reuse_freed_memory()
-    # The names of parameters in glibc's malloc.h: M_ARENA_MAX, M_MMAP_MAX, M_TRIM_THRESHOLD.
-    assert dict(calls) == {-8: 1, -4: 0, -1: 2**31 - 1}
+    # Parameters in glibc's malloc.h: M_ARENA_MAX, M_MMAP_THRESHOLD, M_TRIM_THRESHOLD, M_MMAP_MAX.
+    assert dict(calls) == {-8: 1, -3: 2**25, -1: 2**31 - 1}
+    with pytest.raises(KeyError), memory.reusing_large_buffers():
+        assert calls[-1] == (-4, 0)
+        raise KeyError
+    assert calls[-1] == (-4, 65536)
     memory.give_back_memory()
     assert calls[-1] == 0
 
@@ -34,7 +38,8 @@ def test_other_c_libraries_change_nothing(monkeypatch, library):
 
     monkeypatch.setattr(memory.ctypes, "CDLL", load)
     memory.reuse_freed_memory()
-    memory.give_back_memory()
+    with memory.reusing_large_buffers():
+        memory.give_back_memory()
 
 
 def test_jax_on_a_cpu_takes_arrays_without_a_copy():

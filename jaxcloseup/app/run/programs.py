@@ -30,6 +30,7 @@ from jaxcloseup.app.run.stereo_depths import StereoDepths
 from jaxcloseup.app.run.taken_steps import check_steps, run_in_parts
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.io.memory import reusing_large_buffers
 from jaxcloseup.photos.exposures import Exposures, Taken, at_middle_exposure
 from jaxcloseup.photos.pyramids import Pyramid, photograph_pyramid
 from jaxcloseup.photos.scene import Scene
@@ -222,7 +223,8 @@ class Programs:
         state, data = self._place(state, data)
         while True:
             growth = self.growth
-            with self._announce_compiling(type(data).__name__, "compiling the steps"):
+            compiling = self._announce_compiling(type(data).__name__, "compiling the steps")
+            with compiling, reusing_large_buffers():
                 after, metrics = self._take_steps(state, data, count)
                 metrics = jax.device_get(metrics)
             # Means of counts: positive if any step had an overflow.
