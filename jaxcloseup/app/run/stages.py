@@ -22,7 +22,7 @@ from jaxcloseup.app.run.scoring import HeldOut, Scorer, hold_out
 from jaxcloseup.app.run.stage_names import STAGES
 from jaxcloseup.app.run.states import say_which_points_fit, train_baseline
 from jaxcloseup.app.run.step_data import CloseupData, LabeledData, StepData, TrainData
-from jaxcloseup.app.run.timers import timed
+from jaxcloseup.app.run.timers import forget_compiled, timed
 from jaxcloseup.app.score.audit import audit_labels, left_out_curve
 from jaxcloseup.app.score.expected_errors import compare_errors
 from jaxcloseup.app.score.renders import write_truth
@@ -121,8 +121,10 @@ def run_stages(
     detail: dict[str, Any] | None = None
     render: Render = run.render
     if "detail" in to_run:
+        forget_compiled()
         detail, render = add_detail_stage(run, get_detail)
     if "test_time" in to_run:
+        forget_compiled()
         train_for_target_views(run, get_detail, controlled="control" in to_run)
     with timed(training.seconds, "audit"):
         audit = audit_all(run)
