@@ -2,6 +2,7 @@
 
 import functools
 import pathlib
+import shutil
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -85,26 +86,41 @@ class Scorer:
 
         By default the state renders, and is exported too.
         """
-        programs, log = self._training.programs, self._training.log
+        programs = self._training.programs
         if render is None:
             render = functools.partial(render_exposed, programs, state)
             write_splats(self._folder / "splats", stage, programs, state)
-        targets, ladder = self.held_out.targets, self.held_out.ladder
         with timed(self._training.seconds, f"{stage}_evaluation"):
             scores: dict[str, Any] = {}
-            shown: dict[str, np.ndarray] = {}
             for split, views in self.held_out.all.items():
                 scores[split], seen = evaluate(render, views, self._perceptual)
                 write_renders(self._folder / "renders" / stage / split, seen, programs.scene)
-                if split in targets:
+                if split in self.held_out.targets:
                     self.images[stage, split] = {
                         name: np.asarray(rendering.rgb) for name, rendering in seen.items()
                     }
-                    name, first = next(iter(seen.items()))
-                    shown[f"{split}/{name}"] = np.asarray(first.rgb)
-                    print(f"{stage:>9} {split}: {describe_split(scores[split])}", flush=True)
-            self.scores[stage] = scores
-            if log is not None:
-                log.evaluated(stage, scores, shown)
-            if ladder:
-                print(f"{stage:>9} {describe_ladder(scores)}", flush=True)
+            self._keep(stage, scores)
+
+    def repeat(self, stage: str, of: str) -> None:
+        """Keep a stage that ended with the state of another, without rendering it again."""
+        renders, splats = self._folder / "renders", self._folder / "splats"
+        with timed(self._training.seconds, f"{stage}_evaluation"):
+            shutil.copytree(renders / of, renders / stage, dirs_exist_ok=True)
+            if (exported := splats / f"{of}.ply").exists():
+                shutil.copyfile(exported, splats / f"{stage}.ply")
+            for split in self.held_out.targets:
+                self.images[stage, split] = self.images[of, split]
+            self._keep(stage, self.scores[of])
+
+    def _keep(self, stage: str, scores: dict[str, Any]) -> None:
+        """Keep, log and print the scores of a stage whose images are there."""
+        self.scores[stage] = scores
+        shown = {}
+        for split in self.held_out.targets:
+            name, first = next(iter(self.images[stage, split].items()))
+            shown[f"{split}/{name}"] = first
+            print(f"{stage:>9} {split}: {describe_split(scores[split])}", flush=True)
+        if self._training.log is not None:
+            self._training.log.evaluated(stage, scores, shown)
+        if self.held_out.ladder:
+            print(f"{stage:>9} {describe_ladder(scores)}", flush=True)

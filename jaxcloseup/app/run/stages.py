@@ -116,7 +116,7 @@ def run_stages(
         closeups = closeup_data(run)
         run.stage, run.state = "closeup", run.train("closeup", run.start.state, closeups)
     elif "closeup" in to_run:
-        run.scorer.score("closeup", run.state)
+        run.scorer.repeat("closeup", of="control")
     get_detail = run.get_detail(run.stage, run.state)
     detail: dict[str, Any] | None = None
     render: Render = run.render
