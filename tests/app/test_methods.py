@@ -97,7 +97,7 @@ def test_the_smoothing_filter_is_that_of_the_finest_photographs(capture_folder, 
 def test_refinement_and_exports_keep_the_shapes_that_the_filter_made(capture_folder, tmp_path):
     """Splats of a coarse model have its filter in their scales, and beside them the finer one."""
     scene = load_scene(str(capture_folder), downscale=2)
-    config = dataclasses.replace(TINY_MIP.field, smoothed_at=1, capacity=600)
+    config = dataclasses.replace(TINY_MIP.field, smoothed_at=1, capacity=420)
     coarse = dataclasses.replace(config, smoothed_at=2, capacity=100)
     points = np.random.default_rng(0).uniform([-1, -1, -0.1], [1, 1, 0.1], (100, 3))
     points = jnp.asarray(scene.placement.to_scene(points), jnp.float32)
@@ -107,7 +107,7 @@ def test_refinement_and_exports_keep_the_shapes_that_the_filter_made(capture_fol
     pyramid, _ = scene_pyramid(scene)
 
     def render(shown, shown_buffers, camera):
-        assert shown.means.shape == (600, 3) and shown_buffers.alive.sum() == 100
+        assert shown.means.shape in ((420, 3), (9000, 3)) and shown_buffers.alive.sum() == 100
         return gray
 
     finer, kept = METHODS["mip_gaussians"].refine(
@@ -118,13 +118,19 @@ def test_refinement_and_exports_keep_the_shapes_that_the_filter_made(capture_fol
     before, after = variances
     np.testing.assert_allclose(after[:100], before + added, rtol=1e-4)
     np.testing.assert_allclose(kept.interval[:100], buffers.interval / 2, rtol=1e-5)
-    assert kept.alive.all() and finer.log_scales.shape == (600, 3)
+    assert kept.alive.all() and finer.log_scales.shape == (420, 3)
     write_surfels(tmp_path / "finer.ply", *METHODS["mip_gaussians"].splats(finer, kept))
     found = read_surfels(tmp_path / "finer.ply", num_scales=3)
     expected = smoothed(finer, kept.interval)
     np.testing.assert_allclose(found.log_scales, expected.log_scales, rtol=1e-6)
     np.testing.assert_allclose(found.opacity_logits, expected.opacity_logits, rtol=1e-5)
     assert np.all(found.opacity_logits < finer.opacity_logits)
+    # Photographs fill no more rows than they resolve: one for 12 pixels of each at its own size.
+    roomy = dataclasses.replace(config, capacity=9000)
+    _, kept = METHODS["mip_gaussians"].refine(
+        jax.random.key(1), roomy, params, buffers, render, scene, pyramid
+    )
+    assert kept.alive.sum() == 100 + len(pyramid) * (plane.HEIGHT * plane.WIDTH // 12)
 
 
 def test_target_views_get_splats_where_their_labels_show_more(scene):

@@ -39,6 +39,9 @@ from jaxcloseup.training.state import TrainState
 
 SplatTrainingConfig = SurfelTrainingConfig | GaussianTrainingConfig
 _REPLACED = 0.2  # share of all splats that target views may replace
+# Pixels of a photograph for each new surfel: photographs show the same surface several times, and
+# more surfels than they resolve learn each photograph by heart, more slowly.
+_PIXELS = 12
 _REFINED_AT = 8  # times the photographs' training size, at which new surfels are looked for
 
 
@@ -123,13 +126,14 @@ def refine(
 ) -> tuple[Surfels, SurfelBuffers]:
     """Fill the rows that `config` has beyond `surfels` where photographs show more than these.
 
-    They lie at the depths that were measured, and elsewhere at those that are rendered.
+    Small photographs fill only as many as they resolve. New surfels lie at the depths that were
+    measured, and elsewhere at those that are rendered.
     """
     views, cameras = len(pyramid), scene.train.cameras
     level = pyramid.level_near(_REFINED_AT * cameras.width)
     free = config.capacity - int(buffers.alive.sum())
-    smallest = int(np.asarray(pyramid.extents)[:, level].prod(-1).min())
-    each = min(max(0, free) // views, smallest)
+    smallest, finest = np.asarray(pyramid.extents)[:, (level, 0)].prod(-1).min(0).tolist()
+    each = min(max(0, free) // views, smallest, finest // _PIXELS)
     sample = _sampler(config, each)
     # With all rows, so that what is compiled here is what renders the field later.
     padded, padded_buffers = _with_rows((surfels, buffers), config.capacity)
