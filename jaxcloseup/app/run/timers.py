@@ -43,7 +43,7 @@ def timed_compiling(seconds: dict[str, float]) -> Iterator[None]:
 
 
 def forget_compiled() -> None:
-    """Free the programs of the parts before: a gigabyte, of which later parts need little again."""
+    """Drop the programs of the parts before: a gigabyte, of which later parts need little again."""
     jax.clear_caches()
     gc.collect()  # what they held through cycles of references
     give_back_memory()
