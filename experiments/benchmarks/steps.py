@@ -5,7 +5,6 @@ a window shows a share of them. A step should cost what its window shows, howeve
 """
 
 import dataclasses
-import resource
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +20,7 @@ from jaxcloseup.fields.splats.spherical_harmonics import rgb_to_sh
 from jaxcloseup.fields.splats.splat_field import SurfelBuffers
 from jaxcloseup.fields.splats.surfels import Surfels
 from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_points
+from jaxcloseup.io.memory import peak_memory
 from jaxcloseup.photos.views import to_float
 from jaxcloseup.training.state import TrainState
 
@@ -49,7 +49,7 @@ def run() -> None:
 
                 calls[f"{count:,} surfels, {name}", number] = steps
                 jax.block_until_ready(steps())
-        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
+        memory = (peak_memory() or float("nan")) / 2**20
         print(f"{count:,} surfels: {memory:.0f} MiB at most so far", flush=True)
     medians = {key: 1e3 * seconds for key, seconds in interleaved_medians(calls, 3).items()}
     few, many = STEPS

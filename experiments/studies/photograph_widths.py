@@ -11,7 +11,6 @@ in `outputs/studies`; what is there is not made again.
 
 import json
 import pathlib
-import resource
 import shutil
 import subprocess
 import sys
@@ -170,23 +169,17 @@ def _train(capture: pathlib.Path, run: pathlib.Path) -> dict[str, Any]:
     if not record.exists():
         given = [f"--scene={capture}", f"--output_dir={run}", "--seed=0", "--stages=detail"]
         given.append(f"--split={FLAGS.split}")
-        begun, before = time.perf_counter(), _core_seconds()
+        begun = time.perf_counter()
         subprocess.run([sys.executable, "-m", "experiments.run", *given], check=True)
-        size = "x".join(map(str, read_object(run / "results.json")["resolution"]))
+        seconds, used = time.perf_counter() - begun, read_object(run / "manifest.json")
         found = {
-            "seconds": time.perf_counter() - begun,
-            "core_seconds": _core_seconds() - before,
-            "bytes": read_object(run / "manifest.json")["peak_bytes"],
-            "reduced": size,
+            "seconds": seconds,
+            "core_seconds": used["core_seconds"],
+            "bytes": used["peak_bytes"],
+            "reduced": "x".join(map(str, read_object(run / "results.json")["resolution"])),
         }
         record.write_text(json.dumps(found))
     return read_object(record)
-
-
-def _core_seconds() -> float:
-    """Return the time that finished processes took on all cores."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
 
 
 def _closeups(scene: Scene) -> Iterator[tuple[Camera, np.ndarray]]:

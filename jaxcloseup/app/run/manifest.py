@@ -5,6 +5,7 @@ import hashlib
 import pathlib
 import platform
 import subprocess
+import time
 import warnings
 from collections.abc import Mapping
 from typing import Any
@@ -143,12 +144,7 @@ def _hash(arrays: Mapping[str, Any]) -> str:
 
 def _resources_used() -> dict[str, float | None]:
     """Return the core-seconds and the largest resident memory in bytes of this process so far."""
-    try:
-        import resource
-    except ImportError:  # not a Unix: what a run uses is not measured
-        return {}
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    return {"core_seconds": used.ru_utime + used.ru_stime, "peak_bytes": peak_memory()}
+    return {"core_seconds": time.process_time(), "peak_bytes": peak_memory()}
 
 
 def git_commit(folder: pathlib.Path) -> tuple[str | None, bool | None]:
