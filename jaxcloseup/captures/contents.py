@@ -12,13 +12,14 @@ from jaxcloseup.captures.colmap_files import find_model_files
 from jaxcloseup.captures.corrections import correct_frames, correct_points
 from jaxcloseup.captures.detection import SEPARATE, SINGLE, Detected, detect
 from jaxcloseup.captures.leftovers import unused_note
+from jaxcloseup.captures.listed_splits import splits_from_fields
 from jaxcloseup.captures.llff import read_llff
 from jaxcloseup.captures.photo_masks import attach_masks
 from jaxcloseup.captures.photo_search import check_missing, list_first, locate, photograph_folders
 from jaxcloseup.captures.placing import find_placement, place
 from jaxcloseup.captures.points import read_ply_points
 from jaxcloseup.captures.scale import check_positions, plausible
-from jaxcloseup.captures.splits import splits_from_fields, without_repeats
+from jaxcloseup.captures.splits import without_repeats
 from jaxcloseup.captures.transforms import read_transforms
 from jaxcloseup.captures.world_frames import Frame
 from jaxcloseup.io.placement import UNMOVED, Placement

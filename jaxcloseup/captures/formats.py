@@ -10,11 +10,12 @@ import numpy as np
 from jaxcloseup.captures.choosing import choose_photographs
 from jaxcloseup.captures.contents import placed, read_content
 from jaxcloseup.captures.leftovers import unused_note
+from jaxcloseup.captures.listed_splits import splits_from_file
 from jaxcloseup.captures.photo_files import size_of_image
 from jaxcloseup.captures.photo_masks import attach_masks
 from jaxcloseup.captures.placing import describe_offset
 from jaxcloseup.captures.reduced_photos import attach_reduced, note_stand_ins
-from jaxcloseup.captures.splits import FindPoints, divide, splits_from_file, warn_duplicates
+from jaxcloseup.captures.splits import FindPoints, divide, warn_duplicates
 from jaxcloseup.captures.world_frames import Frame
 from jaxcloseup.io.messages import printable
 from jaxcloseup.io.placement import Placement

@@ -59,7 +59,7 @@ def load_scene(
       half_pixel: whether the files put pixel centers at integers, as the paper's data does.
       background: gray level in [0, 1] behind transparent pixels.
       format: the only format to read, `transforms`, `colmap` or `llff`; None reads the first found.
-      split: how to hold out photographs: `given`, `listed`, `every8`, `closest` or `zoom`.
+      split: how to hold out photographs: one of `SPLITS`, as docs/programs.md describes them.
       zoom: how many times finer `test` is with split `zoom`, 2 or more; None means 4.
       invert_masks: whether masks mark ignored pixels in white instead of black.
       alpha_mode: `blend` shows the background through transparent pixels; `mask` keeps the file's
@@ -73,7 +73,7 @@ def load_scene(
       The scene, float32, in coordinates of its own, which `placement` maps to those of a folder's
       files. For a folder, `metadata` holds path, downscale, format, split; files and sizes (width,
       height) by split; applied_transform `[3, 4]`, applied_scale; up `[3]` or None; notes on what
-      was read; for `closest`, `zoom` times_nearer of each `test` view; for `zoom` crops' corners.
+      was read; times_nearer of each `test` view, if the split knows; for `zoom` crops' corners.
 
     Raises:
       SceneError: one sentence that names the file and the field and says what to do.

@@ -1,24 +1,23 @@
 """Split the photographs of a capture into training and held-out ones."""
 
-import collections
 import pathlib
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from jaxcloseup.captures.choosing import choose_photographs
 from jaxcloseup.captures.depth_range import depths_in_view
-from jaxcloseup.captures.json_fields import read_object
 from jaxcloseup.captures.photo_files import read_image
 from jaxcloseup.captures.world_frames import Frame, frame_intrinsics
-from jaxcloseup.photos.scene import DuplicateFileWarning, SceneError, UnknownKeyWarning
+from jaxcloseup.photos.scene import DuplicateFileWarning, SceneError
 
 
 TEST_EVERY = 8
 CLOSEST_SHARE = 0.1
-_LISTS = {"train": "train_filenames", "test": "test_filenames", "test_far": "val_filenames"}
-_SPLIT_FILE_KEYS = {"train", "test", "test_far", "unused"}
+WIDE = 16  # training photographs of `macro`, as many as MACRO (arXiv 2607.03875) has of a scene
+_NEARER = 2  # how many times nearer its close-ups are, or more
 
 
 # Returns frames that list the points they show, and these points `[P, 3]`.
@@ -30,50 +29,9 @@ class Division(NamedTuple):
 
     frames: dict[str, list[Frame]]  # photographs of each split present, `train` first
     notes: tuple[str, ...] = ()  # sentences on how they were split
-    # for `closest`, how many times nearer each `test` photograph is than the median `train` one;
-    # for `zoom`, how many times finer each close-up is; otherwise None
+    # for `closest` and `macro`, how many times nearer each `test` photograph is than the median
+    # `train` one; for `zoom`, how many times finer each close-up is; otherwise None
     times_nearer: tuple[float, ...] | None = None
-
-
-def splits_from_fields(
-    file: pathlib.Path, fields: dict[str, Any], frames: Sequence[Frame]
-) -> dict[str, list[Frame]] | None:
-    """Read the splits that the fields of a `transforms.json` list; None without lists."""
-    lists = {key: (split, fields[key]) for split, key in _LISTS.items() if fields.get(key)}
-    by_path = {pathlib.PurePath(frame.listed): frame for frame in frames}
-    chosen = _choose(file, lists, lambda name: by_path.get(pathlib.PurePath(name)), "file_path")
-    return _with_train(file, chosen, frames) if chosen else None
-
-
-def splits_from_file(
-    folder: pathlib.Path, frames: Sequence[Frame]
-) -> dict[str, list[Frame]] | None:
-    """Read the splits of a folder's `split.json`; None if it does not exist.
-
-    The file is an object with lists of photograph names: `train`, `test`, `test_far` and `unused`.
-    Photographs that no list names are unused, or form `train` if that list is missing.
-
-    Raises:
-      SceneError: the file is not such an object, or a list names an unknown photograph.
-    """
-    file = folder / "split.json"
-    if not file.is_file():
-        return None
-    fields = read_object(file, "lists train and test")
-    if unknown := sorted(set(fields) - _SPLIT_FILE_KEYS):
-        warnings.warn(
-            f"{file}: these fields are ignored: {', '.join(unknown)}.",
-            UnknownKeyWarning,
-            stacklevel=2,
-        )
-    # A bare name that photographs in several folders share is ambiguous.
-    bases = collections.Counter(frame.file.name for frame in frames)
-    by_name = {frame.file.name: frame for frame in frames if bases[frame.file.name] == 1}
-    by_name |= {frame.listed: frame for frame in frames}
-    lists = {key: (key, fields[key]) for key in fields if key in _SPLIT_FILE_KEYS and fields[key]}
-    chosen = _choose(file, lists, by_name.get, "name")
-    splits = _with_train(file, chosen, frames)
-    return {key: splits[key] for key in _LISTS if key in splits}
 
 
 def divide(
@@ -94,12 +52,13 @@ def divide(
       given: splits that the capture's files list, or None.
       split: one of `SPLITS`, see `load_scene`; without lists `given` holds out every 8th, and
         `listed` nothing.
-      points: `[P, 3]` world points, which `closest` needs.
+      points: `[P, 3]` world points, which `closest` and `macro` need.
       zoom: how many times finer the close-ups of `zoom` are.
-      find_points: finds them for `closest` where there are none.
+      find_points: finds them for these where there are none.
 
     Raises:
-      SceneError: `closest` has too few photographs, or no points that they see.
+      SceneError: `closest` or `macro` has too few photographs, no points that they see, or no
+        photographs that are near enough.
     """
     if split in ("given", "listed") and given:
         return Division(given)
@@ -107,8 +66,9 @@ def divide(
     if split == "listed":
         note = f"{name} lists no splits: all of its {len(frames)} photographs train, none is scored"
         return Division({"train": frames}, (note,))
-    if split == "closest":
-        return _closest(name, frames, points, find_points)
+    if split in ("closest", "macro"):
+        sizes, by = _sizes_of_pixels(name, split, frames, points, find_points)
+        return (_closest if split == "closest" else _macro)(name, frames, sizes, by)
     if split == "zoom":
         return _zoom(name, frames, zoom)
     parts = _every_eighth(frames)
@@ -174,37 +134,81 @@ def _every_eighth(frames: Sequence[Frame]) -> dict[str, list[Frame]]:
     }
 
 
-def _closest(
-    name: str, frames: Sequence[Frame], points: np.ndarray, find_points: FindPoints | None
-) -> Division:
+def _sizes_of_pixels(
+    name: str,
+    split: str,
+    frames: Sequence[Frame],
+    points: np.ndarray,
+    find_points: FindPoints | None,
+) -> tuple[np.ndarray, str]:
+    """Return what `_size_of_pixel` says of each photograph `[V]`, and by which points, in words."""
     if len(frames) < 2:
-        raise SceneError(f"{name}: split closest needs at least 2 photographs, got 1: add some.")
+        raise SceneError(f"{name}: split {split} needs at least 2 photographs, got 1: add some.")
     showing, by = frames, ""
     if not len(points) and find_points:
         showing, points = find_points(frames)
         by = f" by {len(points)} points triangulated from their features"
-    sizes = [_size_of_pixel(frame, points) for frame in showing]
+    sizes = np.array([_size_of_pixel(frame, points) for frame in showing])
     if not np.isfinite(sizes).any():
         raise SceneError(
-            f"{name}: split closest needs points that the photographs see, but the capture lists "
+            f"{name}: split {split} needs points that the photographs see, but the capture lists "
             "none and the photographs' features give none: read its COLMAP model "
             "(--format=colmap), give ply_file_path, or choose --split=zoom, which needs no points."
         )
+    return sizes, by
+
+
+def _closest(name: str, frames: Sequence[Frame], sizes: np.ndarray, by: str) -> Division:
     nearest = np.argsort(sizes, kind="stable")[: max(1, round(CLOSEST_SHARE * len(frames)))]
     held_out = sorted(nearest.tolist())
-    rest = [frame for i, frame in enumerate(frames) if i not in held_out]
-    parts = _every_eighth(rest)
-    parts = {"train": parts["train"], "test": [frames[i] for i in held_out], **parts}
-    size_by_file = {frame.file: size for frame, size in zip(frames, sizes, strict=True)}
-    median = np.median([size_by_file[frame.file] for frame in parts["train"]])
-    ratios = tuple(float(median / sizes[i]) for i in held_out)
+    rest = [i for i in range(len(frames)) if i not in held_out]
+    far = rest[::TEST_EVERY] if len(rest) > 1 else []
+    train = [i for i in rest if i not in far]
+    ratios = np.median(sizes[train]) / sizes[held_out]
     note = (
         f"{name}: test is the {len(held_out)} nearest of {len(frames)} photographs{by}, "
-        f"{min(ratios):.2f} to {max(ratios):.2f} times nearer (median {np.median(ratios):.2f}) "
-        f"than the median of {len(parts['train'])} training photographs; test_far is "
-        f"{len(parts.get('test_far', ()))} others"
+        f"{_nearer(ratios)} than the median of {len(train)} training photographs; test_far is "
+        f"{len(far)} others"
     )
-    return Division(parts, (note,), ratios)
+    return _divided(frames, train, held_out, far, note, ratios)
+
+
+def _macro(name: str, frames: Sequence[Frame], sizes: np.ndarray, by: str) -> Division:
+    middle = np.median(sizes[np.isfinite(sizes)])
+    wide = [i for i, size in enumerate(sizes) if middle <= size < np.inf]
+    poses = np.stack([frames[i].camtoworld for i in wide])
+    train = [wide[k] for k in choose_photographs(name, poses, min(WIDE, len(wide)), "spread")]
+    ratios = np.median(sizes[train]) / sizes
+    held_out = np.flatnonzero(ratios >= _NEARER).tolist()
+    if not held_out:
+        raise SceneError(
+            f"{name}: split macro needs photographs {_NEARER} times nearer than its wide ones, but "
+            f"the nearest is {ratios.max():.2f} times nearer: choose --split=closest."
+        )
+    far = [i for i in range(len(frames)) if i not in {*train, *held_out}][::TEST_EVERY]
+    note = (
+        f"{name}: train is {len(train)} wide photographs that are far apart; test is the "
+        f"{len(held_out)} of {len(frames)}{by} that are {_nearer(ratios[held_out])} than the "
+        f"median of these; test_far is {len(far)} others"
+    )
+    return _divided(frames, train, held_out, far, note, ratios[held_out])
+
+
+def _nearer(ratios: np.ndarray) -> str:
+    return f"{min(ratios):.2f} to {max(ratios):.2f} times nearer (median {np.median(ratios):.2f})"
+
+
+def _divided(
+    frames: Sequence[Frame],
+    train: Sequence[int],
+    test: Sequence[int],
+    far: Sequence[int],
+    note: str,
+    ratios: np.ndarray,
+) -> Division:
+    rows = {"train": train, "test": test, "test_far": far}
+    parts = {split: [frames[i] for i in chosen] for split, chosen in rows.items() if chosen}
+    return Division(parts, (note,), tuple(map(float, ratios)))
 
 
 def _zoom(name: str, frames: Sequence[Frame], zoom: int) -> Division:
@@ -230,41 +234,3 @@ def _size_of_pixel(frame: Frame, points: np.ndarray) -> float:
     return (
         float(np.median(depths) / np.sqrt(intrinsics[0] * intrinsics[1])) if len(depths) else np.inf
     )
-
-
-def _choose(
-    file: pathlib.Path,
-    lists: dict[str, tuple[str, Any]],
-    find: Callable[[str], Frame | None],
-    field: str,
-) -> dict[str, list[Frame]]:
-    splits = {}
-    for key, (split, names) in lists.items():
-        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise SceneError(f"{file}: {key} must be a list of the frames' {field}: correct it.")
-        members = {name: find(name) for name in names}
-        unlisted = [name for name in names if members[name] is None]
-        if unlisted:
-            raise SceneError(
-                f"{file}: {key} names {unlisted[0]!r}, which is no frame's {field} "
-                f"({len(unlisted)} of {len(names)} such names): correct it."
-            )
-        chosen = (frame for frame in members.values() if frame is not None)
-        splits[split] = list({frame.file: frame for frame in chosen}.values())
-    return splits
-
-
-def _with_train(
-    file: pathlib.Path, splits: dict[str, list[Frame]], frames: Sequence[Frame]
-) -> dict[str, list[Frame]]:
-    if "train" in splits:
-        return splits
-    held_out = {frame.file for members in splits.values() for frame in members}
-    train = [frame for frame in frames if frame.file not in held_out]
-    if not train:
-        raise SceneError(f"{file}: every frame is held out: leave some for {_train_key(file)}.")
-    return {"train": train, **splits}
-
-
-def _train_key(file: pathlib.Path) -> str:
-    return "train" if file.name == "split.json" else _LISTS["train"]

@@ -134,7 +134,10 @@ def test_help_shows_each_shared_flag_under_one_topic():
         ("run --seed=-1", "--seed=-1 must be a whole number between 0 and 9223372036854775807"),
         ("run --zoom=1", "--zoom=1 must be a whole number of at least 2"),
         ("run --resume=si", "--resume=si must be true or false"),
-        ("run --split=all", "--split=all must be one of given, listed, every8, closest, zoom"),
+        (
+            "run --split=all",
+            "--split=all must be one of given, listed, every8, closest, macro, zoom",
+        ),
         ("run --stages=polish", "--stages takes names of baseline, control, closeup, "),
         ("run --method=magic", "--method=magic must be one of surfels, "),
         ("run table", "table is not a flag: flags begin with --"),

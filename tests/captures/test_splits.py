@@ -70,6 +70,29 @@ def test_closest_photographs_are_held_out(tmp_path):
     np.testing.assert_allclose(scene.metadata["times_nearer"], [np.median(train) / 4])
 
 
+def test_sixteen_wide_photographs_train_for_close_ups_at_least_twice_as_near(tmp_path):
+    """The nearer half is never among them; what is neither is an ordinary view now and then."""
+    pytest.importorskip("pycolmap")
+    depths = [9.0] * 40
+    depths[3], depths[17], depths[29] = 4.0, 4.5, 4.6
+    colmap_capture(tmp_path, 40, depths=depths)
+    scene = load_scene(tmp_path, split="macro")
+    assert scene.names["test"] == ["003", "017"] and len(scene.names["train"]) == 16
+    assert not {"003", "017", "029"} & set(scene.names["train"])
+    others = [f"{i:03d}" for i in range(40)]
+    others = [name for name in others if name not in scene.names["train"] + scene.names["test"]]
+    assert scene.names["test_far"] == others[::8]
+    np.testing.assert_allclose(scene.metadata["times_nearer"], [9 / 4, 2])
+    assert "the 2 of 40 that are 2.00 to 2.25 times nearer" in " ".join(scene.metadata["notes"])
+
+
+def test_close_ups_that_are_not_near_enough_are_refused(tmp_path):
+    pytest.importorskip("pycolmap")
+    colmap_capture(tmp_path, 4, depths=[9.0, 9.0, 6.0, 9.0])
+    with pytest.raises(SceneError, match=r"nearest is 1\.50 times nearer: choose --split=closest"):
+        load_scene(tmp_path, split="macro")
+
+
 def test_a_longer_lens_counts_as_nearer(tmp_path):
     """For a transforms.json, points inside the image count as seen."""
     pose = {"transform_matrix": np.diag([1.0, -1, -1, 1]).tolist(), "w": WIDTH, "h": HEIGHT}
