@@ -9,6 +9,7 @@ what was cut off is resumed, arm by arm. `--print_only` prints the scenes that a
 """
 
 import itertools
+import math
 import pathlib
 import sys
 from collections.abc import Mapping, Sequence
@@ -26,7 +27,6 @@ from experiments.studies.tables import (
     gains,
     pair,
     print_table,
-    score,
 )
 from experiments.studies.trained_run import open_run
 from jaxcloseup.app.cli.start import loading, set_up_compilation_cache, start
@@ -81,8 +81,12 @@ LADDER = {
 _LENGTHS = ("baseline_steps", "means_lr_steps", "sh_every", "regularize_from")
 _DENSITY_LENGTHS = ("every", "start", "stop", "reset_every")
 _ALONE = ("--stages=control,detail",)  # of all runs of the ladder after the first
-_BY_ANGLE = ("labels by the text", "labels by detail", "render with detail")
-_DEGREES = (0, 10, 20, 30, 45, 181)  # bounds of the rows by angle
+_GROUPED = ("labels by the text", "labels by detail", "render with detail")
+# What close-ups are grouped by, as `describe_proximity` names it, and the bounds of groups.
+_GROUPS = {
+    "ray_angle": ("degrees to the nearest photograph", (0, 10, 20, 30, 45, 181)),
+    "depth_ratio": ("ratio of depths", (0, 1.5, 2.5, 4, 6, math.inf)),
+}
 
 
 def define_flags() -> None:
@@ -219,7 +223,7 @@ def train_arm(
 
 
 def print_scene(name: str, results: Results, others: Mapping[str, Results]) -> None:
-    """Print the arms of a scene, and its close-ups by their angle to the photographs."""
+    """Print the arms of a scene, and gains by where the nearest photographs look from."""
     rows = []
     for title, (stage, over) in _ROWS.items():
         if stage in results["stages"]:
@@ -234,7 +238,7 @@ def print_scene(name: str, results: Results, others: Mapping[str, Results]) -> N
     header = ["arm", "close-ups: PSNR", "SSIM", "color-corrected", "resolves (px)"]
     header += ["ordinary views: PSNR", "SSIM", "gain over control (95 %)", "on ordinary views"]
     print_table(f"{name}, the paper's regime", header, rows)
-    print_angles(name, results)
+    print_groups(name, results)
 
 
 def print_ladder(name: str, found: Mapping[str, Results]) -> None:
@@ -263,23 +267,22 @@ def _scores(results: Results, stage: str) -> list[str]:
     ]
 
 
-def print_angles(name: str, results: Results) -> None:
-    """Print the gains of a scene's close-ups by their angle to the nearest photograph."""
-    stages, rows = results["stages"], []
-    if score(results, "control", CLOSEUPS, "ray_angle") is None:
-        return
+def print_groups(name: str, results: Results) -> None:
+    """Print the gains of a scene's close-ups by how the nearest photographs look at the same."""
+    stages = results["stages"]
     views = stages["control"][CLOSEUPS]["views"]
-    for low, high in itertools.pairwise(_DEGREES):
-        chosen = [
-            view for view, found in views.items() if low <= found.get("ray_angle", 180) < high
-        ]
-        if chosen:
-            row = [f"{low} to {high}", str(len(chosen))]
-            row += [f"{np.mean([views[view].get('depth_ratio', np.nan) for view in chosen]):.1f}"]
-            row += [f"{np.mean([views[view]['psnr'] for view in chosen]):.2f}"]
-            rows.append(row + [_gain(stages, chosen, *_ROWS[title]) for title in _BY_ANGLE])
-    header = ["degrees to the nearest photograph", "close-ups", "times nearer", "control: PSNR"]
-    print_table(f"{name}, gain by angle", [*header, *_BY_ANGLE], rows)
+    for measure, (title, bounds) in _GROUPS.items():
+        rows = []
+        for low, high in itertools.pairwise(bounds):
+            chosen = [view for view, at in views.items() if low <= at.get(measure, -1) < high]
+            if chosen:
+                others = [f"{np.mean([views[view][m] for view in chosen]):.1f}" for m in _GROUPS]
+                control = f"{np.mean([views[view]['psnr'] for view in chosen]):.2f}"
+                gained = [_gain(stages, chosen, *_ROWS[arm]) for arm in _GROUPED]
+                rows.append([f"{low} to {high}", str(len(chosen)), *others, control, *gained])
+        if rows:
+            header = [title, "close-ups", "mean angle", "mean ratio", "control: PSNR", *_GROUPED]
+            print_table(f"{name}, gain by {title}", header, rows)
 
 
 def _gain(stages: Mapping[str, Any], views: Sequence[str], stage: str, over: str) -> str:
