@@ -97,19 +97,49 @@ def read_depths(sources: GatherSources, view: jax.Array | int, camera: Camera) -
       view: which of them.
       camera: a window of its photograph, at any size.
     """
+    pixels = pixel_grid(camera.height, camera.width)
+    x, _ = _in_map(sources, view, camera, pixels[:1])
+    _, y = _in_map(sources, view, camera, pixels[:, :1])
+    return _read(sources.maps, view, x, y)
+
+
+def read_pixel_depths(
+    sources: GatherSources, view: jax.Array, cameras: Camera, pixels: jax.Array
+) -> Measured:
+    """Read the depth maps of views at single pixels, as `read_depths` reads them.
+
+    Args:
+      sources: depth maps.
+      view: `[N]`, which of them.
+      cameras: stacked `[N]` cameras of their photographs, at any size.
+      pixels: `[N, 2]`.
+    """
+
+    def read(view: jax.Array, camera: Camera, pixel: jax.Array) -> Measured:
+        return _read(sources.maps, view, *_in_map(sources, view, camera, pixel))
+
+    return jax.vmap(read)(view, cameras, pixels)
+
+
+def _in_map(
+    sources: GatherSources, view: jax.Array | int, camera: Camera, pixels: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Return where pixels `[..., 2]` lie in a bordered map, whose first pixel's center is 0."""
     fx, fy, cx, cy = camera.intrinsics
     gx, gy, dx, dy = sources.cameras.intrinsics[view]
-    # In the bordered map, whose first pixel's center is at -1 / 2.
-    pixels = pixel_grid(camera.height, camera.width)
-    x = (pixels[0, :, 0] - cx) / fx * gx + dx + 0.5
-    y = (pixels[:, 0, 1] - cy) / fy * gy + dy + 0.5
     height, width = sources.maps.shape[1:3]
-    x, y = jnp.clip(x, 0, width - 1.001), jnp.clip(y, 0, height - 1.001)
-    column, row = x.astype(jnp.int32)[None], y.astype(jnp.int32)[:, None]
-    maps = sources.maps[view]
-    taps = jnp.stack([maps[row + j, column + i] for j in (0, 1) for i in (0, 1)])
+    x = (pixels[..., 0] - cx) / fx * gx + dx + 0.5
+    y = (pixels[..., 1] - cy) / fy * gy + dy + 0.5
+    return jnp.clip(x, 0, width - 1.001), jnp.clip(y, 0, height - 1.001)
+
+
+def _read(maps: jax.Array, view: jax.Array | int, x: jax.Array, y: jax.Array) -> Measured:
+    """Interpolate a view's bordered map at columns `x` and rows `y`, which are broadcast."""
+    column, row = x.astype(jnp.int32), y.astype(jnp.int32)
+    # One gather: of single pixels of many views, no map is copied.
+    taps = jnp.stack([maps[view, row + j, column + i] for j in (0, 1) for i in (0, 1)])
     inverse, trust = taps[..., 0], jnp.min(taps[..., 1], axis=0)
-    wx, wy = (x - jnp.floor(x))[None], (y - jnp.floor(y))[:, None]
+    wx, wy = x - jnp.floor(x), y - jnp.floor(y)
     share = jnp.stack([(1 - wy) * (1 - wx), (1 - wy) * wx, wy * (1 - wx), wy * wx])
     mean = jnp.sum(share * inverse, axis=0)
     smooth = jnp.ptp(inverse, axis=0) < _SMOOTH * mean

@@ -65,11 +65,11 @@ def pad_images(images: Sequence[Any], height: int, width: int) -> np.ndarray:
 
 
 class Measured(NamedTuple):
-    """Depth that is known of the pixels of an image, apart from any field.
+    """Depth that is known of pixels `[B]` or `[H, W]`, apart from any field.
 
     Attributes:
-      depth: `[H, W]` z-depth in world units; 0 where it is unknown.
-      trust: `[H, W]` in [0, 1]; 0 where it is unknown.
+      depth: z-depth in world units; 0 where it is unknown.
+      trust: in [0, 1]; 0 where it is unknown.
     """
 
     depth: jax.Array
@@ -84,7 +84,7 @@ class Batch(NamedTuple):
       pixels: `[B, 2]` pixel centers, or None for the whole image.
       rgb: `[B, 3]` or `[H, W, 3]` float colors in [0, 1].
       weight: `[B]` or `[H, W]`, 0 where the color does not count.
-      measured: depth of the pixels of a whole image, where it is known; None: nowhere.
+      measured: depth of the pixels, where it is known; None: nowhere.
     """
 
     cameras: Camera

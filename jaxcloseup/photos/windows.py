@@ -15,7 +15,7 @@ from flax import struct
 
 from jaxcloseup.geometry.cameras import Camera, crop_camera, pixels_to_points
 from jaxcloseup.geometry.visibility import sample_where_visible
-from jaxcloseup.photos.depth_maps import GatherSources, read_depths
+from jaxcloseup.photos.depth_maps import GatherSources, read_depths, read_pixel_depths
 from jaxcloseup.photos.pyramids import Pyramid, photograph_pyramid
 from jaxcloseup.photos.views import Batch, Views, camera_at, to_float
 
@@ -210,14 +210,13 @@ def sample_window_pixels(key: jax.Array, windows: Windows, count: int) -> Batch:
         y, x = jnp.clip(pixel, 0, pyramid.extents[view, level] - 1).T
     first, width = pyramid.starts[view, level], pyramid.extents[view, level, 1]
     values = to_float(pyramid.at_middle(pyramid.values[first + y * width + x], view))
-    return Batch(
-        cameras=camera_at(windows.cameras, view).replace(
-            intrinsics=pyramid.intrinsics[view, level]
-        ),
-        pixels=jnp.stack([x, y], axis=-1).astype(jnp.float32) + 0.5,
-        rgb=values[..., :3],
-        weight=values[..., 3],
-    )
+    cameras = camera_at(windows.cameras, view)
+    cameras = cameras.replace(intrinsics=pyramid.intrinsics[view, level])
+    pixels = jnp.stack([x, y], axis=-1).astype(jnp.float32) + 0.5
+    depths, measured = windows.depths, None
+    if depths is not None:
+        measured = read_pixel_depths(depths, view, cameras, pixels)
+    return Batch(cameras, pixels, values[..., :3], values[..., 3], measured)
 
 
 def cut_window(

@@ -118,9 +118,14 @@ def _plain(
 ) -> Loss:
     rendering = field.render(params, buffers, batch.cameras, batch.pixels, key)
     loss, metrics = judge(field, rendering, batch.rgb, batch.weight)
-    if batch.measured is not None and field.depth_loss is not None:
-        loss += field.depth_loss(rendering, *batch.measured)
-    return loss, metrics
+    return loss + _depth_loss(field, rendering, batch), metrics
+
+
+def _depth_loss(field: RadianceField, rendering: Rendering, batch: Batch) -> jax.Array:
+    """Return what the field's loss on measured depth says, a mean over all pixels; 0 without."""
+    if batch.measured is None or field.depth_loss is None:
+        return jnp.zeros((), batch.rgb.dtype)
+    return field.depth_loss(rendering, *batch.measured)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
@@ -188,7 +193,7 @@ def _add_up(
     field: RadianceField, chunk: int, params: Any, buffers: Any, batch: Batch, key: jax.Array | None
 ) -> tuple[Loss, Any]:
     """Return the loss and its gradients, one chunk of pixels after the other."""
-    total = jnp.sum(batch.weight)
+    total, count = jnp.sum(batch.weight), batch.rgb.shape[0]
 
     def add_gradient(gradients: Any, piece: tuple[Batch, Any]) -> tuple[Any, Rendering]:
         pixels, key = piece
@@ -196,17 +201,20 @@ def _add_up(
         def share_of_loss(params: Any) -> tuple[jax.Array, Rendering]:
             rendering = field.render(params, buffers, pixels.cameras, pixels.pixels, key)
             loss, _ = field.loss(rendering, pixels.rgb, pixels.weight)
-            return loss * safe_divide(jnp.sum(pixels.weight), total), rendering
+            share = safe_divide(jnp.sum(pixels.weight), total)
+            of_depth = _depth_loss(field, rendering, pixels) * (chunk / count)
+            return loss * share + of_depth, rendering
 
         gradient, rendering = jax.grad(share_of_loss, has_aux=True)(params)
         return jax.tree.map(jnp.add, gradients, gradient), rendering
 
-    pieces, count = _split(batch, chunk), batch.rgb.shape[0]
+    pieces = _split(batch, chunk)
     keys = None if key is None else jax.random.split(key, pieces.rgb.shape[0])
     zeros = jax.tree.map(jnp.zeros_like, params)
     gradients, renderings = jax.lax.scan(add_gradient, zeros, (pieces, keys))
     rendering = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], renderings)
-    return judge(field, rendering, batch.rgb, batch.weight), gradients
+    loss, metrics = judge(field, rendering, batch.rgb, batch.weight)
+    return (loss + _depth_loss(field, rendering, batch), metrics), gradients
 
 
 _chunked.defvjp(_chunked_forward, _scale_gradients)
@@ -215,7 +223,7 @@ _chunked.defvjp(_chunked_forward, _scale_gradients)
 def _split(batch: Batch, chunk: int) -> Batch:
     """Split a batch into pieces of `chunk` pixels on a new leading axis.
 
-    Pixels of weight 0 fill up the last piece.
+    Pixels of weight 0, whose depth is not known, fill up the last piece.
     """
     count = batch.rgb.shape[0]
     fill = -count % chunk
@@ -225,4 +233,7 @@ def _split(batch: Batch, chunk: int) -> Batch:
     batch = batch._replace(cameras=cameras)
     padded = jax.tree.map(lambda x: jnp.concatenate([x, x[:1].repeat(fill, 0)]), batch)
     padded = padded._replace(weight=jnp.pad(batch.weight, (0, fill)))
+    if batch.measured is not None:
+        measured = jax.tree.map(lambda x: jnp.pad(x, (0, fill)), batch.measured)
+        padded = padded._replace(measured=measured)
     return jax.tree.map(lambda x: x.reshape(-1, chunk, *x.shape[1:]), padded)

@@ -88,6 +88,25 @@ def test_a_window_has_the_depth_of_its_photograph_at_any_size():
     assert np.all(np.asarray(batch.measured.depth)[unknown] == 0)
 
 
+def test_single_pixels_have_the_depth_of_their_photograph(key):
+    poses = [plane.camera_above(x, 0.2, 3.0, tilt=0.3 * x) for x in (-1.0, 1.0)]
+    views, depths = plane.make_views(poses)
+    shown = np.ones(depths.shape, np.float32)
+    shown[1, :10] = 0
+    known = join_maps(views.cameras, 1 / depths, jnp.asarray(shown))
+    windows = photograph_windows(views.cameras, photograph_pyramid(views), whole_share=1.0)
+    windows = dataclasses.replace(windows, depths=known)
+    batch = jax.jit(sample_window_pixels, static_argnums=2)(key, windows, 400)
+    of_second = np.asarray(batch.cameras.camtoworld == poses[1].camtoworld[None]).all((1, 2))
+    hidden = of_second & (np.asarray(batch.pixels[:, 1]) < 10.4)
+    assert 0 < hidden.sum() < of_second.sum() < 400
+    np.testing.assert_array_equal(np.asarray(batch.measured.trust) == 0, hidden)
+    rays = jax.vmap(pixels_to_rays)(batch.cameras, batch.pixels)
+    origins, directions = map(np.asarray, rays)
+    exact = np.where(hidden, 0, -origins[:, 2] / directions[:, 2])
+    np.testing.assert_allclose(batch.measured.depth, exact, rtol=1e-5)
+
+
 def test_views_of_any_size_have_windows_of_a_given_one(windows, key):
     """Windows of 13 x 17 pixels: two halvings of 48 x 64 would be smaller."""
     image = np.asarray(windows.pyramid.image(1, 0))

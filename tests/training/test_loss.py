@@ -7,7 +7,7 @@ import pytest
 
 from jaxcloseup.fields.contract import RadianceField, Rendering
 from jaxcloseup.geometry.cameras import Camera
-from jaxcloseup.photos.views import Batch
+from jaxcloseup.photos.views import Batch, Measured
 from jaxcloseup.training.loss import judge, rendered_loss
 
 
@@ -66,6 +66,32 @@ def test_chunks_change_nothing(stacked, chunk):
     )
     loss = rendered_loss(*args, None, field=FIELD, chunk=chunk)
     np.testing.assert_allclose(loss[0], whole[0][0], rtol=1e-6)
+
+
+def test_chunks_add_up_the_loss_on_measured_depth():
+    """Ten pixels in chunks of four; two have no known depth, and fill counts for nothing."""
+    params, buffers, batch = problem(False)
+    trust = jnp.array([1.0, 0.5, 0, 1, 1, 1, 0, 1, 1, 1])
+    batch = batch._replace(measured=Measured(jnp.linspace(0.5, 1.5, 10), trust))
+
+    def depth_loss(rendering, depth, trust):
+        return jnp.mean(trust * (rendering.depth - depth) ** 2)
+
+    field = FIELD._replace(depth_loss=depth_loss)
+
+    def total(params):
+        seen = _render(params, buffers, batch.cameras, batch.pixels, None)
+        error = trust * (seen.depth - batch.measured.depth) ** 2
+        return _loss(seen, batch.rgb, batch.weight)[0] + jnp.sum(error) / 10
+
+    expected = jax.jit(jax.value_and_grad(total))(params)
+    for chunk in (None, 4):
+        loss = functools.partial(rendered_loss, field=field, chunk=chunk)
+        found = jax.jit(jax.value_and_grad(loss, has_aux=True))(params, buffers, batch, None)
+        np.testing.assert_allclose(found[0][0], expected[0], rtol=1e-5)
+        jax.tree.map(
+            functools.partial(np.testing.assert_allclose, rtol=1e-5), found[1], expected[1]
+        )
 
 
 def test_every_chunk_draws_its_own_numbers():

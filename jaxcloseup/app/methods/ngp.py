@@ -2,6 +2,7 @@
 
 import dataclasses
 
+from jaxcloseup.app.methods.method import StereoTraining
 from jaxcloseup.app.methods.volumes import (
     AdamConfig,
     DepthConfig,
@@ -35,10 +36,13 @@ QUICK = quick_preset(
         distortion_weight=1e-3,
         initial_lr=1e-2,
         lr_decay_steps=2700,
+        depth_weight=0.01,
+        depth_from="stereo",
         chunk=2048,
     ),
     rays=1024,
     steps=2500,
+    stereo=StereoTraining(points=0),
 )
 
 METHOD = volumetric(

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from jaxcloseup.app.methods.method import Method, Preset, TargetConfig, WindowConfig
+from jaxcloseup.app.methods.method import Method, Preset, StereoTraining, TargetConfig, WindowConfig
 from jaxcloseup.labels.config import LabelConfig
 from jaxcloseup.lazy import lazy_function
 from jaxcloseup.setting import setting
@@ -33,9 +33,14 @@ class AdamConfig:
 
 @dataclasses.dataclass(frozen=True)
 class DepthConfig:
-    """Supervision of depth by the capture's points, for any volumetric field."""
+    """Supervision of depth, for any volumetric field."""
 
     depth_weight: float = setting(0.0, "weight of the depth loss; 0 turns it off")
+    depth_from: str = setting(
+        "points",
+        "what knows depth: the capture's points, or stereo, which matches photographs",
+        choices=("points", "stereo"),
+    )
     depth_share: float = setting(
         0.25, "rays through points in a step, as a share of its pixels", high=1
     )
@@ -74,6 +79,8 @@ def volumetric(
 QUICK_LABELS = LabelConfig(
     rgb_tolerance=0.04, depth_tolerance=0.02, leave_out_source=True, source_tolerance=0.05
 )
+# Depth by stereo is measured where a preset says so.
+_NO_STEREO = StereoTraining(pixels=0, points=0)
 # Target views learn from renders with detail instead, whose weights say how far to trust them.
 QUICK_TARGETS = TargetConfig("residual", lr_scale=3.0)
 
@@ -90,7 +97,15 @@ def paper_preset(method: str, field: Any, *, rays: int, steps: int, closeup_step
     )
 
 
-def quick_preset(method: str, field: Any, *, rays: int, steps: int, finest: int = 1) -> Preset:
+def quick_preset(
+    method: str,
+    field: Any,
+    *,
+    rays: int,
+    steps: int,
+    finest: int = 1,
+    stereo: StereoTraining = _NO_STEREO,
+) -> Preset:
     """Return a short training on reduced photographs, with windows up to `finest`."""
     return Preset(
         method=method,
@@ -103,4 +118,5 @@ def quick_preset(method: str, field: Any, *, rays: int, steps: int, finest: int 
         downscale=None,
         score_width=120,  # single rays take a minute for an image of 960 x 540
         windows=WindowConfig(finest=finest),
+        stereo=stereo,
     )

@@ -14,7 +14,11 @@ import jax
 import jax.numpy as jnp
 
 from jaxcloseup.fields.contract import RadianceField, Rendering
-from jaxcloseup.fields.volume.depth_supervision import DepthSupervision, mean_divergence
+from jaxcloseup.fields.volume.depth_supervision import (
+    DepthSupervision,
+    mean_divergence,
+    measured_divergence,
+)
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_rays
 from jaxcloseup.geometry.numerics import safe_divide, safe_norm
 
@@ -87,12 +91,14 @@ class VolumeAux(NamedTuple):
       median_depth: `[...]` z-depth at which half of the light is absorbed, 0 where it never is.
       expected_depth: `[...]` weighted sum of z-depths, not divided by alpha.
       penalty: `[...]` what the loss adds for each ray; None for fields without regularizers.
+      light: `Traced.light` of these pixels, for a loss on their measured depth; otherwise None.
     """
 
     coarse_rgb: jax.Array | None
     median_depth: jax.Array
     expected_depth: jax.Array
     penalty: jax.Array | None = None
+    light: list[tuple[jax.Array, jax.Array]] | None = None
 
 
 class Traced(NamedTuple):
@@ -129,11 +135,13 @@ def ray_field(
         rendering.
       chunk: rays traced, and in training differentiated, at once; None for all.
       loss: `photometric_loss` by default.
-      supervision: adds a loss on depth to the penalty of renderings with a key.
+      supervision: a loss on depth, for renderings with a key: a penalty, or without sightings the
+        field's `depth_loss`.
 
     Returns:
       A field whose `render` takes single pixels, also with stacked cameras.
     """
+    depth_loss = _measured_loss(supervision)
 
     def trace_pixels(
         params: Any,
@@ -154,21 +162,43 @@ def ray_field(
     def render(
         params: Any, buffers: Any, camera: Camera, pixels: Any, key: jax.Array | None
     ) -> Rendering:
-        if pixels is None:
-            pixels = pixel_grid(camera.height, camera.width)
+        pixels = pixel_grid(camera.height, camera.width) if pixels is None else pixels
         shape, pixels = pixels.shape[:-1], pixels.reshape(-1, 2)
         bound = functools.partial(trace_pixels, params, buffers)
-        rendering = bound(camera, pixels, key, lambda traced: traced.rendering)
-        if supervision is not None and key is not None:
+        lit = depth_loss is not None and key is not None
+        rendering = bound(camera, pixels, key, _with_light if lit else lambda seen: seen.rendering)
+        if supervision is not None and depth_loss is None and key is not None:
             see = functools.partial(bound, take=lambda traced: traced.light)
             key = jax.random.fold_in(key, _SUPERVISED)
             more = mean_divergence(supervision, key, len(pixels), see)
-            before = rendering.aux.penalty
-            more = jnp.broadcast_to(more, (len(pixels),)) + (0 if before is None else before)
-            rendering = rendering._replace(aux=rendering.aux._replace(penalty=more))
+            rendering = _add_penalty(rendering, more)
         return jax.tree.map(lambda x: x.reshape((*shape, *x.shape[1:])), rendering)
 
-    return RadianceField(init, render, loss or photometric_loss, gradient_chunk=chunk)
+    loss = loss or photometric_loss
+    return RadianceField(init, render, loss, gradient_chunk=chunk, depth_loss=depth_loss)
+
+
+def _measured_loss(supervision: DepthSupervision | None) -> Callable[..., jax.Array] | None:
+    """Return the field's `depth_loss` where pixels learn from their measured depth."""
+    if supervision is None or supervision.sightings is not None:
+        return None
+
+    def depth_loss(rendering: Rendering, depth: jax.Array, trust: jax.Array) -> jax.Array:
+        return supervision.weight * measured_divergence(rendering.aux.light, depth, trust)
+
+    return depth_loss
+
+
+def _add_penalty(rendering: Rendering, more: jax.Array) -> Rendering:
+    """Add a penalty `[]` to that of each pixel `[N]`."""
+    before = rendering.aux.penalty
+    more = jnp.broadcast_to(more, rendering.alpha.shape) + (0 if before is None else before)
+    return rendering._replace(aux=rendering.aux._replace(penalty=more))
+
+
+def _with_light(traced: Traced) -> Rendering:
+    aux = traced.rendering.aux._replace(light=traced.light)
+    return traced.rendering._replace(aux=aux)
 
 
 def photometric_loss(

@@ -1,11 +1,14 @@
 """Depth supervision: the divergence against quadrature, and what photographs show of points."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import plane
 import pytest
 
+from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.methods.shared.sightings import find_sightings
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.fields.volume.depth_supervision import DepthSupervision, Sightings, depth_divergence
@@ -64,18 +67,19 @@ def test_the_divergences_gradient_is_the_finite_difference():
         np.testing.assert_allclose(slope, (of_step(1e-7) - of_step(-1e-7)) / 2e-7, rtol=1e-5)
 
 
+EDGES = jnp.array([1.0, 2.0, 3.0])
+
+
+def trace(params, buffers, key, rays):
+    """See the same light, `params` in two intervals, along every ray."""
+    each = jnp.ones(rays.length.shape)
+    rendering = Rendering(each[:, None] * jnp.ones((1, 3)), each, each, VolumeAux(None, each, each))
+    light = [each[:, None] * values for values in (EDGES[None], params[None])]
+    return Traced(rendering, [tuple(light)])
+
+
 def test_a_field_adds_the_loss_of_rays_through_points_to_steps_alone():
     """Every ray sees the same light, so the mean over points drawn is known."""
-    edges = jnp.array([1.0, 2.0, 3.0])
-
-    def trace(params, buffers, key, rays):
-        each = jnp.ones(rays.length.shape)
-        rendering = Rendering(
-            each[:, None] * jnp.ones((1, 3)), each, each, VolumeAux(None, each, each)
-        )
-        light = [each[:, None] * values for values in (edges[None], params[None])]
-        return Traced(rendering, [tuple(light)])
-
     cameras = [plane.camera_above(x, 0.0, 4.0) for x in (-0.5, 0.5)]
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
     points = Sightings(
@@ -95,8 +99,36 @@ def test_a_field_adds_the_loss_of_rays_through_points_to_steps_alone():
         assert without.aux.penalty is None and silent.aux.penalty is None
         return fields[1].loss(supervised, target, weight)[0]
 
-    expected = 0.3 * by_quadrature(np.asarray(edges), np.asarray(params), 2.2, 0.1)
+    expected = 0.3 * by_quadrature(np.asarray(EDGES), np.asarray(params), 2.2, 0.1)
     np.testing.assert_allclose(losses(jax.random.key(0)), expected, rtol=1e-3)
+
+
+def test_without_points_pixels_learn_from_their_measured_depth():
+    """Of five pixels one is unknown, one half trusted; whole images keep no light."""
+    field = ray_field(
+        Extent(1.0, 3.0),
+        init=None,
+        trace=trace,
+        chunk=4,
+        supervision=DepthSupervision(None, 0.3, 0.5),
+    )
+    params, camera = jnp.array([0.25, 0.75]), plane.camera_above(0.0, 0.0, 4.0)
+    depth, trust = jnp.array([2.2, 1.5, 0.0, 2.9, 2.9]), jnp.array([1.0, 1.0, 0.0, 0.5, 1.0])
+
+    @jax.jit
+    def loss(params, key):
+        seen = field.render(params, (), camera, jnp.ones((5, 2)), key)
+        return field.depth_loss(seen, depth, trust)
+
+    diverged = [
+        by_quadrature(np.asarray(EDGES), np.asarray(params), mean, 0.005 * mean)
+        for mean in (2.2, 1.5, 2.9)
+    ]
+    expected = 0.3 * np.dot([1, 1, 1.5], diverged) / 5
+    np.testing.assert_allclose(loss(params, jax.random.key(0)), expected, rtol=1e-3)
+    slope = jax.jit(jax.grad(loss))(params, jax.random.key(0))
+    assert np.all(np.isfinite(slope))
+    assert field.render(params, (), camera, jnp.ones((5, 2)), None).aux.light is None
 
 
 def scene(points, rgb, **metadata):
@@ -143,3 +175,16 @@ def test_a_models_own_tracks_and_errors_are_taken():
 def test_a_scene_without_points_is_one_sentence():
     with pytest.raises(SceneError, match="no points that two training photographs show"):
         find_sightings(scene(np.zeros((0, 3)), np.zeros((0, 3)))[0])
+
+
+def test_what_knows_depth_follows_from_the_settings():
+    """A capture without points can be matched by stereo, but not supervised by points."""
+    empty, _ = scene(np.zeros((0, 3)), np.zeros((0, 3)))
+    quick = METHODS["ngp"].presets["quick"]
+    assert quick.field.depth_from == "stereo" and quick.stereo.pixels > 0
+    make = METHODS["ngp"].make_field
+    assert make(quick.field, empty, 1).depth_loss is not None
+    unsupervised = dataclasses.replace(quick.field, depth_weight=0.0)
+    assert make(unsupervised, empty, 1).depth_loss is None
+    with pytest.raises(SceneError, match="no points that two training photographs show"):
+        make(dataclasses.replace(quick.field, depth_from="points"), empty, 1)

@@ -26,7 +26,7 @@ def build_field(
       normalize: scale the scene to the unit cube.
 
     Raises:
-      SceneError: depth is supervised, but the scene has no points for it.
+      SceneError: depth is supervised by points, but the scene has none for it.
     """
     center, scale = unit_cube(scene) if normalize else ((0.0, 0.0, 0.0), 1.0)
     extent = Extent(scene.near, scene.far, center, scale)
@@ -36,7 +36,8 @@ def build_field(
 def _depth_supervision(config: DepthConfig, scene: Scene) -> DepthSupervision | None:
     if not config.depth_weight:
         return None
-    return DepthSupervision(find_sightings(scene), config.depth_weight, config.depth_share)
+    sightings = None if config.depth_from == "stereo" else find_sightings(scene)
+    return DepthSupervision(sightings, config.depth_weight, config.depth_share)
 
 
 def grid_adam(config: AdamConfig, scene: Scene) -> optax.GradientTransformation:
