@@ -268,9 +268,9 @@ def _scores(results: Results, stage: str) -> list[str]:
 
 
 def print_groups(name: str, results: Results) -> None:
-    """Print the gains of a scene's close-ups by how the nearest photographs look at the same."""
+    """Print gains of the close-ups of which a photograph saw a quarter, by how that looks at it."""
     stages = results["stages"]
-    views = stages["control"][CLOSEUPS]["views"]
+    views = stages.get("control", {}).get(CLOSEUPS, {}).get("views", {})
     for measure, (title, bounds) in _GROUPS.items():
         rows = []
         for low, high in itertools.pairwise(bounds):

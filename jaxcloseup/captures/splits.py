@@ -18,6 +18,7 @@ TEST_EVERY = 8
 CLOSEST_SHARE = 0.1
 WIDE = 16  # training photographs of `macro`, as many as MACRO (arXiv 2607.03875) has of a scene
 _NEARER = 2  # how many times nearer its close-ups are, or more
+_FAR = 0.9  # quantile of the world sizes of pixels; wide photographs have half of it, or more
 
 
 # Returns frames that list the points they show, and these points `[P, 3]`.
@@ -174,18 +175,20 @@ def _closest(name: str, frames: Sequence[Frame], sizes: np.ndarray, by: str) -> 
 
 
 def _macro(name: str, frames: Sequence[Frame], sizes: np.ndarray, by: str) -> Division:
-    middle = np.median(sizes[np.isfinite(sizes)])
-    wide = [i for i, size in enumerate(sizes) if middle <= size < np.inf]
+    # Of the far end, not of the middle: most photographs may be close-ups.
+    least = np.quantile(sizes[np.isfinite(sizes)], _FAR) / _NEARER
+    wide = [i for i, size in enumerate(sizes) if least < size < np.inf]
     poses = np.stack([frames[i].camtoworld for i in wide])
     train = [wide[k] for k in choose_photographs(name, poses, min(WIDE, len(wide)), "spread")]
     ratios = np.median(sizes[train]) / sizes
-    held_out = np.flatnonzero(ratios >= _NEARER).tolist()
+    others = [i for i in range(len(frames)) if i not in train]
+    held_out = [i for i in others if ratios[i] >= _NEARER]
     if not held_out:
         raise SceneError(
-            f"{name}: split macro needs photographs {_NEARER} times nearer than its wide ones, but "
-            f"the nearest is {ratios.max():.2f} times nearer: choose --split=closest."
+            f"{name}: split macro needs photographs {_NEARER} times nearer than its "
+            f"{len(train)} wide ones, and has none: choose --split=closest."
         )
-    far = [i for i in range(len(frames)) if i not in {*train, *held_out}][::TEST_EVERY]
+    far = [i for i in others if i not in held_out][::TEST_EVERY]
     note = (
         f"{name}: train is {len(train)} wide photographs that are far apart; test is the "
         f"{len(held_out)} of {len(frames)}{by} that are {_nearer(ratios[held_out])} than the "

@@ -69,8 +69,8 @@ class RadianceField(NamedTuple):
       adapt: `(key, state) -> state`, density control or occupancy refresh; identity by default.
       gradient_chunk: pixels that training differentiates at once, see `rendered_loss`; None for
         all. With chunks, every array that `render` returns is per pixel.
-      depth_loss: `(rendering, depth, trust) -> scalar` of a whole image whose depth is known, see
-        `Measured`; None for fields that learn from no depth so.
+      depth_loss: `(rendering, depth, trust) -> scalar`, a mean over all pixels, of which `Measured`
+        knows the depth of some, of a rendering with a key; None for fields that learn no depth so.
       local: for fields of which a view can change a part alone; None where it can change all.
     """
 

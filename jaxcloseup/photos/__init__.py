@@ -29,7 +29,7 @@ __all__, __getattr__, __dir__ = lazy_names(
         "gather_sums": "GatherSettings Gathered Reader gather_points",
         "support": "Support find_support count_seen",
         "proximity": "Proximity measure_proximity",
-        "depth_maps": "GatherSources gather_sources join_maps read_depths",
+        "depth_maps": "GatherSources gather_sources join_maps read_depths read_pixel_depths",
         "fusion": "DepthMaps Fused fuse fuse_grid prepare_depth_maps",
     },
 )

@@ -71,25 +71,33 @@ def test_closest_photographs_are_held_out(tmp_path):
 
 
 def test_sixteen_wide_photographs_train_for_close_ups_at_least_twice_as_near(tmp_path):
-    """The nearer half is never among them; what is neither is an ordinary view now and then."""
+    """Most photographs are close-ups; those between are ordinary views now and then."""
     pytest.importorskip("pycolmap")
-    depths = [9.0] * 40
-    depths[3], depths[17], depths[29] = 4.0, 4.5, 4.6
-    colmap_capture(tmp_path, 40, depths=depths)
+    depths = [9.0] * 20 + [1.0, 2.0] * 15 + [4.4, 4.6, 6.0]
+    colmap_capture(tmp_path, len(depths), depths=depths)
     scene = load_scene(tmp_path, split="macro")
-    assert scene.names["test"] == ["003", "017"] and len(scene.names["train"]) == 16
-    assert not {"003", "017", "029"} & set(scene.names["train"])
-    others = [f"{i:03d}" for i in range(40)]
-    others = [name for name in others if name not in scene.names["train"] + scene.names["test"]]
-    assert scene.names["test_far"] == others[::8]
-    np.testing.assert_allclose(scene.metadata["times_nearer"], [9 / 4, 2])
-    assert "the 2 of 40 that are 2.00 to 2.25 times nearer" in " ".join(scene.metadata["notes"])
+    names = [f"{i:03d}" for i in range(len(depths))]
+    assert scene.names["test"] == names[20:51]
+    assert len(scene.names["train"]) == 16
+    assert not set(scene.names["train"]) & set(scene.names["test"])
+    rest = [name for name in names if name not in scene.names["train"] + scene.names["test"]]
+    assert scene.names["test_far"] == rest[::8]
+    np.testing.assert_allclose(scene.metadata["times_nearer"], 9 / np.array(depths[20:51]))
+    assert "the 31 of 53 that are 2.05 to 9.00 times nearer" in " ".join(scene.metadata["notes"])
+
+
+def test_what_trains_is_never_scored(tmp_path):
+    """Of wide photographs at any distance, some are far nearer than the median of those chosen."""
+    pytest.importorskip("pycolmap")
+    colmap_capture(tmp_path, 41, depths=[4.0] * 21 + [16.0] * 20)
+    names = load_scene(tmp_path, split="macro").names
+    assert not set(names["train"]) & {*names["test"], *names["test_far"]}
 
 
 def test_close_ups_that_are_not_near_enough_are_refused(tmp_path):
     pytest.importorskip("pycolmap")
     colmap_capture(tmp_path, 4, depths=[9.0, 9.0, 6.0, 9.0])
-    with pytest.raises(SceneError, match=r"nearest is 1\.50 times nearer: choose --split=closest"):
+    with pytest.raises(SceneError, match="than its 4 wide ones, and has none: choose --split=clo"):
         load_scene(tmp_path, split="macro")
 
 

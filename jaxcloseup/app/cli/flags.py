@@ -84,7 +84,8 @@ with topic("The capture") as _CAPTURE:
         "photographs to hold out: given: as the capture says, and every 8th where it says nothing; "
         "listed: as it says, and none where it says nothing; every8: every 8th by name, as "
         "test_far; closest: the closest tenth, as test, and every 8th of the rest, as test_far; "
-        "macro: all but 16 wide ones: as test those at least twice as near; "
+        "macro: up to 16 wide ones train; all that are twice as near, as test, and every 8th of "
+        "the rest, as test_far; "
         "zoom: every 8th, as test_far, and unreduced parts of some others, which train reduced "
         "--zoom times more, as test",
     )

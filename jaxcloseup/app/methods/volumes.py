@@ -42,7 +42,7 @@ class DepthConfig:
         choices=("points", "stereo"),
     )
     depth_share: float = setting(
-        0.25, "rays through points in a step, as a share of its pixels", high=1
+        0.25, "rays through the capture's points in a step, as a share of its pixels", high=1
     )
 
 
@@ -79,8 +79,8 @@ def volumetric(
 QUICK_LABELS = LabelConfig(
     rgb_tolerance=0.04, depth_tolerance=0.02, leave_out_source=True, source_tolerance=0.05
 )
-# Depth by stereo is measured where a preset says so.
-_NO_STEREO = StereoTraining(pixels=0, points=0)
+# Matches nothing; `--set stereo.pixels=N` does.
+_NO_STEREO = StereoTraining(pixels=0, points=0, exposures=False)
 # Target views learn from renders with detail instead, whose weights say how far to trust them.
 QUICK_TARGETS = TargetConfig("residual", lr_scale=3.0)
 

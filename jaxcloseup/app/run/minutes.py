@@ -14,7 +14,7 @@ from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.photograph_sizes import finest_read
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.read_photographs import ReadPhotographs
-from jaxcloseup.app.run.states import initial_state, refine_state
+from jaxcloseup.app.run.states import initial_state, refine_state, with_depths
 from jaxcloseup.app.run.step_data import TrainData
 from jaxcloseup.app.run.timers import timed_compiling
 from jaxcloseup.photos.scene import Scene
@@ -90,11 +90,12 @@ def _time_steps(programs: Programs) -> _Times:
     else:
         coarse = programs.coarse
         state = initial_state(coarse, keys, stereo)
-        state, each = _steps(coarse, state, TrainData(coarse.photographs))
+        state, each = _steps(coarse, state, TrainData(with_depths(coarse, stereo)))
         _, reading = _timed(lambda: programs.pyramid(finest_read(preset, programs.scene)))
         state, refining = _timed(functools.partial(refine_state, programs, state))
         before = preset.coarse.steps * each + refining
-    return _Times(reading, before, _steps(programs, state, TrainData(programs.photographs))[1])
+    data = TrainData(with_depths(programs, stereo))
+    return _Times(reading, before, _steps(programs, state, data)[1])
 
 
 def _steps(programs: Programs, state: Any, data: TrainData) -> tuple[Any, float]:

@@ -74,7 +74,7 @@ def plan_run(preset: Preset, scene: Scene, to_run: Sequence[str]) -> dict[str, f
 
     def typical(name: str) -> float:
         if name not in steps:
-            return slower * _PART.get(name, _EVALUATION)
+            return (1 if name == "stereo" else slower) * _PART.get(name, _EVALUATION)
         images = 2 if name in ("closeup", "test_time") else 1  # of a step
         return (_STEP[name] + images * pixels * _PIXEL) * steps[name]
 

@@ -37,14 +37,16 @@ def train_baseline(training: Training, stage: str, keys: RunKeys) -> TrainState:
     """Train stage 1 on photographs alone, and before it the preset's coarse model, if any."""
     programs, preset = training.programs, training.programs.preset
     stereo = None
-    if preset.stereo is not None:
+    if preset.stereo is not None and preset.stereo.pixels:
         with timed(training.seconds, "stereo"):
             stereo = programs.stereo
+    if stereo is None and programs.method.renders_pixels and programs.field.depth_loss is not None:
+        print("depth is learned from colors alone: depth_from=stereo has no matched photographs")
     if preset.coarse is None:
         start = initial_state(programs, keys, stereo)
     else:
         start = _refine_coarse(training, stage, keys, stereo)
-    data = TrainData(_with_depths(programs, stereo))
+    data = TrainData(with_depths(programs, stereo))
     return train_stage(training, stage, start, data, steps=preset.baseline_steps)
 
 
@@ -59,14 +61,14 @@ def _refine_coarse(
         coarse,
         f"coarse_{stage}",
         initial_state(coarse.programs, keys, stereo),
-        TrainData(_with_depths(coarse.programs, stereo)),
+        TrainData(with_depths(coarse.programs, stereo)),
         steps=preset.coarse.steps,
     )
     with timed(training.seconds, f"refine_{stage}"):
         return refine_state(programs, state, None if stereo is None else stereo.sources)
 
 
-def _with_depths(programs: Programs, stereo: StereoDepths | None) -> Views | Windows:
+def with_depths(programs: Programs, stereo: StereoDepths | None) -> Views | Windows:
     """Return the programs' photographs, with stereo's depths if the field learns from them."""
     photographs = programs.photographs
     if stereo is None or programs.field.depth_loss is None:

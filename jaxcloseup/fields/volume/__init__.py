@@ -10,7 +10,9 @@ __all__, __getattr__, __dir__ = lazy_names(
         "cones": "Moments frustum_gaussians frustum_moments frustum_samples integrated_encoding",
         "config": ("HashGridConfig MipNerfConfig NerfConfig NgpConfig TensorfConfig ZipNerfConfig"),
         "coordinates": "contract contraction_scale spaced unspaced",
-        "depth_supervision": "DepthSupervision Sightings depth_divergence mean_divergence",
+        "depth_supervision": (
+            "DepthSupervision Sightings depth_divergence mean_divergence measured_divergence"
+        ),
         "encodings": "positional_encoding",
         "hash_fields": "hash_field",
         "hash_grid": "grid_rows hash_features init_hash_grid",
