@@ -3,7 +3,7 @@
 import pathlib
 import warnings
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -20,6 +20,7 @@ WIDE = 16  # training photographs of `macro`, as many as MACRO (arXiv 2607.03875
 _NEARER = 2  # how many times nearer its close-ups are, or more
 _FAR = 0.9  # quantile of the world sizes of pixels; wide photographs have half of it, or more
 
+_Member = TypeVar("_Member")  # a photograph, or its number
 
 # Returns frames that list the points they show, and these points `[P, 3]`.
 FindPoints = Callable[[Sequence[Frame]], tuple[list[Frame], np.ndarray]]
@@ -126,12 +127,12 @@ def _some(names: Sequence[str]) -> str:
     return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
 
 
-def _every_eighth(frames: Sequence[Frame]) -> dict[str, list[Frame]]:
-    if len(frames) == 1:
-        return {"train": list(frames)}
+def _every_eighth(members: Sequence[_Member]) -> dict[str, list[_Member]]:
+    if len(members) == 1:
+        return {"train": list(members)}
     return {
-        "train": [frame for i, frame in enumerate(frames) if i % TEST_EVERY],
-        "test_far": [frame for i, frame in enumerate(frames) if i % TEST_EVERY == 0],
+        "train": [member for i, member in enumerate(members) if i % TEST_EVERY],
+        "test_far": [member for i, member in enumerate(members) if i % TEST_EVERY == 0],
     }
 
 
@@ -163,8 +164,8 @@ def _closest(name: str, frames: Sequence[Frame], sizes: np.ndarray, by: str) -> 
     nearest = np.argsort(sizes, kind="stable")[: max(1, round(CLOSEST_SHARE * len(frames)))]
     held_out = sorted(nearest.tolist())
     rest = [i for i in range(len(frames)) if i not in held_out]
-    far = rest[::TEST_EVERY] if len(rest) > 1 else []
-    train = [i for i in rest if i not in far]
+    parts = _every_eighth(rest)
+    train, far = parts["train"], parts.get("test_far", [])
     ratios = np.median(sizes[train]) / sizes[held_out]
     note = (
         f"{name}: test is the {len(held_out)} nearest of {len(frames)} photographs{by}, "
@@ -175,7 +176,7 @@ def _closest(name: str, frames: Sequence[Frame], sizes: np.ndarray, by: str) -> 
 
 
 def _macro(name: str, frames: Sequence[Frame], sizes: np.ndarray, by: str) -> Division:
-    # Of the far end, not of the middle: most photographs may be close-ups.
+    # The far end says what is wide, because most photographs may be close-ups.
     least = np.quantile(sizes[np.isfinite(sizes)], _FAR) / _NEARER
     wide = [i for i, size in enumerate(sizes) if least < size < np.inf]
     poses = np.stack([frames[i].camtoworld for i in wide])
