@@ -12,6 +12,7 @@ from tiny_runs import TINY, programs_of
 
 from experiments.studies import (
     default_runs,
+    detail_teachers,
     few_photographs,
     interruptions,
     methods_table,
@@ -207,3 +208,42 @@ def test_a_piece_ends_before_a_part_that_would_not_fit():
     clock.restart()
     assert not clock.is_over()  # a part took 40 s, and 130 are left
     assert clock.is_over()  # a part took 90 s, and 40 are left
+
+
+def test_views_that_detail_harms_are_counted(tmp_path, capsys):
+    folder = tmp_path / "some" / "run"
+    folder.mkdir(parents=True)
+    stages = {
+        stage: {
+            split: {"views": {name: {"cc_psnr": value} for name, value in views.items()}}
+            for split, views in (("test", close), ("test_far", far))
+        }
+        for stage, close, far in (
+            ("baseline", {"a": 20.0, "b": 21.0}, {"c": 30.0, "d": 30.0}),
+            ("detail", {"a": 20.5, "b": 20.75}, {"c": 29.95, "d": 31.0}),
+        )
+    }
+    (folder / "results.json").write_text(json.dumps({"stages": stages}))
+    detail_teachers.print_harm([folder])
+    out = capsys.readouterr().out
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in out.splitlines()]
+    assert ["some/run", "test", "2", "+0.12", "-0.25", "b -0.25"] in rows
+    assert ["some/run", "test_far", "2", "+0.47", "-0.05", ""] in rows
+    assert "1 of 4 views lose more than 0.1 dB: 25.0%" in out
+
+
+def test_training_poses_alone_are_turned_by_half_a_pixel():
+    count, focal = 300, 800.0
+    frames = [
+        {"file_path": f"{i}.png", "fl_x": focal, "transform_matrix": np.eye(4).tolist()}
+        for i in range(2 * count)
+    ]
+    training = [frame["file_path"] for frame in frames[:count]]
+    listed = {"frames": frames, "train_filenames": training}
+    turned = detail_teachers.turn_training_poses(listed, np.random.default_rng(1))["frames"]
+    poses = np.array([frame["transform_matrix"] for frame in turned])
+    assert (poses[count:] == np.eye(4)).all()
+    ahead = poses[:count, :3, 2]  # where the axis of view goes
+    moved = focal * ahead[:, :2] / ahead[:, 2:]  # pixels by which the middle of the image moves
+    np.testing.assert_allclose(moved.std(axis=0), detail_teachers.NOISE, rtol=0.1)
+    np.testing.assert_allclose(np.linalg.det(poses[:count, :3, :3]), 1)

@@ -1,11 +1,11 @@
 """Learn how far to trust the detail of photographs, from the true close-ups of runs.
 
-The suite reads the stage `baseline` of every run in `outputs/teach`, of two scenes or more, and
-writes `outputs/teach/detail_weights.npz`, as the package's `jaxcloseup/detail/weights.npz` was
-made. It compares the detail of photographs in each held-out view with the truth. Small networks,
-each without one scene, learn how much detail to add and the error that remains. Each is tested on
-its scene: the suite prints the PSNR of held-out views before and after, and the ratio of actual to
-expected error for every tenth of the pixels.
+The suite reads the stage `baseline` of every run in `outputs/teach/KIND`, of two scenes or more
+(`experiments.studies.detail_teachers` makes them), and writes `outputs/teach/detail_weights.npz`,
+as the package's `jaxcloseup/detail/weights.npz` was made. It compares the detail of photographs in
+each held-out view with the truth. Small networks, each without one scene, learn how much detail to
+add and the error that remains. Each is tested on its scene: the suite prints the PSNR of held-out
+views before and after, and the ratio of actual to expected error for every tenth of the pixels.
 """
 
 import pathlib
@@ -39,7 +39,7 @@ FOLDER, STAGE = pathlib.Path("outputs/teach"), "baseline"
 def run(folder: pathlib.Path = FOLDER) -> None:
     """Learn from the runs in a folder, write the weights, and print their scores."""
     scenes: dict[str, list[Evidence]] = {}
-    for path in sorted(folder.glob("*/manifest.json")):
+    for path in sorted(folder.glob("*/*/manifest.json")):
         name, found = run_evidence(path.parent)
         scenes.setdefault(name, []).extend(found)
     if len(scenes) < 2:
@@ -70,7 +70,8 @@ def run_evidence(folder: pathlib.Path) -> tuple[str, list[Evidence]]:
         told = make_evidence(found, own, to_float(jnp.asarray(photograph.weight)))
         return sample_evidence(told, PIXELS // count, seed=index)
 
-    kinds = _held_out(scene)
+    finer = _FINER if programs.method.splats else _FINER[:1]  # rays of whole images take minutes
+    kinds = _held_out(scene, finer)
     return scene.name, [
         evidence(photograph, len(views), i) for views in kinds for i, photograph in enumerate(views)
     ]
@@ -79,12 +80,12 @@ def run_evidence(folder: pathlib.Path) -> tuple[str, list[Evidence]]:
 _FINER = 4, 1  # divisors of the photographs' size of the finer views among those that teach
 
 
-def _held_out(scene: Scene) -> Iterator[Sequence[Photograph]]:
+def _held_out(scene: Scene, finer: Sequence[int]) -> Iterator[Sequence[Photograph]]:
     for split in ("test", "test_far"):
         if getattr(scene, split) is not None:
             yield unpadded(getattr(scene, split), scene.sizes(split))
             if scene.photographs_at:
-                yield from (scene.photographs_at(divisor, split) for divisor in _FINER)
+                yield from (scene.photographs_at(divisor, split) for divisor in finer)
 
 
 def _describe(weights: DetailWeights, views: Sequence[Evidence]) -> str:

@@ -32,7 +32,7 @@ def test_runs_of_two_scenes_teach_a_network_each(kept, tmp_path, monkeypatch, ca
     quickly = functools.partial(learn_weights, steps=(20, 20))
     monkeypatch.setattr(teach, "learn_weights", quickly)
     for name in ("a", "b"):
-        shutil.copytree(kept, tmp_path / name)
+        shutil.copytree(kept, tmp_path / "all" / name)
     with jax.numpy_dtype_promotion("standard"):
         teach.run(tmp_path)
     out = capsys.readouterr().out
@@ -50,7 +50,7 @@ def test_runs_of_two_scenes_teach_a_network_each(kept, tmp_path, monkeypatch, ca
 
 def test_one_scene_has_no_test(kept, tmp_path, monkeypatch):
     monkeypatch.setattr(teach, "STAGE", "closeup")
-    shutil.copytree(kept, tmp_path / "a")
+    shutil.copytree(kept, tmp_path / "all" / "a")
     with (
         pytest.raises(SystemExit, match="must hold runs of two scenes or more"),
         jax.numpy_dtype_promotion("standard"),
