@@ -30,19 +30,23 @@ _ACROSS = 20  # width in pixels of the small image whose enlargement blurs the r
 def find_empty(
     camera: Camera, pixels: jax.Array, sources: GatherSources, wanted: jax.Array | None = None
 ) -> jax.Array:
-    """Return the pixels `[H, W]` whose rays pass a place behind which photographs see nothing.
+    """Return how surely rays pass a place behind which photographs see nothing, `[H, W]` in [0, 1].
 
-    Dark surfaces may be learned as transparent, so these pixels may truly be black.
+    Dark surfaces may be learned as transparent, so these pixels may truly be black. Some rays
+    across the image are tried, and one alone among others is not empty: photographs may err.
 
     Args:
       camera: camera of the view.
       pixels: `[H, W, 2]` its pixel centers, neighbors in the image.
       sources: depth maps of the photographs; an inverse depth of 0 means that nothing was seen.
-      wanted: `[H, W]` bool, where the answer is needed; elsewhere it may be False. None is
-        everywhere.
+      wanted: `[H, W]` bool, where the answer is needed; elsewhere it may be 0. None is everywhere.
     """
     (height, width), step = pixels.shape[:2], max(1, round(pixels.shape[1] / _RAYS))
-    pixels = pixels[::step, ::step]
+    middles = [
+        np.minimum(np.arange(step // 2, size + step // 2, step), size - 1)
+        for size in (height, width)
+    ]
+    pixels = pixels[middles[0]][:, middles[1]]
     rows, columns = pixels.shape[:2]
     if wanted is None:
         wanted = jnp.ones((rows, columns), bool)
@@ -62,7 +66,11 @@ def find_empty(
         )
 
     empty = jax.lax.map(find, (pixels, wanted)).reshape(-1, columns)[:rows]
-    return jnp.repeat(jnp.repeat(empty, step, axis=0), step, axis=1)[:height, :width]
+    padded = jnp.pad(empty.astype(jnp.float32), 1, mode="edge")
+    around = jax.lax.reduce_window(padded, 0.0, jax.lax.add, (3, 3), (1, 1), "valid") / 9
+    sure = jnp.clip(3 * around - 1, 0, 1)  # 1 from the side of a straight border that is empty
+    large = jax.image.resize(sure, (rows * step, columns * step), "linear")
+    return large[:height, :width]
 
 
 def _pass_emptiness(camera: Camera, pixels: jax.Array, sources: GatherSources) -> jax.Array:
@@ -106,17 +114,18 @@ def fill_holes(rgb: jax.Array, alpha: jax.Array, seen: jax.Array, empty: jax.Arr
       rgb: `[H, W, 3]` colors over black.
       alpha: `[H, W]` opacity.
       seen: `[H, W]` whether a photograph saw the surface.
-      empty: `[H, W]` from `find_empty`.
+      empty: `[H, W]` in [0, 1] from `find_empty`.
     """
-    hole, (height, width) = ~seen & ~empty, seen.shape
+    height, width = seen.shape
+    hole = jnp.where(seen, 0, 1 - empty)
     few = max(1, round(_ACROSS * height / width)), _ACROSS
-    near = jax.image.resize(hole.astype(rgb.dtype), few, "linear")
+    near = jax.image.resize(hole, few, "linear")
     near = jnp.clip(2 * jax.image.resize(near, hole.shape, "linear"), 0, 1)
-    missing = near * (1 - jnp.clip(alpha / OPAQUE, 0, 1))
-    opacity = jnp.where(empty, 1, jnp.maximum(alpha, _FAINT))
+    missing = near * (1 - empty) * (1 - jnp.clip(alpha / OPAQUE, 0, 1))
+    opacity = empty + (1 - empty) * jnp.maximum(alpha, _FAINT)
     colors = jnp.clip(rgb / opacity[..., None], 0, 1)
     alpha = jnp.clip(alpha, 0, 1)
-    weight = jnp.where(hole, jnp.sqrt(alpha), jnp.where(seen, alpha, 1))
+    weight = jnp.where(seen, alpha, empty**4 + hole * jnp.sqrt(alpha))
     planes = jnp.concatenate([jnp.moveaxis(colors, -1, 0), weight[None]])
     around = jnp.moveaxis(_spread(planes), 0, -1)
     return jnp.clip(rgb + missing[..., None] * around, 0, 1)

@@ -73,7 +73,7 @@ def test_a_hole_in_one_color_has_that_color():
     alpha, seen = fading()
     color = jnp.array([0.2, 0.5, 0.8])
     rgb = alpha[..., None] * color[None, None]
-    filled = fill_holes(rgb, alpha, seen, jnp.zeros_like(seen))
+    filled = fill_holes(rgb, alpha, seen, jnp.zeros(seen.shape))
     hole = ~np.asarray(seen)
     np.testing.assert_allclose(filled[hole], np.tile(color, (hole.sum(), 1)), atol=0.06)
     clear = np.asarray(alpha) < 0.05
@@ -86,17 +86,31 @@ def test_colors_spread_from_the_nearest_pixels():
     seen = alpha > 0
     rgb = jnp.where(jnp.arange(WIDTH)[None, :, None] < 20, 1.0, 0.0) * alpha[..., None]
     rgb = jnp.broadcast_to(rgb, (HEIGHT, WIDTH, 3))
-    row = np.asarray(fill_holes(rgb, alpha, seen, jnp.zeros_like(seen)))[HEIGHT // 2, :, 0]
+    row = np.asarray(fill_holes(rgb, alpha, seen, jnp.zeros(seen.shape)))[HEIGHT // 2, :, 0]
     assert row[16] > 0.8 and row[23] < 0.2 and np.all(np.diff(row[14:26]) <= 1e-6)
 
 
 def test_emptiness_stays_black():
     alpha, seen = fading()
     rgb = 0.5 * jnp.repeat(alpha[..., None], 3, axis=-1)
-    np.testing.assert_array_equal(fill_holes(rgb, alpha, seen, ~seen), rgb)
+    np.testing.assert_array_equal(fill_holes(rgb, alpha, seen, jnp.where(seen, 0.0, 1.0)), rgb)
 
 
 def test_an_image_without_anything_stays_black():
     nothing = jnp.zeros((HEIGHT, WIDTH))
-    filled = fill_holes(jnp.zeros((HEIGHT, WIDTH, 3)), nothing, nothing > 0, nothing > 0)
+    filled = fill_holes(jnp.zeros((HEIGHT, WIDTH, 3)), nothing, nothing > 0, nothing)
     np.testing.assert_array_equal(filled, np.zeros((HEIGHT, WIDTH, 3)))
+
+
+def test_a_single_ray_among_others_is_not_empty():
+    depth = np.full((HEIGHT, WIDTH), 2.0)
+    depth[12, 20] = 0  # two photographs saw nothing there, by mistake
+    assert not find_empty(camera(), pixel_grid(HEIGHT, WIDTH), photographs(2, depth)).any()
+
+
+def test_half_empty_pixels_are_half_filled():
+    alpha, seen = fading()
+    rgb = 0.5 * jnp.repeat(alpha[..., None], 3, axis=-1)
+    unsure = [fill_holes(rgb, alpha, seen, jnp.where(seen, 0.0, e)) for e in (0.0, 0.5, 1.0)]
+    full, half, none = (np.asarray(image)[:, -1].mean() for image in unsure)
+    assert full > 0.45 and none == 0 and 0.1 < half < full - 0.1
