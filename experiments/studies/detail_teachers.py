@@ -41,8 +41,8 @@ _NGP = ("--method=ngp",)
 KINDS: dict[str, tuple[Sequence[str], Sequence[str]]] = {
     "all": ((), SCENES),
     "10": (("--photographs=10", "--choose=spread"), SCENES),
-    "6": (("--photographs=6", "--choose=spread"), ("bench", "counter", "stairs")),
-    "noise": ((), ("counter", "room", "table")),
+    "6": (("--photographs=6", "--choose=spread"), ("counter", "stairs")),
+    "noise": ((), ("room", "table")),
     "ngp_10": ((*_NGP, "--photographs=10", "--choose=spread"), ("room", "table")),
     "ngp_10_colors": (
         (*_NGP, "--photographs=10", "--choose=spread", "--set=depth_weight=0"),

@@ -232,6 +232,7 @@ def find_candidates(
       alpha: `[H, W]` rendered opacity.
       depth: `[H, W]` rendered z-depth; 0 is undefined.
     """
+    depth = _smooth(detail.grain, camera, depth)
     gathered = gather_parts(camera, pixels, depth, detail.sources, detail.shown, SETTINGS)
     return _candidates(detail.finer, gathered, rgb, alpha, depth)
 

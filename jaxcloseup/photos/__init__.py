@@ -11,7 +11,7 @@ __all__, __getattr__, __dir__ = lazy_names(
         ),
         "scene": (
             "SceneError SceneWarning UnknownKeyWarning ImageSizeWarning NearFarWarning "
-            "DuplicateFileWarning PointsWarning Surface Scene keep_photographs"
+            "DuplicateFileWarning PointsWarning Surface Scene keep_photographs move_photographs"
         ),
         "pyramids": "Pyramid scene_pyramid photograph_pyramid fractional_level read_pyramid",
         "windows": (
@@ -27,6 +27,7 @@ __all__, __getattr__, __dir__ = lazy_names(
         "stated_exposures": "StatedExposure fit_cameras gains_of_files",
         "gather": "gather_parts",
         "gather_sums": "GatherSettings Gathered Reader gather_points",
+        "alignment": "estimate_motion halves_agree move_camera shift_between",
         "support": "Support find_support count_seen",
         "proximity": "Proximity measure_proximity",
         "depth_maps": "GatherSources gather_sources join_maps read_depths read_pixel_depths",

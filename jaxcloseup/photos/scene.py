@@ -167,3 +167,24 @@ def keep_photographs(scene: Scene, chosen: Sequence[int]) -> Scene:
         names=scene.names | {"train": [scene.names["train"][i] for i in chosen]},
         photographs_at=scene.photographs_at and photographs_at,
     )
+
+
+def move_photographs(scene: Scene, camtoworld: jax.Array) -> Scene:
+    """Return the scene with other poses `[V, 3, 4]` of its training photographs."""
+
+    def photographs_at(factor: int, split: str = "train") -> list[Photograph]:
+        assert scene.photographs_at is not None
+        found = scene.photographs_at(factor, split)
+        if split != "train":
+            return found
+        return [
+            photograph._replace(camera=photograph.camera.replace(camtoworld=pose))
+            for photograph, pose in zip(found, camtoworld, strict=True)
+        ]
+
+    cameras = scene.train.cameras.replace(camtoworld=camtoworld)
+    return dataclasses.replace(
+        scene,
+        train=scene.train.replace(cameras=cameras),
+        photographs_at=scene.photographs_at and photographs_at,
+    )

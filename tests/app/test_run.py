@@ -102,7 +102,8 @@ def test_a_run_leaves_what_it_takes_to_render_it(finished, capture_folder):
 
 def test_surfels_run_through_all_stages_from_random_points(capture_folder, tmp_path, capsys):
     """A coarse model becomes finer, and learns from windows of photographs twice as large."""
-    coarse = CoarseConfig(dataclasses.replace(TINY_SURFELS.field, capacity=500), steps=20)
+    field = dataclasses.replace(TINY_SURFELS.field, capacity=500)
+    coarse = CoarseConfig(field, steps=20, poses=True)
     steps = {"downscale": 2, "coarse": coarse, "windows": WindowConfig()}
     steps["targets"] = TargetConfig("residual", lr_scale=2.0)
     fine = dataclasses.replace(TINY_SURFELS.field, capacity=800, selective_adam=True)
@@ -120,6 +121,8 @@ def test_surfels_run_through_all_stages_from_random_points(capture_folder, tmp_p
     assert parts == sorted(parts, key=lambda part: part[0]) and len(set(parts)) > 8
     assert "\n[1/" in said and "compiling the steps" in said and "writing the report" in said
     assert results["history"]["coarse_baseline"][-1]["step"] == 20
+    poses = json.loads((tmp_path / "poses.json").read_text())["camtoworld"]
+    assert list(poses) == scene.names["train"] and np.shape(list(poses.values())) == (5, 3, 4)
     assert json.loads((tmp_path / "results.json").read_text()) == results
     stages = results["stages"]
     use_labels = results["gate"]["weight"] > 0

@@ -57,6 +57,9 @@ class CoarseConfig:
 
     field: Any = setting(help="configuration of the field during this training")
     steps: int = setting(help="number of steps", low=1)
+    poses: bool = setting(
+        False, "move the cameras of a capture's photographs to where the result of it fits them"
+    )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -125,7 +125,7 @@ QUICK = dataclasses.replace(
         density=McmcConfig(start=0, stop=700, growth=1.0, noise=0.0),
         raster=RasterizeConfig(capacity=2**17, antialias=True),
     ),
-    coarse=CoarseConfig(field=_COARSE, steps=1500),
+    coarse=CoarseConfig(field=_COARSE, steps=1500, poses=True),
     windows=WindowConfig(whole_share=0.03),
     stereo=StereoTraining(),
     targets=TargetConfig("residual", label_loss_weight=0.7, lr_scale=10.0, control_lr_scale=2.0),
@@ -149,6 +149,7 @@ STANDARD = dataclasses.replace(
             raster=dataclasses.replace(_COARSE.raster, capacity=2**17, block=128),
         ),
         steps=1500,
+        poses=True,
     ),
     step_pixels=4 * QUICK.step_pixels,
 )

@@ -19,6 +19,7 @@ _STEP = {
 _PIXEL = 6e-7  # seconds that each pixel adds to a step that renders whole photographs
 _PART = {
     "stereo": 20,
+    "poses": 5,
     "refine_baseline": 9,
     "depths": 27,
     "gate": 3,
@@ -35,6 +36,7 @@ _EVALUATION = 7  # seconds of any other
 _RAYS = 8  # times as long for images of a field that renders single rays
 _WORDS = {
     "stereo": "matching photographs",
+    "poses": "moving cameras to where their photographs fit",
     "depths": "rendering depths of the photographs, and what is scored",
     "gate": "comparing labels with left-out photographs",
     "audit": "comparing labels with the truth",
@@ -49,9 +51,10 @@ def plan_run(preset: Preset, scene: Scene, to_run: Sequence[str]) -> dict[str, f
     method = METHODS[preset.method]
     steps = {"baseline": preset.baseline_steps}
     parts = ["stereo"] if preset.stereo is not None and preset.stereo.pixels else []
-    parts += ["coarse_baseline", "refine_baseline"] if preset.coarse is not None else []
     if preset.coarse is not None:
         steps["coarse_baseline"] = preset.coarse.steps
+        moves = preset.coarse.poses and scene.surface is None
+        parts += ["coarse_baseline", *["poses"] * moves, "refine_baseline"]
     parts += ["baseline", "depths", "baseline_evaluation", "gate"]
     for stage in ("control", "closeup"):
         steps[stage] = preset.closeup_steps

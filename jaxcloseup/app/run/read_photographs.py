@@ -68,6 +68,14 @@ class ReadPhotographs:
         """Take exposures that were measured before, such as those of a stored run."""
         self._exposures = dict.fromkeys((False, True), exposures)
 
+    def moved(self, scene: Scene) -> "ReadPhotographs":
+        """Return the same for a scene whose training photographs have other poses."""
+        moved = ReadPhotographs(scene)
+        moved._pyramids, moved._exposures = self._pyramids, self._exposures
+        for pixels, found in self._matched.items():
+            moved._matched[pixels] = found and found.moved(scene.train.cameras)
+        return moved
+
     def _match(self, preset: Preset, config: StereoTraining) -> StereoDepths | None:
         if not can_match(self._scene):
             return None

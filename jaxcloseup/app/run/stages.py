@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcloseup.app.run.corrected_poses import correct_poses, corrects_poses, write_poses
 from jaxcloseup.app.run.exposed import expose, render_exposed
 from jaxcloseup.app.run.fine_tuning import prepare_target_views
 from jaxcloseup.app.run.gate import gated, uses_labels, weigh
@@ -20,7 +21,7 @@ from jaxcloseup.app.run.measured_exposures import write_exposures
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.scoring import HeldOut, Scorer, hold_out
 from jaxcloseup.app.run.stage_names import STAGES
-from jaxcloseup.app.run.states import say_which_points_fit, train_baseline
+from jaxcloseup.app.run.states import say_which_points_fit, train_baseline, train_coarse
 from jaxcloseup.app.run.step_data import CloseupData, LabeledData, StepData, TrainData
 from jaxcloseup.app.run.timers import forget_compiled, timed
 from jaxcloseup.app.score.audit import audit_labels, left_out_curve
@@ -143,9 +144,14 @@ def train_baseline_stage(
     training: Training, keys: RunKeys, output_dir: pathlib.Path, perceptual: Perceptual
 ) -> Run:
     """Train and score `baseline`, and prepare what the other stages share."""
-    programs, labels = training.programs, training.programs.preset.labels
+    programs, labels, coarse = training.programs, training.programs.preset.labels, None
     say_which_points_fit(programs)
-    state = train_baseline(training, "baseline", keys)
+    if corrects_poses(programs):
+        coarse = train_coarse(training, "baseline", keys)
+        with timed(training.seconds, "poses"):
+            training.programs = programs = correct_poses(programs, coarse)
+        write_poses(output_dir, programs.scene.train.cameras, programs.scene.names["train"])
+    state = train_baseline(training, "baseline", keys, coarse)
     with timed(training.seconds, "depths"):
         start = start_labels(programs, state, keys, expected_depth=labels.expected_depth)
         held_out = hold_out(programs, start)

@@ -33,39 +33,47 @@ FEWEST_POINTS = 100  # a capture with fewer gets random points too
 _init_state = jax.jit(init_state, static_argnames=("field", "optimizer"))
 
 
-def train_baseline(training: Training, stage: str, keys: RunKeys) -> TrainState:
-    """Train stage 1 on photographs alone, and before it the preset's coarse model, if any."""
+def train_baseline(
+    training: Training, stage: str, keys: RunKeys, coarse: TrainState | None = None
+) -> TrainState:
+    """Train stage 1 on photographs alone, from `coarse` or from what it trains before."""
     programs, preset = training.programs, training.programs.preset
-    stereo = None
-    if preset.stereo is not None and preset.stereo.pixels:
-        with timed(training.seconds, "stereo"):
-            stereo = programs.stereo
+    stereo = _match(training)
     if stereo is None and programs.method.renders_pixels and programs.field.depth_loss is not None:
         print("depth is learned from colors alone: depth_from=stereo has no matched photographs")
     if preset.coarse is None:
         start = initial_state(programs, keys, stereo)
     else:
-        start = _refine_coarse(training, stage, keys, stereo)
+        coarse = train_coarse(training, stage, keys) if coarse is None else coarse
+        with timed(training.seconds, f"refine_{stage}"):
+            start = refine_state(programs, coarse, None if stereo is None else stereo.sources)
     data = TrainData(with_depths(programs, stereo))
     return train_stage(training, stage, start, data, steps=preset.baseline_steps)
 
 
-def _refine_coarse(
-    training: Training, stage: str, keys: RunKeys, stereo: StereoDepths | None
-) -> TrainState:
-    """Train `preset.coarse`, and give its state the room and the detail of the preset itself."""
-    programs, preset = training.programs, training.programs.preset
+def train_coarse(training: Training, stage: str, keys: RunKeys) -> TrainState:
+    """Train `preset.coarse`, from which `stage` begins."""
+    programs, preset, stereo = training.programs, training.programs.preset, _match(training)
     assert preset.coarse is not None
     coarse = dataclasses.replace(training, programs=programs.coarse)
-    state: Any = train_stage(
+    return train_stage(
         coarse,
         f"coarse_{stage}",
         initial_state(coarse.programs, keys, stereo),
         TrainData(with_depths(coarse.programs, stereo)),
         steps=preset.coarse.steps,
     )
-    with timed(training.seconds, f"refine_{stage}"):
-        return refine_state(programs, state, None if stereo is None else stereo.sources)
+
+
+def _match(training: Training) -> StereoDepths | None:
+    """Return depth by stereo, if the preset begins with it; the first call takes its time."""
+    stereo = training.programs.preset.stereo
+    if stereo is None or not stereo.pixels:
+        return None
+    if "stereo" in training.seconds:
+        return training.programs.stereo
+    with timed(training.seconds, "stereo"):
+        return training.programs.stereo
 
 
 def with_depths(programs: Programs, stereo: StereoDepths | None) -> Views | Windows:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxcloseup.app.methods.method import Preset
 from jaxcloseup.app.methods.settings import with_settings
 from jaxcloseup.app.run import manifest
+from jaxcloseup.app.run.corrected_poses import read_poses
 from jaxcloseup.app.run.loop import TrainingError
 from jaxcloseup.app.run.measured_exposures import read_exposures
 from jaxcloseup.app.run.programs import Programs
@@ -21,7 +22,7 @@ from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.captures.load import DRAWN_SCENES, load_scene
 from jaxcloseup.io.files import read_object
 from jaxcloseup.io.messages import printable
-from jaxcloseup.photos.scene import Scene
+from jaxcloseup.photos.scene import Scene, move_photographs
 from jaxcloseup.training.state import TrainState
 
 
@@ -155,7 +156,11 @@ def load_run_scene(run: StoredRun, moved_to: str | None = None) -> Scene:
             f"{name} does not hold the photographs or cameras that {run.folder} was trained on.",
             stacklevel=2,
         )
-    return scene
+    try:
+        poses = read_poses(run.folder, scene.names["train"])
+    except (OSError, ValueError) as error:
+        raise RunError(f"--run={run.folder}: {error}") from None
+    return scene if poses is None else move_photographs(scene, poses)
 
 
 def restore(run: StoredRun, scene: Scene, stage: str) -> tuple[Programs, TrainState]:
