@@ -81,12 +81,13 @@ def main(_: list[str]) -> None:
 def noisy_capture(name: str, root: pathlib.Path) -> pathlib.Path:
     """Write a drawn scene as a capture whose training poses are inexact; return its folder."""
     folder = root / name
-    if (folder / "noise.json").exists():
+    about = folder / "noise.json"
+    if about.exists() and read_object(about) == {"pixels": NOISE}:
         return folder
     export_cameras(folder, load_scene(name))
     path = folder / "transforms.json"
     write_json(path, turn_training_poses(read_object(path), np.random.default_rng(0)))
-    write_json(folder / "noise.json", {"pixels": NOISE})
+    write_json(about, {"pixels": NOISE})
     return folder
 
 

@@ -29,7 +29,7 @@ from jaxcloseup.io.files import read_object
 FLAGS = flags.FLAGS
 _SETTINGS = pathlib.Path("run", "checkpoints", "run.json")
 _MADE = ("closeups/*", "dolly.*", "share/**/*", "capture/sparse/**/*", "capture/images/*")
-_MADE += ("run/results.json", "run/exposures.json", "run/splats/*")
+_MADE += ("run/results.json", "run/exposures.json", "run/poses.json", "run/splats/*")
 _TIMES = ("time", "seconds", "minutes", "compil", "memory")  # in names of what is never the same
 
 

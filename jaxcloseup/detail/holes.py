@@ -18,7 +18,7 @@ from jaxcloseup.photos.depth_maps import GatherSources
 
 
 OPAQUE = 0.9  # opacity from which a render counts as opaque
-_PHOTOGRAPHS = 2  # photographs that must see through a place that counts as empty; one may err
+_PHOTOGRAPHS = 2  # photographs that see through a place that is surely empty; one may err
 _DEPTHS = 16  # places that are tried on a ray,
 _REACH = 3.0  # from 2**-3 to 2**3 times the typical depth of the photographs
 _RAYS = 120  # rays that are tried across an image
@@ -53,6 +53,8 @@ def find_empty(
     else:
         wanted = jnp.pad(wanted, ((0, -height % step), (0, -width % step)))
         wanted = wanted.reshape(rows, step, columns, step).any((1, 3))
+        # Neighbors count too, below.
+        wanted = jax.lax.reduce_window(wanted, False, jax.lax.bitwise_or, (5, 5), (1, 1), "same")
     pad = ((0, -rows % _BAND), (0, 0))
     pixels = jnp.pad(pixels, (*pad, (0, 0)), mode="edge").reshape(-1, _BAND * columns, 2)
     wanted = jnp.pad(wanted, pad).reshape(-1, _BAND * columns)
@@ -62,11 +64,11 @@ def find_empty(
         return jax.lax.cond(
             jnp.any(wanted),
             lambda: _pass_emptiness(camera, pixels, sources),
-            lambda: jnp.zeros(wanted.shape, bool),
+            lambda: jnp.zeros(wanted.shape, jnp.float32),
         )
 
     empty = jax.lax.map(find, (pixels, wanted)).reshape(-1, columns)[:rows]
-    padded = jnp.pad(empty.astype(jnp.float32), 1, mode="edge")
+    padded = jnp.pad(empty, 1, mode="edge")
     around = jax.lax.reduce_window(padded, 0.0, jax.lax.add, (3, 3), (1, 1), "valid") / 9
     sure = jnp.clip(3 * around - 1, 0, 1)  # 1 from the side of a straight border that is empty
     large = jax.image.resize(sure, (rows * step, columns * step), "linear")
@@ -74,7 +76,7 @@ def find_empty(
 
 
 def _pass_emptiness(camera: Camera, pixels: jax.Array, sources: GatherSources) -> jax.Array:
-    """Return whether rays of pixels `[N, 2]` pass an empty place, `[N]` bool."""
+    """Return how surely rays of pixels `[N, 2]` pass an empty place, `[N]` in [0, 1]."""
     known = sources.inverse_depth > 0
     log_depth = -jnp.log2(jnp.where(known, sources.inverse_depth, 1))
     typical = safe_divide(jnp.sum(log_depth), jnp.sum(known, dtype=log_depth.dtype))
@@ -98,7 +100,8 @@ def _pass_emptiness(camera: Camera, pixels: jax.Array, sources: GatherSources) -
 
     none = jnp.zeros((_DEPTHS, len(pixels)), jnp.int32)
     through, _ = jax.lax.scan(add, none, (sources.cameras, known))
-    return jnp.max(through, axis=0) >= _PHOTOGRAPHS
+    most = jnp.max(through, axis=0).astype(jnp.float32)
+    return jnp.minimum(most / _PHOTOGRAPHS, 1)
 
 
 def fill_holes(rgb: jax.Array, alpha: jax.Array, seen: jax.Array, empty: jax.Array) -> jax.Array:
@@ -121,7 +124,7 @@ def fill_holes(rgb: jax.Array, alpha: jax.Array, seen: jax.Array, empty: jax.Arr
     few = max(1, round(_ACROSS * height / width)), _ACROSS
     near = jax.image.resize(hole, few, "linear")
     near = jnp.clip(2 * jax.image.resize(near, hole.shape, "linear"), 0, 1)
-    missing = near * (1 - empty) * (1 - jnp.clip(alpha / OPAQUE, 0, 1))
+    missing = near * jnp.where(seen, 1, 1 - empty) * (1 - jnp.clip(alpha / OPAQUE, 0, 1))
     opacity = empty + (1 - empty) * jnp.maximum(alpha, _FAINT)
     colors = jnp.clip(rgb / opacity[..., None], 0, 1)
     alpha = jnp.clip(alpha, 0, 1)

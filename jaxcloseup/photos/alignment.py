@@ -34,14 +34,14 @@ def estimate_motion(
 
     Returns:
       A translation in world units, then a rotation vector in radians, both in the camera's frame,
-      for `move_camera`; 0 if nothing tells it.
+      for `move_camera`; 0 where the pixels do not determine it.
     """
     chex.assert_equal_shape([photograph, shown])
     chex.assert_equal_shape([depth, weight])
     seen, gray = photograph.mean(-1), shown.mean(-1)
     down, across = jnp.gradient(gray)
     moved = _flow(camera, depth)
-    # XLA for CPUs compiles a sum over the last axis to something else.
+    # As a sum over the last axis, XLA for CPUs compiles this to other, wrong values (jax 0.10.2).
     moved = -(across[None] * moved[..., 0] + down[None] * moved[..., 1])
     columns = jnp.stack([*moved, gray, jnp.ones_like(gray)], axis=-1).reshape(-1, 8)
     weight = jnp.where(depth > 0, weight, 0).reshape(-1)
@@ -83,7 +83,7 @@ def move_camera(camera: Camera, motion: jax.Array) -> Camera:
 def halves_agree(
     photograph: jax.Array, shown: jax.Array, depth: jax.Array, weight: jax.Array, camera: Camera
 ) -> jax.Array:
-    """Return how alike the motions are that two halves of an image tell, `[]` in [-1, 1].
+    """Return how alike the motions from two halves of an image are, `[]` in [-1, 1].
 
     The halves are those of a checkerboard, so that noise in one is not that of the other. Motions
     a and b are as alike as 2 a . b / (|a|^2 + |b|^2) of the pixels that they move, the median.
@@ -91,14 +91,15 @@ def halves_agree(
     """
     rows, columns = (jnp.arange(size) // _SQUARE for size in depth.shape)
     odd = ((rows[:, None] + columns[None]) % 2).astype(weight.dtype)
-    flow = _flow(camera, depth)
-    one, other = (
-        jnp.tensordot(estimate_motion(photograph, shown, depth, part, camera), flow, axes=1)
+    flow = _flow(camera, depth).reshape(6, -1)
+    (x, y), (u, v) = (
+        matmul(estimate_motion(photograph, shown, depth, part, camera)[None], flow)
+        .reshape(*depth.shape, 2)
+        .transpose(2, 0, 1)
         for part in (weight * odd, weight * (1 - odd))
     )
-    x, y, u, v = one[..., 0], one[..., 1], other[..., 0], other[..., 1]
     alike = safe_divide(2 * (x * u + y * v), x * x + y * y + u * u + v * v)
-    return jnp.nan_to_num(jnp.nanmedian(jnp.where(weight > 0, alike, jnp.nan)))
+    return jnp.nan_to_num(jnp.nanmedian(jnp.where((weight > 0) & (depth > 0), alike, jnp.nan)))
 
 
 def shift_between(one: Camera, other: Camera, depth: jax.Array) -> jax.Array:

@@ -16,11 +16,12 @@ from tiny_runs import TINY_SURFELS
 from jaxcloseup.app.methods.method import CoarseConfig
 from jaxcloseup.app.run.corrected_poses import (
     NAME,
-    correct_poses,
     corrects_poses,
+    kept_or_corrected,
     read_poses,
     write_poses,
 )
+from jaxcloseup.app.run.loop import TrainingError
 from jaxcloseup.app.run.read_photographs import ReadPhotographs
 from jaxcloseup.app.store.stored_run import RunError, load_run_scene, read_run
 from jaxcloseup.fields.contract import Rendering
@@ -53,44 +54,59 @@ def programs_with(cameras, photographs):
     )
 
 
-def test_cameras_come_back_and_one_that_shows_nothing_stays(capsys):
-    exact = [plane.camera_above(x, 0.2 * x, 4.0, tilt=0.2 * x) for x in (-1.0, 0.0, 1.0)]
-    rng = np.random.default_rng(0)
-    off = [
-        move_camera(camera, jnp.asarray(rng.normal(scale=0.01, size=6), jnp.float32))
-        for camera in exact
-    ]
-    photographs, _ = plane.make_views(exact)
-    rgb = photographs.rgb.at[2].set(0.5)
-    programs = programs_with(off, rgb)
-    assert corrects_poses(programs)
-    moved = correct_poses(programs, None)
+EXACT = [plane.camera_above(x, 0.2 * x, 4.0, tilt=0.2 * x) for x in (-1.0, 0.0, 1.0)]
+
+
+def moved_by(scale, camera, seed):
+    motion = np.random.default_rng(seed).normal(scale=scale, size=6)
+    return move_camera(camera, jnp.asarray(motion, jnp.float32))
+
+
+def test_cameras_come_back(tmp_path, capsys):
+    off = [moved_by(0.01, camera, seed) for seed, camera in enumerate(EXACT)]
+    programs = programs_with(off, plane.make_views(EXACT)[0].rgb)
+    moved = kept_or_corrected(programs, None, tmp_path)
     poses = moved.scene.train.cameras.camtoworld
-    for i in (0, 1):
-        x, y = np.meshgrid(np.linspace(-0.4, 0.4, 5), np.linspace(-0.3, 0.3, 5))
-        at = np.stack([x, y, np.ones_like(x)], axis=-1)
+    x, y = np.meshgrid(np.linspace(-0.4, 0.4, 5), np.linspace(-0.3, 0.3, 5))
+    at = np.stack([x, y, np.ones_like(x)], axis=-1)
 
-        def where_rays_meet_the_plane(pose, at=at):
-            rays = at @ np.asarray(pose[:, :3]).T
-            return pose[:2, 3] - rays[..., :2] * pose[2, 3] / rays[..., 2:]
+    def where_rays_meet_the_plane(pose):
+        pose = np.asarray(pose)
+        rays = at @ pose[:, :3].T
+        return pose[:2, 3] - rays[..., :2] * pose[2, 3] / rays[..., 2:]
 
-        truth, before, after = (
-            np.asarray(where_rays_meet_the_plane(np.asarray(pose)))
-            for pose in (exact[i].camtoworld, off[i].camtoworld, poses[i])
+    for given, exact, pose in zip(off, EXACT, poses, strict=True):
+        truth, before, after = map(
+            where_rays_meet_the_plane, (exact.camtoworld, given.camtoworld, pose)
         )
         assert np.abs(after - truth).max() < 0.1 * np.abs(before - truth).max()
-    np.testing.assert_array_equal(poses[2], off[2].camtoworld)
     np.testing.assert_array_equal(moved.train.cameras.camtoworld, poses)
-    assert "2 of 3 cameras were moved to fit their photographs" in capsys.readouterr().out
+    assert "3 of 3 cameras were moved to fit their photographs" in capsys.readouterr().out
+    # A resumed run goes on with the poses that it keeps, whatever it would find now.
+    programs.coarse.render = None
+    again = kept_or_corrected(programs, None, tmp_path)
+    np.testing.assert_array_equal(again.scene.train.cameras.camtoworld, poses)
+    (tmp_path / NAME).write_text("{}")
+    with pytest.raises(TrainingError, match="does not hold the poses of these photographs"):
+        kept_or_corrected(programs, None, tmp_path)
+
+
+def test_cameras_stay_whose_photographs_do_not_tell(tmp_path, capsys):
+    """One shows noise, one nothing, and one is off by many pixels."""
+    off = [*EXACT[:2], moved_by(0.5, EXACT[2], 3)]
+    rgb = plane.make_views(EXACT)[0].rgb
+    rgb = rgb.at[0].add(0.1 * jax.random.normal(jax.random.key(1), rgb.shape[1:])).at[1].set(0.5)
+    programs = programs_with(off, rgb)
+    assert kept_or_corrected(programs, None, tmp_path) is programs
+    assert not capsys.readouterr().out and not list(tmp_path.iterdir())
 
 
 def test_exact_poses_of_drawn_scenes_are_left_alone():
     scene, _ = plane.make_scene([plane.camera_above(0.0, 0.0, 4.0)])
-    drawn = SimpleNamespace(preset=PRESET, scene=scene)
-    assert not corrects_poses(drawn)
-    capture = SimpleNamespace(preset=PRESET, scene=dataclasses.replace(scene, surface=None))
-    assert corrects_poses(capture)
-    assert not corrects_poses(SimpleNamespace(preset=TINY_SURFELS, scene=capture.scene))
+    assert not corrects_poses(PRESET, scene)
+    capture = dataclasses.replace(scene, surface=None)
+    assert corrects_poses(PRESET, capture)
+    assert not corrects_poses(TINY_SURFELS, capture)
 
 
 def test_renders_take_the_poses_that_a_run_keeps(kept, tmp_path):

@@ -19,6 +19,7 @@ from jaxcloseup.app.report import reported_run
 from jaxcloseup.app.report.comparison import say_which_is_best, write_comparison
 from jaxcloseup.app.report.finished_runs import read_finished
 from jaxcloseup.app.report.reported_run import run
+from jaxcloseup.app.run.corrected_poses import read_poses
 from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.loop import Training, TrainingError, train_stage
 from jaxcloseup.app.run.programs import Programs
@@ -121,8 +122,11 @@ def test_surfels_run_through_all_stages_from_random_points(capture_folder, tmp_p
     assert parts == sorted(parts, key=lambda part: part[0]) and len(set(parts)) > 8
     assert "\n[1/" in said and "compiling the steps" in said and "writing the report" in said
     assert results["history"]["coarse_baseline"][-1]["step"] == 20
-    poses = json.loads((tmp_path / "poses.json").read_text())["camtoworld"]
-    assert list(poses) == scene.names["train"] and np.shape(list(poses.values())) == (5, 3, 4)
+    assert "cameras were moved to fit their photographs" in said
+    poses = read_poses(tmp_path, scene.names["train"])
+    assert np.abs(poses - scene.train.cameras.camtoworld).max() > 1e-5
+    after = load_run_scene(read_run(tmp_path)).train.cameras.camtoworld
+    np.testing.assert_array_equal(after, poses)
     assert json.loads((tmp_path / "results.json").read_text()) == results
     stages = results["stages"]
     use_labels = results["gate"]["weight"] > 0

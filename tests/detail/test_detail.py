@@ -194,12 +194,15 @@ def test_renders_with_detail_come_nearer_to_the_truth(rendered, found):
             if unseen.all():
                 np.testing.assert_array_equal(alone.rgb, 0)
             else:
-                # Photographs look past the plane through many places on these rays.
+                # Photographs look past the plane through many places on these rays, so the colors
+                # around fill them as far as they are not empty.
                 pixels = pixel_grid(camera.height, camera.width)
-                rows = np.asarray(find_empty(camera, pixels, detail.sources))[:, 20] < 0.5
+                empty = np.asarray(find_empty(camera, pixels, detail.sources))[:, 20]
+                rows = empty < 0.75
                 assert rows.mean() > 0.2
                 column = np.asarray(alone.rgb)[rows].mean(0)
-                assert np.abs(column[20] - column[19]).max() < 0.3 * column[19].max()
+                filled = (1 - empty[rows].mean()) * column[19]
+                assert np.abs(column[20] - filled).max() < 0.3 * column[19].max()
 
 
 def test_target_views_may_be_labeled_by_their_detail(rendered, found, monkeypatch):

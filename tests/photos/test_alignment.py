@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points
-from jaxcloseup.photos.alignment import estimate_motion, move_camera, shift_between
+from jaxcloseup.photos.alignment import estimate_motion, halves_agree, move_camera, shift_between
 
 
 HEIGHT, WIDTH = 67, 120
@@ -74,3 +74,27 @@ def test_a_moved_camera_is_that_of_a_matrix_exponential():
     np.testing.assert_allclose(moved.rotation, camera().rotation @ turn, atol=1e-6)
     ahead = camera().position + camera().rotation @ MOTION[:3]
     np.testing.assert_allclose(moved.position, ahead, atol=1e-6)
+
+
+def test_halves_agree_on_a_motion_but_not_on_noise():
+    rgb, depth = shown(camera())
+    weight = jnp.ones_like(depth)
+    photograph = shown(move_camera(camera(), MOTION))[0]
+    noise = 0.05 * jax.random.normal(jax.random.key(0), (40, *rgb.shape))
+    compare = jax.jit(halves_agree)
+    assert compare(photograph, rgb, depth, weight, camera()) > 0.9
+    alike = [float(compare(rgb + part, rgb, depth, weight, camera())) for part in noise]
+    assert abs(np.mean(alike)) < 0.25 and np.max(alike) < 0.9
+
+
+def test_pixels_without_weight_say_nothing():
+    rgb, depth = shown(camera())
+    photograph = shown(move_camera(camera(), MOTION))[0]
+    ours = jnp.arange(WIDTH)[None] < WIDTH // 2
+    weight = jnp.broadcast_to(jnp.where(ours, 1.0, 0.0), depth.shape)
+    other = jnp.where(ours[..., None], photograph, 0.9 - photograph)
+    motions = [
+        estimate_motion(image, rgb, jnp.where(weight > 0, depth, 7.0), weight, camera())
+        for image in (photograph, other)
+    ]
+    np.testing.assert_allclose(*motions, atol=1e-6)

@@ -58,7 +58,8 @@ class CoarseConfig:
     field: Any = setting(help="configuration of the field during this training")
     steps: int = setting(help="number of steps", low=1)
     poses: bool = setting(
-        False, "move the cameras of a capture's photographs to where the result of it fits them"
+        False,
+        "move a capture's cameras to where the coarse model fits their photographs, not in sweeps",
     )
 
 

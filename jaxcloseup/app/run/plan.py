@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from jaxcloseup.app.methods.method import Preset
 from jaxcloseup.app.methods.registry import METHODS
+from jaxcloseup.app.run.corrected_poses import corrects_poses
 from jaxcloseup.photos.scene import Scene
 
 
@@ -53,8 +54,8 @@ def plan_run(preset: Preset, scene: Scene, to_run: Sequence[str]) -> dict[str, f
     parts = ["stereo"] if preset.stereo is not None and preset.stereo.pixels else []
     if preset.coarse is not None:
         steps["coarse_baseline"] = preset.coarse.steps
-        moves = preset.coarse.poses and scene.surface is None
-        parts += ["coarse_baseline", *["poses"] * moves, "refine_baseline"]
+        moved = ["poses"] if corrects_poses(preset, scene) else []
+        parts += ["coarse_baseline", *moved, "refine_baseline"]
     parts += ["baseline", "depths", "baseline_evaluation", "gate"]
     for stage in ("control", "closeup"):
         steps[stage] = preset.closeup_steps

@@ -69,11 +69,9 @@ class ReadPhotographs:
         self._exposures = dict.fromkeys((False, True), exposures)
 
     def moved(self, scene: Scene) -> "ReadPhotographs":
-        """Return the same for a scene whose training photographs have other poses."""
+        """Return the same for a scene whose photographs have other poses; depth is matched anew."""
         moved = ReadPhotographs(scene)
         moved._pyramids, moved._exposures = self._pyramids, self._exposures
-        for pixels, found in self._matched.items():
-            moved._matched[pixels] = found and found.moved(scene.train.cameras)
         return moved
 
     def _match(self, preset: Preset, config: StereoTraining) -> StereoDepths | None:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcloseup.app.run.corrected_poses import correct_poses, corrects_poses, write_poses
+from jaxcloseup.app.run.corrected_poses import corrects_poses, kept_or_corrected
 from jaxcloseup.app.run.exposed import expose, render_exposed
 from jaxcloseup.app.run.fine_tuning import prepare_target_views
 from jaxcloseup.app.run.gate import gated, uses_labels, weigh
@@ -146,11 +146,10 @@ def train_baseline_stage(
     """Train and score `baseline`, and prepare what the other stages share."""
     programs, labels, coarse = training.programs, training.programs.preset.labels, None
     say_which_points_fit(programs)
-    if corrects_poses(programs):
+    if corrects_poses(programs.preset, programs.scene):
         coarse = train_coarse(training, "baseline", keys)
         with timed(training.seconds, "poses"):
-            training.programs = programs = correct_poses(programs, coarse)
-        write_poses(output_dir, programs.scene.train.cameras, programs.scene.names["train"])
+            programs = training.programs = kept_or_corrected(programs, coarse, output_dir)
     state = train_baseline(training, "baseline", keys, coarse)
     with timed(training.seconds, "depths"):
         start = start_labels(programs, state, keys, expected_depth=labels.expected_depth)

@@ -66,7 +66,7 @@ def train_coarse(training: Training, stage: str, keys: RunKeys) -> TrainState:
 
 
 def _match(training: Training) -> StereoDepths | None:
-    """Return depth by stereo, if the preset begins with it; the first call takes its time."""
+    """Return depth by stereo, if the preset begins with it; the first call is a part of the run."""
     stereo = training.programs.preset.stereo
     if stereo is None or not stereo.pixels:
         return None

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxcloseup.app import progress
 from jaxcloseup.app.methods.method import StereoTraining
-from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points
+from jaxcloseup.geometry.cameras import pixel_grid, pixels_to_points
 from jaxcloseup.geometry.numerics import safe_divide
 from jaxcloseup.native import library
 from jaxcloseup.photos.depth_maps import GatherSources, join_maps
@@ -40,11 +40,6 @@ class StereoDepths(NamedTuple):
         depth, confidence = self.maps.depth, self.maps.confidence
         inverse = safe_divide(jnp.ones_like(depth), jnp.where(confidence > 0, depth, 0))
         return join_maps(self.views.cameras, inverse, confidence)
-
-    def moved(self, cameras: Camera) -> "StereoDepths":
-        """Return the same depth of photographs with the poses of other cameras."""
-        own = self.views.cameras.replace(camtoworld=cameras.camtoworld)
-        return self._replace(views=self.views.replace(cameras=own))
 
 
 def can_match(scene: Scene) -> bool:
