@@ -10,6 +10,7 @@ import jax
 
 from jaxcloseup.app.methods.method import Preset
 from jaxcloseup.app.methods.settings import settings_of, with_settings
+from jaxcloseup.app.run.corrected_poses import corrects_poses
 from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.photograph_sizes import finest_read
 from jaxcloseup.app.run.programs import Programs
@@ -83,7 +84,8 @@ class _Times(NamedTuple):
 
 def _time_steps(programs: Programs) -> _Times:
     """Time everything that a run does until the end of stage 1."""
-    preset, keys, stereo = programs.preset, run_keys(0), programs.stereo
+    preset, keys = programs.preset, run_keys(0)
+    stereo, matching = _timed(lambda: programs.stereo)
     reading = before = 0.0
     if preset.coarse is None:
         state = initial_state(programs, keys, stereo)
@@ -94,6 +96,8 @@ def _time_steps(programs: Programs) -> _Times:
         _, reading = _timed(lambda: programs.pyramid(finest_read(preset, programs.scene)))
         state, refining = _timed(functools.partial(refine_state, programs, state))
         before = preset.coarse.steps * each + refining
+        if corrects_poses(preset, programs.scene):
+            before += matching  # once more, after cameras were moved
     data = TrainData(with_depths(programs, stereo))
     return _Times(reading, before, _steps(programs, state, data)[1])
 
