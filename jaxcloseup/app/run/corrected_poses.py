@@ -90,10 +90,11 @@ def correct_poses(programs: Programs, coarse: TrainState) -> Programs:
             seen = render(coarse, camera)
             shown = jnp.clip(seen.rgb, 0, 1), seen.alpha, seen.depth
             steps.append(_move(camera, views.rgb[index], views.weight[index], shown))
+            if steps[0].alike < _ALIKE:
+                return given.camtoworld, 0.0
             camera = steps[-1].camera
         shift = shift_between(given, camera, steps[0].depth)
-        small = steps[-1].shift <= steps[0].shift / 2
-        if steps[0].alike < _ALIKE or not small or shift > 1:
+        if steps[-1].shift > steps[0].shift / 2 or shift > 1:
             return given.camtoworld, 0.0
         return camera.camtoworld, float(shift)
 
