@@ -135,6 +135,7 @@ def written(tmp_path_factory):
     found |= {"config": {"targets": None, "name": "long " * 50}}
     errors = [{"expected": 0.1, "actual": 0.2}]
     found["detail"] = {"stage": "baseline", "errors": errors, "sizes": [[36, 48]]}
+    found["detail"] |= {"ause": 0.123, "pearson": 0.456}
     for stage, splits in found["stages"].items():
         splits["zoom_2"] = {"psnr": {"baseline": 18.0, "test_time_control": 17.0}[stage]}
         for metrics in splits.values():
@@ -165,6 +166,7 @@ def test_a_page_shows_the_numbers_of_results_in_order(written):
     assert labels[1] == ["exact depth", "0.0100", "0.5000", "0.1000"]
     assert gate[1] == ["0.02", "0.005", "10%", "30.00", "31.00"]
     assert detail[1] == ["1", "25.5", "51.0"]
+    assert "AUSE 0.12, correlation 0.46" in page.text
     assert page.tags.count("svg") == 1  # no control: no plot of gains
     assert page.tags.count("details") == 5
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from experiments.benchmarks import teach
-from jaxcloseup.app.score.expected_errors import compare_errors, error_tenths
+from jaxcloseup.app.score.expected_errors import compare_errors, error_tenths, rank_errors
 from jaxcloseup.app.score.targets import Target
 from jaxcloseup.detail import weights as detail_weights
 from jaxcloseup.detail.add import Detailed
@@ -83,7 +83,24 @@ def test_errors_are_compared_where_they_are_expected_and_without_exposure():
     weight[:, :5] = 0
     target = Target("view", SimpleNamespace(), *map(jnp.asarray, (truth, weight, weight)))
     seen = Detailed(jnp.asarray(rgb), None, None, jnp.asarray(error))
-    tenths = compare_errors(lambda camera: seen, [target])
+    found = compare_errors(lambda camera: seen, [target])
+    tenths = found["errors"]
     assert all(row["expected"] == pytest.approx(0.1) for row in tenths)
     assert all(row["actual"] < 1e-5 for row in tenths)
-    assert compare_errors(lambda camera: seen, []) == []
+    assert "ause" not in found  # all expect the same
+    assert compare_errors(lambda camera: seen, []) == {"errors": []}
+
+
+def test_expected_errors_are_ranked_by_area_and_correlation():
+    rng = np.random.default_rng(0)
+    actual = rng.uniform(0, 1, 20_000)
+    knows = rank_errors(3 * actual + 1, actual)
+    assert knows["ause"] == pytest.approx(0, abs=1e-9)
+    assert knows["pearson"] == pytest.approx(1)
+    # Of means a + b with the same variance, one of which is known: a correlation of 1 / sqrt(2).
+    other = rng.uniform(0, 1, 20_000)
+    half = rank_errors(actual, actual + other)
+    assert half["pearson"] == pytest.approx(0.5**0.5, abs=0.01)
+    assert 0.05 < half["ause"] < rank_errors(other, actual)["ause"]
+    assert not rank_errors(np.ones(5), actual[:5])
+    assert not rank_errors(np.empty(0), np.empty(0))

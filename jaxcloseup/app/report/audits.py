@@ -87,4 +87,7 @@ def detail_table(detail: Mapping[str, Any]) -> Table:
         for number, row in enumerate(detail["errors"], 1)
     ]
     header = ["tenth of the pixels", "expected error", "actual error"]
-    return Table("Detail of the photographs", header, body)
+    title = "Detail of the photographs"
+    if "ause" in detail:
+        title += f": AUSE {detail['ause']:.2f}, correlation {detail['pearson']:.2f}"
+    return Table(title, header, body)

@@ -179,8 +179,8 @@ def add_detail_stage(run: Run, get_detail: GetDetail) -> tuple[dict[str, Any], R
     """Score the renders of the latest stage again with the photographs' detail.
 
     Returns:
-      A record for JSON: the `stage`, what `find_detail` says, and `errors`, expected and actual
-      ones; and a function that renders with detail.
+      A record for JSON: the `stage`, what `find_detail` says, and how the expected errors compare
+      with the actual ones; and a function that renders with detail.
     """
     programs, state, scorer = run.programs, run.state, run.scorer
     with timed(run.training.seconds, "detail"):
@@ -199,7 +199,7 @@ def add_detail_stage(run: Run, get_detail: GetDetail) -> tuple[dict[str, Any], R
         splits = (name for name in programs.scene.names if name != "train")
         targets = [target for name in splits for target in scorer.held_out.reduced(name)]
         errors = compare_errors(detail_of, targets)
-    return {"stage": run.stage, **about, "errors": errors}, render
+    return {"stage": run.stage, **about, **errors}, render
 
 
 def train_for_target_views(run: Run, get_detail: GetDetail, *, controlled: bool) -> None:

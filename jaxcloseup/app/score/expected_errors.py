@@ -1,11 +1,13 @@
 """Compare the errors that detail expects with the actual ones."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from jaxcloseup.app import progress
+from jaxcloseup.app.score.audit import error_curve
 from jaxcloseup.app.score.targets import Target
 from jaxcloseup.detail.add import Detailed
 from jaxcloseup.geometry.cameras import Camera
@@ -18,7 +20,7 @@ TENTHS = 10
 
 def compare_errors(
     render: Callable[[Camera], Detailed], targets: Sequence[Target]
-) -> list[dict[str, float]]:
+) -> dict[str, Any]:
     """Compare the expected error at each pixel of held-out views with the actual one.
 
     An affine map first matches each view's colors to the photograph's, because the exposure of a
@@ -29,7 +31,8 @@ def compare_errors(
       targets: the held-out views.
 
     Returns:
-      The rows of `error_tenths`; none without views.
+      `errors`, the rows of `error_tenths`, and what `rank_errors` says of all pixels: nothing, and
+      no rows, without views.
     """
 
     def compare(target: Target) -> tuple[np.ndarray, ...]:
@@ -44,9 +47,31 @@ def compare_errors(
 
     views = list(progress.each(compare, targets, "expected errors"))
     if not views:
-        return []
+        return {"errors": []}
     expected, actual, weight = map(np.concatenate, zip(*views, strict=True))
-    return error_tenths(expected, actual, weight)
+    counts = weight > 0
+    return {
+        "errors": error_tenths(expected, actual, weight),
+        **rank_errors(expected[counts], actual[counts]),
+    }
+
+
+def rank_errors(expected: np.ndarray, actual: np.ndarray) -> dict[str, float]:
+    """Return how well expected errors tell where actual ones are large, by the field's measures.
+
+    Args:
+      expected: `[N]` expected errors.
+      actual: `[N]` actual errors.
+
+    Returns:
+      `ause`, the area under the sparsification error (see `error_curve`): 0 if they sort pixels as
+      their errors do. `pearson`, the coefficient of correlation. Nothing where all are the same.
+    """
+    curve = error_curve(expected, actual, len(expected))
+    if curve is None or not np.ptp(expected) or not np.ptp(actual):
+        return {}
+    ause, pearson = curve["ause"], np.corrcoef(expected, actual)[0, 1]
+    return {"ause": float(ause), "pearson": float(pearson)}
 
 
 def error_tenths(
