@@ -9,6 +9,8 @@ import tempfile
 import jax
 import optimized  # noqa: F401
 import pytest
+from absl import flags
+from absl.testing import flagsaver
 from tiny_runs import keep_run, write_plane
 
 
@@ -83,6 +85,14 @@ def shared():
 def key(request):
     """A key that differs from test to test and never from run to run."""
     return jax.random.key(sum(map(ord, request.node.name)) % 2**31)
+
+
+@pytest.fixture
+def parsed_flags():
+    """Parsed flags of the programs that the test imports, which change no compilation cache."""
+    flags.FLAGS(["a program"])
+    with flagsaver.flagsaver(compilation_cache=""):
+        yield
 
 
 @pytest.fixture(scope="session")

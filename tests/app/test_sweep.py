@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from absl import flags
 from absl.testing import flagsaver
 from conftest import QUICKLY
 from tiny_runs import TINY, TINY_SURFELS, programs_of
@@ -209,13 +208,6 @@ def test_the_interval_is_that_of_the_mean():
     half = 1.96 * noise.std() / np.sqrt(400)
     assert low == pytest.approx(noise.mean() - half, abs=0.03)
     assert high == pytest.approx(noise.mean() + half, abs=0.03)
-
-
-@pytest.fixture
-def parsed_flags():
-    flags.FLAGS(["sweep"])
-    with flagsaver.flagsaver(compilation_cache=""):
-        yield
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,7 @@
-"""Detail: weights that evidence teaches, renders that come nearer to the truth, a kept file."""
+"""Detail of a run's state: renders that come nearer to the truth, and a kept file."""
 
 import dataclasses
 import functools
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -16,127 +15,13 @@ from jaxcloseup.app.run.fine_tuning import fine_tune, tuned_detail
 from jaxcloseup.app.run.kept_detail import detail_getter, detail_path, detailed, find_detail
 from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.labels import label_closeups, label_target_views, start_labels
-from jaxcloseup.app.run.residuals import enlarge
-from jaxcloseup.app.score.targets import targets_by_split
 from jaxcloseup.app.store.stored_run import load_run_scene, read_run, restore
-from jaxcloseup.captures.load import DRAWN_SCENES, SceneError, load_scene
-from jaxcloseup.detail import weights as detail_weights
-from jaxcloseup.detail.features import FEATURES
 from jaxcloseup.detail.holes import find_empty
-from jaxcloseup.detail.learn import Evidence, learn_weights
-from jaxcloseup.detail.weights import CONTRAST, blend, expected_errors, known_weights, write_known
-from jaxcloseup.geometry.cameras import Camera, pixel_grid
+from jaxcloseup.geometry.cameras import pixel_grid
 from jaxcloseup.io.cache import Stored, load, save
 from jaxcloseup.photos.depth_maps import join_maps
-from jaxcloseup.photos.pyramids import scene_pyramid
 from jaxcloseup.photos.views import camera_at, to_float
 from jaxcloseup.photos.windows import view_windows
-
-
-# Made-up evidence is simple, so few steps teach it.
-learn_quickly = functools.partial(learn_weights, steps=(250, 300))
-
-
-def made_up(share, count=20_000, seed=0):
-    """Evidence whose true share of the gathered residual is `share(feature)`, plus noise."""
-    rng = np.random.default_rng(seed)
-    x = rng.uniform(0, 1, count)
-    features = np.stack([np.ones(count), x, x**2], axis=-1)
-    gathered = rng.normal(0, 0.1, (count, 3))
-    own = share(x)[:, None] * gathered + (0.01 + 0.03 * x)[:, None] * rng.normal(0, 1, (count, 3))
-    images = features, gathered / CONTRAST, rng.normal(0, 0.1, (count, 3)), own, np.ones(count)
-    return Evidence(*(image.astype(np.float32) for image in images)), x
-
-
-@pytest.mark.parametrize(
-    "share", [lambda x: 0.2 + 0.6 * x, lambda x: 1 / (1 + np.exp(12 * (x - 0.5)))]
-)
-def test_weights_are_the_share_that_is_there(share):
-    weights = learn_quickly({f"scene {seed}": [made_up(share, seed=seed)[0]] for seed in range(3)})
-    other, x = made_up(share, seed=3)
-    mixed, predicted = map(np.asarray, blend(weights, *other[:3]))
-    added = predicted[:, None] * mixed
-    expected = share(x)[:, None] * CONTRAST * other.residual
-    # Colors are noise here: what is added is the share of the residual.
-    assert np.abs(added - expected).mean() < 0.1 * np.abs(expected).mean()
-
-    # The mean of |z| is sqrt(2 / pi) of the deviation: of the noise, and of what the render lacks.
-    noise = 0.01 + 0.03 * x
-    deviations = np.hypot(0.1 * share(x), noise), noise
-    guesses = np.asarray(expected_errors(weights, other[0])).T
-    for guess, deviation in zip(guesses, deviations, strict=True):
-        assert guess == pytest.approx(np.sqrt(2 / np.pi) * deviation, rel=0.25)
-        assert guess.mean() == pytest.approx(np.sqrt(2 / np.pi) * deviation.mean(), rel=0.03)
-
-
-def test_colors_are_taken_where_they_are_right_and_the_residual_elsewhere():
-    rng, count = np.random.default_rng(0), 40_000
-    exact = rng.uniform(size=count) < 0.5
-    own, noise = rng.normal(0, 0.1, (2, count, 3))
-    colors = np.where(exact[:, None], own, noise)
-    residual = np.where(exact[:, None], noise, own) / CONTRAST
-    images = exact[:, None] * 1.0, residual, colors, own, np.ones(count)
-    found = Evidence(*(image.astype(np.float32) for image in images))
-    weights = learn_quickly({"scene": [found]})
-    mixed, share = blend(weights, *found[:3])
-    assert np.abs(np.asarray(mixed) - own).mean() < 0.1 * np.abs(own).mean()
-    assert float(share.min()) > 0.9
-
-
-def test_weights_stay_in_their_range_and_need_evidence():
-    found, _ = made_up(lambda x: 3 * x - 1)
-    _, predicted = blend(learn_quickly({"scene": [found]}), *found[:3])
-    assert 0 <= float(predicted.min()) < 0.05 and 0.95 < float(predicted.max()) <= 1
-    none = found._replace(weight=0 * found.weight)
-    with pytest.raises(ValueError, match="no photograph shows anything of the scenes other than b"):
-        learn_quickly({"a": [none], "b": [found]})
-
-
-def test_what_points_away_from_the_truth_is_not_added():
-    def share(x):
-        return np.where(x < 0.4, -0.3, 0.8)
-
-    found = {}
-    for seed in range(3):
-        one, x = made_up(share, seed=seed)
-        found[f"scene {seed}"] = [one._replace(colors=CONTRAST * one.residual)]
-    _, predicted = map(np.asarray, blend(learn_quickly(found), *found["scene 2"][0][:3]))
-    assert predicted[x < 0.35].max() < 0.05 and predicted[x > 0.45].min() > 0.6
-
-
-def test_a_scene_is_judged_by_a_network_that_never_saw_it(tmp_path, monkeypatch):
-    """Two scenes have all of the residual, a third has none, and one pixel counts as much there."""
-    shares = {"a": 1.0, "b": 1.0, "none": 0.0}
-    found = {
-        name: [made_up(lambda x, share=share: share + 0 * x, seed=seed)[0]]
-        for seed, (name, share) in enumerate(shares.items())
-    }
-    path = tmp_path / "weights.npz"
-    write_known(path, list(found), learn_quickly(found))
-    monkeypatch.setattr(detail_weights, "KNOWN", path)
-    detail_weights._read_known.cache_clear()
-
-    def share(unseen):
-        rows = found["a"][0][:3]
-        return float(np.mean(blend(known_weights(unseen), *rows)[1]))
-
-    try:
-        assert share("none") > 0.97 and share("a") < 0.9 and share("b") < 0.9
-        assert share("another") == share(None) and share("a") < share(None) < share("none")
-    finally:
-        detail_weights._read_known.cache_clear()
-
-
-def test_built_in_scenes_taught_the_weights_that_come_with_the_package():
-    """All but the statue did, which all networks therefore judge."""
-    names, weights = detail_weights._read_known()
-    assert sorted(names) == sorted(set(DRAWN_SCENES) - {"statue"})
-    assert known_weights("statue") is weights
-    for networks in (weights.mixing, weights.errors):
-        assert networks.center.shape == networks.scale.shape == (len(names), FEATURES)
-        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(networks))
-    own = known_weights(names[2])
-    np.testing.assert_array_equal(own.errors.center, weights.errors.center[2:3])
 
 
 @pytest.fixture(scope="module")
@@ -339,65 +224,3 @@ def test_damaged_detail_is_made_again(rendered, found, monkeypatch, capsys):
     out = capsys.readouterr().out
     assert len(made) == count + 1 and out.count("is damaged") == out.count("made again next") == 1
     path.rmdir()
-
-
-def test_an_enlarged_render_stays_in_its_place():
-    pose = jnp.eye(3, 4)
-    coarse = Camera(pose, jnp.array([20.0, 20.5, 15, 12]), 24, 30)
-    fine = Camera(pose, jnp.array([61.0, 59.5, 45.5, 36.2]), 72, 91)
-
-    def image(camera):
-        x, y = np.moveaxis(np.asarray(pixel_grid(camera.height, camera.width)), -1, 0)
-        fx, fy, cx, cy = np.asarray(camera.intrinsics)
-        wave = 0.5 + 0.4 * np.sin(4 * (x - cx) / fx) * np.cos(3 * (y - cy) / fy)
-        return np.stack([wave, wave**2, 1 - wave], axis=-1).astype(np.float32)
-
-    rgb = enlarge(image(coarse), coarse, fine)
-    inner = np.s_[6:-6, 6:-6]
-    assert np.abs(rgb - image(fine))[inner].max() < 0.006  # a tenth of a coarse pixel
-
-
-def test_a_scene_is_read_at_the_finest_size_that_fits(capture_folder):
-    scene = load_scene(str(capture_folder), downscale=4)
-    assert scene.train.rgb.shape[1:3] == (6, 8)
-    pyramid, divisor = scene_pyramid(scene)
-    assert divisor == 1 and pyramid.sizes == ((24, 32), (12, 16), (6, 8))
-    whole = load_scene(str(capture_folder))
-    finest = np.stack([pyramid.image(view, 0) for view in range(len(pyramid))])
-    np.testing.assert_array_equal(finest[..., :3], whole.train.rgb)
-    np.testing.assert_array_equal(pyramid.intrinsics[:, 0], whole.train.cameras.intrinsics)
-    size = 5 * 24 * 32 * 4 * 4 / 3
-    assert scene_pyramid(scene, budget=int(size) - 1)[1] == 2
-    assert scene_pyramid(scene, budget=int(size / 4) - 1)[1] == 3
-    assert scene_pyramid(scene, budget=1)[1] == 4  # what training reads anyway
-
-
-def test_held_out_parts_of_photographs_are_not_read(capture_folder):
-    scene = load_scene(str(capture_folder), split="zoom", zoom=2)
-    assert scene.photographs_at is None
-    assert scene_pyramid(scene)[0].sizes[0] == scene.train.rgb.shape[1:3]
-
-
-def test_views_are_scored_at_their_own_size_only_where_finer_photographs_are_kept(
-    capture_folder, capsys
-):
-    scene = load_scene(str(capture_folder), downscale=4)
-    depths = jnp.ones(scene.train.weight.shape)
-
-    def score(scene):
-        flat = lambda camera: SimpleNamespace(depth=jnp.ones((camera.height, camera.width)))  # noqa: E731
-        targets = targets_by_split(scene, depths, None, flat, divisor=2)
-        return {split: views[0].rgb.shape[:2] for split, views in targets.items()}
-
-    sizes = score(scene)
-    assert set(sizes.values()) == {(6, 8), (12, 16)}
-    assert all(
-        sizes[split] == ((6, 8) if split.endswith("_reduced") else (12, 16)) for split in sizes
-    )
-
-    def gone(factor, split):
-        raise SceneError("images/000.png is not there")
-
-    kept = score(dataclasses.replace(scene, photographs_at=gone))
-    assert kept == {split: (6, 8) for split, size in sizes.items() if size == (12, 16)}
-    assert "size of training alone: images/000.png is not there" in capsys.readouterr().out
