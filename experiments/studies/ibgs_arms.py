@@ -42,7 +42,6 @@ from jaxcloseup.detail.add import Detail, find_candidates
 from jaxcloseup.detail.weights import mean_output, mix
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
-from jaxcloseup.geometry.numerics import safe_divide
 from jaxcloseup.labels.rules import label_depth
 from jaxcloseup.photos.pyramids import photograph_pyramid
 from jaxcloseup.photos.views import Photograph, camera_at, to_float, unpadded
@@ -105,7 +104,10 @@ def print_arms(run: TrainedRun) -> None:
     scores = {"field": score(functools.partial(programs.render, run.state))}
     scores["detail"] = score(with_detail(run, run.state, detail))
     if FLAGS.head_steps:
-        head = train_head(run, detail)
+        count = len(run.scene.names["train"])
+        chosen = np.linspace(0, count - 1, min(FLAGS.photographs, count)).astype(int)
+        examples = [example(run, detail, view) for view in chosen.tolist()]
+        head = train_head(examples, FLAGS.head_steps)
         scores["detail, head"] = score(with_head(run, detail, head))
     if FLAGS.joint_steps:
         for title, joint in (("detail, more steps", False), ("detail, joint", True)):
@@ -168,8 +170,7 @@ def add_by_head(params: Any, gathered: Gathered) -> jax.Array:
     stacked = jnp.concatenate([part.astype(jnp.float32) for part in inputs], axis=-1)
     change: Any = Head().apply(params, stacked)
     outputs, residual, colors = (
-        part.astype(jnp.float32)
-        for part in (gathered.outputs, gathered.residual, gathered.colors)
+        part.astype(jnp.float32) for part in (gathered.outputs, gathered.residual, gathered.colors)
     )
     mixed, share = mix(outputs + change[..., :2], residual, colors)
     added = share[..., None] * mixed + change[..., 2:] / 8
@@ -184,8 +185,9 @@ def with_head(run: TrainedRun, detail: Detail, params: Any) -> Render:
         gathered = gather(run, detail, camera, seen)
         added = add_by_head(params, gathered)
         visible = gathered.seen[..., None]
+        count = jnp.maximum(jnp.sum(visible), 1).astype(jnp.float32)
         # As `add_detail` does: detail keeps the mean color of the view.
-        added -= visible * safe_divide(jnp.sum(added, (0, 1)), jnp.sum(visible))
+        added -= jnp.where(visible, jnp.sum(added, (0, 1)) / count, 0)
         sharper = jnp.clip(jnp.clip(seen.rgb, 0, 1) + added, 0, 1)
         filled = detailed(run.programs, detail, camera, seen).rgb
         return seen._replace(rgb=jnp.where(visible, sharper, filled))
@@ -193,15 +195,12 @@ def with_head(run: TrainedRun, detail: Detail, params: Any) -> Render:
     return render
 
 
-def train_head(run: TrainedRun, detail: Detail) -> Any:
-    """Train a head on photographs of the scene, each with what the others show."""
-    count = len(run.scene.names["train"])
-    chosen = np.unique(np.linspace(0, count - 1, min(FLAGS.photographs, count)).astype(int))
-    examples = [example(run, detail, int(view)) for view in chosen]
+def train_head(examples: Sequence[tuple[Gathered, np.ndarray]], steps: int) -> Any:
+    """Train a head on what views gather and on what their renders miss, `[H, W, 3]`."""
     rng, zeros = np.random.default_rng(0), jax.tree.map(lambda array: array[None], examples[0][0])
     channels = sum(part.shape[-1] for part in zeros[:4]) + 1
     params = Head().init(jax.random.key(0), jnp.zeros((1, 8, 8, channels)))
-    optimizer = optax.adam(optax.cosine_decay_schedule(2e-3, FLAGS.head_steps))
+    optimizer = optax.adam(optax.cosine_decay_schedule(2e-3, steps))
     state = optimizer.init(params)
 
     @jax.jit
@@ -209,15 +208,16 @@ def train_head(run: TrainedRun, detail: Detail) -> Any:
         def loss(params: Any) -> jax.Array:
             off = jnp.abs(add_by_head(params, crops) - missing.astype(jnp.float32))
             inner = slice(_MARGIN, -_MARGIN)
-            counts = crops.seen[:, inner, inner, None]
+            counts = crops.seen[:, inner, inner, None].astype(jnp.float32)
             return jnp.sum(counts * off[:, inner, inner]) / jnp.maximum(3 * jnp.sum(counts), 1)
 
         value, gradient = jax.value_and_grad(loss)(params)
-        update, after = optimizer.update(gradient, state)
+        with jax.numpy_dtype_promotion("standard"):  # optax multiplies by counts of steps
+            update, after = optimizer.update(gradient, state)
         return optax.apply_updates(params, update), after, value
 
     losses = []
-    for index in range(FLAGS.head_steps):
+    for index in range(steps):
         crops = [crop(examples[rng.integers(len(examples))], rng) for _ in range(_BATCH)]
         stacked = jax.tree.map(lambda *arrays: np.stack(arrays), *crops)
         params, state, value = step(params, state, *stacked)

@@ -1,7 +1,7 @@
 """Compare the errors that detail expects with the actual ones."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -70,8 +70,8 @@ def rank_errors(expected: np.ndarray, actual: np.ndarray) -> dict[str, float]:
     curve = error_curve(expected, actual, len(expected))
     if curve is None or not np.ptp(expected) or not np.ptp(actual):
         return {}
-    ause, pearson = curve["ause"], np.corrcoef(expected, actual)[0, 1]
-    return {"ause": float(ause), "pearson": float(pearson)}
+    pearson = np.corrcoef(expected, actual)[0, 1]
+    return {"ause": cast(float, curve["ause"]), "pearson": float(pearson)}
 
 
 def error_tenths(
