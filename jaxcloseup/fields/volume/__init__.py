@@ -11,7 +11,8 @@ __all__, __getattr__, __dir__ = lazy_names(
         "config": ("HashGridConfig MipNerfConfig NerfConfig NgpConfig TensorfConfig ZipNerfConfig"),
         "coordinates": "contract contraction_scale spaced unspaced",
         "depth_supervision": (
-            "DepthSupervision Sightings depth_divergence mean_divergence measured_divergence"
+            "DepthSupervision PixelSupervision PointSupervision Sightings depth_divergence "
+            "mean_divergence measured_divergence"
         ),
         "encodings": "positional_encoding",
         "hash_fields": "hash_field",

@@ -41,19 +41,31 @@ class Sightings(NamedTuple):
     deviation: Any
 
 
-class DepthSupervision(NamedTuple):
-    """A loss on the depth of rays.
+class PointSupervision(NamedTuple):
+    """A loss on the depth of rays through known points, which each step draws.
 
     Attributes:
-      sightings: known points, at least one, through which rays are drawn; None: a step's own pixels
-        learn from their measured depth.
+      sightings: the points, at least one.
       weight: weight of the loss.
       share: rays through points in a step, as a share of its pixels.
     """
 
-    sightings: Sightings | None
+    sightings: Sightings
     weight: float
     share: float
+
+
+class PixelSupervision(NamedTuple):
+    """A loss on the depth of a step's own pixels, where it is measured.
+
+    Attributes:
+      weight: weight of the loss.
+    """
+
+    weight: float
+
+
+DepthSupervision = PointSupervision | PixelSupervision
 
 
 def depth_divergence(
@@ -83,7 +95,7 @@ def depth_divergence(
 
 
 def mean_divergence(
-    supervision: DepthSupervision,
+    supervision: PointSupervision,
     key: jax.Array,
     num_pixels: int,
     see: Callable[..., list[tuple[jax.Array, jax.Array]]],
@@ -99,7 +111,6 @@ def mean_divergence(
     """
     key_draw, key_see = jax.random.split(key)
     points = supervision.sightings
-    assert points is not None
     count = max(1, round(supervision.share * num_pixels))
     drawn = jax.random.randint(key_draw, (count,), 0, len(points.view))
     view, pixels, depth, deviation = (jnp.asarray(x)[drawn] for x in points[1:])

@@ -16,6 +16,8 @@ import jax.numpy as jnp
 from jaxcloseup.fields.contract import RadianceField, Rendering
 from jaxcloseup.fields.volume.depth_supervision import (
     DepthSupervision,
+    PixelSupervision,
+    PointSupervision,
     mean_divergence,
     measured_divergence,
 )
@@ -135,13 +137,13 @@ def ray_field(
         rendering.
       chunk: rays traced, and in training differentiated, at once; None for all.
       loss: `photometric_loss` by default.
-      supervision: a loss on depth, for renderings with a key: a penalty, or without sightings the
+      supervision: a loss on depth, for renderings with a key: a penalty of points, or of pixels the
         field's `depth_loss`.
 
     Returns:
       A field whose `render` takes single pixels, also with stacked cameras.
     """
-    depth_loss = _measured_loss(supervision)
+    depth_loss = _depth_loss(supervision) if isinstance(supervision, PixelSupervision) else None
 
     def trace_pixels(
         params: Any,
@@ -167,7 +169,7 @@ def ray_field(
         bound = functools.partial(trace_pixels, params, buffers)
         lit = depth_loss is not None and key is not None
         rendering = bound(camera, pixels, key, _with_light if lit else lambda seen: seen.rendering)
-        if supervision is not None and depth_loss is None and key is not None:
+        if isinstance(supervision, PointSupervision) and key is not None:
             see = functools.partial(bound, take=lambda traced: traced.light)
             key = jax.random.fold_in(key, _SUPERVISED)
             more = mean_divergence(supervision, key, len(pixels), see)
@@ -178,10 +180,8 @@ def ray_field(
     return RadianceField(init, render, loss, gradient_chunk=chunk, depth_loss=depth_loss)
 
 
-def _measured_loss(supervision: DepthSupervision | None) -> Callable[..., jax.Array] | None:
-    """Return the field's `depth_loss` where pixels learn from their measured depth."""
-    if supervision is None or supervision.sightings is not None:
-        return None
+def _depth_loss(supervision: PixelSupervision) -> Callable[..., jax.Array]:
+    """Return a field's `depth_loss`."""
 
     def depth_loss(rendering: Rendering, depth: jax.Array, trust: jax.Array) -> jax.Array:
         return supervision.weight * measured_divergence(rendering.aux.light, depth, trust)

@@ -11,7 +11,12 @@ import pytest
 from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.methods.shared.sightings import find_sightings
 from jaxcloseup.fields.contract import Rendering
-from jaxcloseup.fields.volume.depth_supervision import DepthSupervision, Sightings, depth_divergence
+from jaxcloseup.fields.volume.depth_supervision import (
+    PixelSupervision,
+    PointSupervision,
+    Sightings,
+    depth_divergence,
+)
 from jaxcloseup.fields.volume.rays import Extent, Traced, VolumeAux, ray_field
 from jaxcloseup.photos.scene import Scene, SceneError
 
@@ -87,7 +92,7 @@ def test_a_field_adds_the_loss_of_rays_through_points_to_steps_alone():
     )
     fields = [
         ray_field(Extent(1.0, 3.0), init=None, trace=trace, chunk=4, supervision=supervision)
-        for supervision in (None, DepthSupervision(points, 0.3, 0.5))
+        for supervision in (None, PointSupervision(points, 0.3, 0.5))
     ]
     params, pixels = jnp.array([0.25, 0.75]), jnp.ones((6, 2))
     target, weight = jnp.ones((6, 3)), jnp.ones(6)
@@ -103,14 +108,10 @@ def test_a_field_adds_the_loss_of_rays_through_points_to_steps_alone():
     np.testing.assert_allclose(losses(jax.random.key(0)), expected, rtol=1e-3)
 
 
-def test_without_points_pixels_learn_from_their_measured_depth():
+def test_pixels_learn_from_their_measured_depth():
     """Of five pixels one is unknown, one half trusted; whole images keep no light."""
     field = ray_field(
-        Extent(1.0, 3.0),
-        init=None,
-        trace=trace,
-        chunk=4,
-        supervision=DepthSupervision(None, 0.3, 0.5),
+        Extent(1.0, 3.0), init=None, trace=trace, chunk=4, supervision=PixelSupervision(0.3)
     )
     params, camera = jnp.array([0.25, 0.75]), plane.camera_above(0.0, 0.0, 4.0)
     depth, trust = jnp.array([2.2, 1.5, 0.0, 2.9, 2.9]), jnp.array([1.0, 1.0, 0.0, 0.5, 1.0])

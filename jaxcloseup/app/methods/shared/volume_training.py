@@ -9,7 +9,11 @@ import optax
 from jaxcloseup.app.methods.shared.sightings import find_sightings
 from jaxcloseup.app.methods.volumes import AdamConfig, DepthConfig
 from jaxcloseup.fields.contract import RadianceField
-from jaxcloseup.fields.volume.depth_supervision import DepthSupervision
+from jaxcloseup.fields.volume.depth_supervision import (
+    DepthSupervision,
+    PixelSupervision,
+    PointSupervision,
+)
 from jaxcloseup.fields.volume.rays import Extent
 from jaxcloseup.photos.scene import Scene
 
@@ -36,8 +40,9 @@ def build_field(
 def _depth_supervision(config: DepthConfig, scene: Scene) -> DepthSupervision | None:
     if not config.depth_weight:
         return None
-    sightings = None if config.depth_from == "stereo" else find_sightings(scene)
-    return DepthSupervision(sightings, config.depth_weight, config.depth_share)
+    if config.depth_from == "stereo":
+        return PixelSupervision(config.depth_weight)
+    return PointSupervision(find_sightings(scene), config.depth_weight, config.depth_share)
 
 
 def grid_adam(config: AdamConfig, scene: Scene) -> optax.GradientTransformation:
