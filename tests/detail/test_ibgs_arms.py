@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.studies import ibgs_arms
 from experiments.studies.ibgs_arms import Gathered, Head, add_by_head, train_head, without
 from jaxcloseup.detail.add import Detail
 from jaxcloseup.detail.weights import mix
@@ -30,14 +31,15 @@ def test_an_untrained_head_changes_nothing():
     np.testing.assert_allclose(add_by_head(params, seen), expected, atol=1e-6)
 
 
-def test_a_head_learns_what_neighbors_show():
+def test_a_head_learns_what_neighbors_show(monkeypatch):
     """What is missing is the residual of the pixel to the left, which a single pixel hides."""
+    monkeypatch.setattr(ibgs_arms, "_CROP", 32)
     missing, seen = [], []
     for seed in range(4):
-        view = gathered((120, 130), seed)
+        view = gathered((60, 70), seed)
         seen.append(view._replace(residual=view.residual / 2, colors=0 * view.colors))
         missing.append(np.roll(seen[-1].residual, 1, axis=1))
-    params = train_head(list(zip(seen[:3], missing[:3], strict=True)), 120)
+    params = train_head(list(zip(seen[:3], missing[:3], strict=True)), 200)
     inner, visible = np.s_[4:-4, 4:-4], seen[3].seen[..., None]
     off = np.abs(np.asarray(add_by_head(params, seen[3])) - missing[3]) * visible
     assert off[inner].mean() < 0.5 * np.abs(missing[3] * visible)[inner].mean()
