@@ -4,6 +4,7 @@ import dataclasses
 import json
 import re
 import shutil
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -152,6 +153,20 @@ def test_the_ladder_says_what_each_step_adds(tmp_path, capsys):
     out = capsys.readouterr().out
     assert "| paper | 21.00 | 0.500 | 21.50 | - | 31.00 | 0.500 | - | - | 23.00 |" in out
     assert "| +1.50 (+1.00 to +2.00) | +0.00 (+0.00 to +0.00) | 23.00 |" in out
+
+
+def test_each_step_of_the_ladder_keeps_those_before_it_since_a_preset(monkeypatch):
+    made = []
+    given = SimpleNamespace(shorter=1, given=["seed=0"], output_dir="runs")
+    monkeypatch.setattr(paper_regime, "FLAGS", given)
+    monkeypatch.setattr(paper_regime, "_run", lambda folder, scene, *words: made.append(words))
+    assert paper_regime.ladder_results("table") == {}
+    presets = [[word for word in words if "preset" in word] for words in made]
+    assert presets == 3 * [["--preset=paper"]] + 2 * [["--preset=quick"]]
+    settings = [{word for word in words if word.startswith("--set")} for words in made]
+    assert settings[0] == settings[4] == set() and settings[1] < settings[2]
+    assert settings[3] == {"--set=stereo.pixels=0"}
+    assert all("--seed=0" in words for words in made)
 
 
 def test_a_shorter_regime_has_no_other_proportions():

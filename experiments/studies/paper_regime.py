@@ -70,12 +70,13 @@ _ROWS = {
     "test time, labels by detail": ("test time, labels by detail", "test_time_control"),
     "render with detail": ("detail", "control"),
 }
-# Steps from the paper's baseline to ours: flags of runs, each with all before it but the preset.
+# Steps from the paper's baseline to ours: flags of runs, each with those before it since a preset.
 LADDER = {
     "paper": ("--preset=paper",),
     "scales at most 0.1 extents": ("--set=max_scale=0.1",),
     "antialiasing": ("--set=raster.antialias=true",),
-    "windows, depth by stereo, shorter (quick)": ("--preset=quick",),
+    "windows, a coarse model first, shorter": ("--preset=quick", "--set=stereo.pixels=0"),
+    "depth by stereo (quick)": ("--preset=quick",),
 }
 # What `--shorter` divides: settings of presets that are counts of steps before the close-ups.
 _LENGTHS = ("baseline_steps", "means_lr_steps", "sh_every", "regularize_from")
@@ -135,8 +136,10 @@ def ladder_results(scene: str) -> dict[str, Results]:
     given: Sequence[str] = ()
     found = {}
     for index, (title, added) in enumerate(LADDER.items()):
-        preset = added[0].removeprefix("--preset=") if added[0].startswith("--preset") else None
-        given = _of("surfels", preset) if preset else [*given, *added]
+        first, *rest = added
+        if first.startswith("--preset="):
+            given, added = _of("surfels", first.removeprefix("--preset=")), tuple(rest)
+        given = [*given, *added]
         kind, alone = (f"ladder_{index}", _ALONE) if index else ("paper", ())
         if results := _run(_folder(kind), scene, *given, *alone):
             found[title] = results
