@@ -116,6 +116,7 @@ def test_surfels_run_through_all_stages_from_random_points(
     coarse = CoarseConfig(field, steps=20, poses=True)
     steps = {"downscale": 2, "coarse": coarse, "windows": WindowConfig()}
     steps["targets"] = TargetConfig("residual", lr_scale=2.0)
+    steps["labels"] = dataclasses.replace(TINY_SURFELS.labels, expected_depth=True)
     fine = dataclasses.replace(TINY_SURFELS.field, capacity=800, selective_adam=True)
     preset = dataclasses.replace(TINY_SURFELS, field=fine, **steps)
     stages = ["closeup", "test_time"]
@@ -151,6 +152,8 @@ def test_surfels_run_through_all_stages_from_random_points(
         assert stages["closeup"] == stages["control"]
     # Target views learn from renders with detail, which the gate of warps does not concern.
     latest = "closeup" if use_labels else "control"
+    # All stages render the depth that labels are made from, so their errors can be compared.
+    assert restore(read_run(tmp_path), scene, latest)[1].buffers.expected == 1
     assert (tmp_path / "detail" / f"{latest}.npz").exists()
     assert [entry["step"] for entry in results["history"]["test_time"]] == [1, 2]
     assert "test_time_control" not in stages

@@ -107,12 +107,12 @@ def run_stages(
     `baseline` always runs; `output_dir` gets renders and exports.
     """
     run = train_baseline_stage(training, run_keys(seed), output_dir, perceptual)
-    preset, baseline = run.programs.preset, run.state
+    preset = run.programs.preset
     # Without labels `closeup` is its control: the same steps on the same photographs.
     labeled = uses_labels(preset.labels, run.gate)
     if "control" in to_run or ("closeup" in to_run and not labeled):
         data = TrainData(run.programs.photographs)
-        run.stage, run.state = "control", run.train("control", baseline, data)
+        run.stage, run.state = "control", run.train("control", run.start.state, data)
     if "closeup" in to_run and labeled:
         closeups = closeup_data(run)
         run.stage, run.state = "closeup", run.train("closeup", run.start.state, closeups)
@@ -157,7 +157,7 @@ def train_baseline_stage(
     write_truth(output_dir / "renders" / "truth", held_out.all)
     write_exposures(output_dir, programs.exposures, programs.scene.names["train"])
     scorer = Scorer(training, held_out, output_dir, perceptual)
-    scorer.score("baseline", state)
+    scorer.score("baseline", start.state)  # the depth of all stages is the one that labels use
     with timed(training.seconds, "gate"):
         gate = weigh(programs, start)
     settings = gated(labels, gate)

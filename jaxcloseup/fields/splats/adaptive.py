@@ -20,6 +20,7 @@ from flax import struct
 
 from jaxcloseup.fields.splats.config import AdaptiveConfig
 from jaxcloseup.fields.splats.control import DensityControl, is_due, replace_surfels
+from jaxcloseup.fields.splats.filters import kept_opacity
 from jaxcloseup.fields.splats.surfels import Surfels
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.geometry.numerics import matmul, safe_norm
@@ -183,11 +184,23 @@ def _place_copies(
     return source, added, parent
 
 
-def reset_opacities(surfels: OffsetSurfels, config: AdaptiveConfig) -> OffsetSurfels:
-    """Return surfels whose opacities are at most `config.reset_opacity`."""
-    # Needless surfels fade between two resets (Kerbl et al., section 5.2); others recover.
-    most = jnp.log(config.reset_opacity / (1 - config.reset_opacity))
-    return surfels.replace(opacity_logits=jnp.minimum(surfels.opacity_logits, most))
+def reset_opacities(
+    surfels: OffsetSurfels, config: AdaptiveConfig, interval: jax.Array | None = None
+) -> OffsetSurfels:
+    """Return surfels whose opacities are at most `config.reset_opacity`, as they are drawn.
+
+    Args:
+      surfels: `N` surfels.
+      config: settings.
+      interval: `[N]` of the filter in space, which lowers opacities; None without it.
+    """
+    # Needless surfels fade between two resets (Kerbl et al., section 5.2); others recover. What is
+    # not drawn at all, as a small surfel would be if the filter came on top, would get no gradient.
+    most = jnp.full_like(surfels.opacity_logits, config.reset_opacity)
+    if interval is not None:
+        most = jnp.minimum(most / kept_opacity(surfels, interval), 1 - 1e-6)
+    logits = jnp.log(most) - jnp.log1p(-most)
+    return surfels.replace(opacity_logits=jnp.minimum(surfels.opacity_logits, logits))
 
 
 def _refine(key: jax.Array, state: Any, config: AdaptiveConfig, extent: float) -> Any:
@@ -215,6 +228,6 @@ def _reset(state: Any, config: AdaptiveConfig) -> Any:
         for moment in (moments.mu, moments.nu)
     )
     return state.replace(
-        params=reset_opacities(state.params, config),
+        params=reset_opacities(state.params, config, state.buffers.interval),
         opt_state=(gradients, (moments._replace(mu=mu, nu=nu), *others)),
     )

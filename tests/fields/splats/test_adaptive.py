@@ -19,6 +19,7 @@ from jaxcloseup.fields.splats.adaptive import (
     reset_opacities,
     with_image_offset,
 )
+from jaxcloseup.fields.splats.filters import smoothed
 from jaxcloseup.fields.splats.splat_field import surfel_field
 from jaxcloseup.fields.splats.splat_optimizer import surfel_optimizer
 from jaxcloseup.geometry.cameras import points_to_pixels
@@ -117,6 +118,20 @@ def test_a_reset_leaves_nothing_opaque():
         reset_opacities(scene_of(np.full(COUNT, SMALL), opacities), CONFIG).opacity_logits
     )
     np.testing.assert_allclose(after, np.where(np.arange(COUNT) % 2, 0.01, 0.003), rtol=1e-4)
+
+
+def test_a_reset_counts_what_the_filter_in_space_takes():
+    """Small surfels, of which the filter leaves little, are drawn as opaque as all others."""
+    opacities = np.where(np.arange(COUNT) % 2, 0.9, 0.003)
+    before = scene_of(np.full(COUNT, SMALL), opacities)
+    interval = jnp.asarray(np.geomspace(0.1, 100, COUNT) * SMALL, jnp.float32)
+
+    def drawn(surfels):
+        return np.asarray(jax.nn.sigmoid(smoothed(surfels, interval).opacity_logits))
+
+    after = drawn(reset_opacities(before, CONFIG, interval))
+    np.testing.assert_allclose(after, np.minimum(drawn(before), 0.01), rtol=1e-3)
+    assert drawn(before).max() > 0.8 and drawn(before).min() < 0.001
 
 
 def test_training_records_image_gradients_and_adds_surfels():
