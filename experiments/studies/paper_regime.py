@@ -136,9 +136,8 @@ def ladder_results(scene: str) -> dict[str, Results]:
     given: Sequence[str] = ()
     found = {}
     for index, (title, added) in enumerate(LADDER.items()):
-        first, *rest = added
-        if first.startswith("--preset="):
-            given, added = _of("surfels", first.removeprefix("--preset=")), tuple(rest)
+        if added[0].startswith("--preset="):
+            given, added = _of("surfels", added[0].removeprefix("--preset=")), added[1:]
         given = [*given, *added]
         kind, alone = (f"ladder_{index}", _ALONE) if index else ("paper", ())
         if results := _run(_folder(kind), scene, *given, *alone):
