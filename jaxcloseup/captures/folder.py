@@ -103,13 +103,9 @@ def _load(listing: Listing, reading: Reading) -> Scene:
         listing = _with_points(listing, parts["train"], camtoworld, intrinsics)
     near, far = _near_far(listing, camtoworld, intrinsics, sizes)
 
-    width, height = sizes.max(0).tolist()
     ends = np.cumsum([len(members) for members in parts.values()])[:-1]
     rows = dict(zip(parts, np.split(np.arange(len(photos)), ends), strict=True))
-    views = {
-        split: _padded(part, intrinsics[rows[split]], height, width)
-        for split, part in parts.items()
-    }
+    views = {split: _padded(part, intrinsics[rows[split]]) for split, part in parts.items()}
     files = {split: [photo.frame.file for photo in part] for split, part in parts.items()}
     names = {split: unique_names(paths) for split, paths in files.items()}
     metadata = {
@@ -193,8 +189,9 @@ def _camera(photo: Photo, reading: Reading) -> Camera:
     )
 
 
-def _padded(photos: Sequence[Photo], intrinsics: np.ndarray, height: int, width: int) -> Views:
-    """Pad photographs to one size."""
+def _padded(photos: Sequence[Photo], intrinsics: np.ndarray) -> Views:
+    """Pad the photographs of a split to one size."""
+    width, height = np.array([photo.size for photo in photos]).max(0).tolist()
     poses = np.stack([photo.frame.camtoworld for photo in photos])
     return Views(
         cameras=Camera(

@@ -25,8 +25,13 @@ def test_steps_and_schedules_follow_from_the_time_of_a_step(monkeypatch, wanted)
     )
     times = minutes._Times(reading=0.0, before=6.0, step=0.01)
     monkeypatch.setattr(minutes, "_time_steps", lambda *_: times)
-    monkeypatch.setattr(minutes, "Programs", lambda *_: types.SimpleNamespace(read=None))
-    fitted, given, _ = minutes.fit_minutes(preset, None, wanted)
+    monkeypatch.setattr(minutes, "Programs", lambda *_: types.SimpleNamespace(read="read"))
+    finest = {100: 4}  # by steps: more read finer photographs
+    monkeypatch.setattr(minutes, "finest_read", lambda of, _: finest.get(of.baseline_steps, 3))
+    fitted, given, read = minutes.fit_minutes(preset, None, wanted)
+    assert isinstance(read, minutes.ReadPhotographs)  # what a resumed run would read, too
+    finest[100] = 3
+    assert minutes.fit_minutes(preset, None, wanted).read == "read"
     assert fitted.baseline_steps == 6000 * wanted - 600
     with monkeypatch.context() as patch:  # half of the minutes are for the steps
         slow = times._replace(before=50.0 * wanted)

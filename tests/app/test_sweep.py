@@ -125,14 +125,15 @@ def test_a_sweep_cut_off_and_resumed_ends_the_same(capture_folder, tmp_path, mon
     monkeypatch.setattr(programs, "render", render_and_note)
     whole = sweep_tiny(scene, tmp_path / "sweep").scores
     assert rendered_by == {1} and len(jax.devices()) == 8  # devices
-    assert list(whole) == ["baseline", "control", "diverse", "test_time"]
+    assert list(whole) == ["baseline", "control", "diverse", "test_time", "test_time_control"]
     assert all(list(of_arm) == ["0", "1"] for of_arm in whole.values())
     psnr = {arm: whole[arm]["0"]["splits"]["test"]["psnr"] for arm in whole}
     assert len({psnr["baseline"], psnr["control"], psnr["diverse"]}) == 3
     other = whole["control"]["1"]["splits"]["test"]["psnr"]
     assert psnr["control"] != other
 
-    for stage in ("arms_1", "test_time_0", "test_time_1"):  # as if stopped after the first arms
+    in_turn = [f"test_time{arm}_{seed}" for arm in ("", "_control") for seed in (0, 1)]
+    for stage in ("arms_1", *in_turn):  # as if stopped after the first arms
         shutil.rmtree(tmp_path / "sweep" / stage)
     capsys.readouterr()
     compare = tmp_path / "compare"
@@ -141,12 +142,12 @@ def test_a_sweep_cut_off_and_resumed_ends_the_same(capture_folder, tmp_path, mon
     pictures = comparisons(compare, again.shown, again.images)
     assert capsys.readouterr().out.count("resumed") == 3  # both baselines and the first arms
 
-    # Truth, four arms and the error of the last, of the one close-up and the one ordinary view.
+    # Truth, five arms and the error of the last, of the one close-up and the one ordinary view.
     assert [picture.section for picture in pictures] == ["Close-ups", "Ordinary views"]
     assert len(list(compare.iterdir())) == 2
     truth = np.asarray(scene.test.rgb[0]).repeat(8, axis=0).repeat(8, axis=1)  # at least 240 wide
     height, width = truth.shape[:2]
-    starts = [(width + 8) * i for i in range(6)]
+    starts = [(width + 8) * i for i in range(7)]
     panels = [pictures[0].image[-height:, x : x + width].astype(int) for x in starts]
     np.testing.assert_array_equal(panels[0], truth)
     assert np.abs(panels[1] - panels[3]).max() > 0  # baseline and diverse
@@ -154,7 +155,7 @@ def test_a_sweep_cut_off_and_resumed_ends_the_same(capture_folder, tmp_path, mon
     about = {"method": "nerf", "preset": "tiny"}
     write_sweep(tmp_path, {scene.name: whole}, about, pictures)
     table = list(csv.DictReader((tmp_path / "table.csv").read_text().splitlines()))
-    assert [row["arm"] for row in table[:4]] == list(whole)
+    assert [row["arm"] for row in table[:5]] == list(whole)
     expected = np.mean([psnr["control"], other])
     assert float(table[1]["psnr"]) == pytest.approx(expected)
     assert json.loads((tmp_path / "sweep.json").read_text())["scenes"][scene.name] == whole
@@ -192,6 +193,17 @@ def test_rows_are_means_over_everything_and_gains_are_paired():
     # A seed that lacks a view is no other seed's equal.
     del scenes["a"]["better"]["1"]["splits"]["test"]["views"]["1"]
     assert rows(scenes)[1].spread is None
+
+
+def test_an_arm_with_a_control_of_its_own_gains_over_that():
+    scenes = {
+        "a": {
+            "control": {"0": result([10.0, 30.0])},
+            "test_time": {"0": result([13.0, 33.0])},
+            "test_time_control": {"0": result([12.0, 32.0])},
+        }
+    }
+    assert [row.gain for row in rows(scenes)] == [None, pytest.approx(1), None]
 
 
 def test_a_sweep_whose_arms_all_failed_has_no_pictures(tmp_path):

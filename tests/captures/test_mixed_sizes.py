@@ -17,7 +17,7 @@ from jaxcloseup.app.score.targets import targets_by_split
 from jaxcloseup.app.view import frames
 from jaxcloseup.app.view.camera_paths import orbit, resized_shots, view_shots
 from jaxcloseup.captures.load import load_scene
-from jaxcloseup.detail.residuals import render_residuals
+from jaxcloseup.detail.residuals import make_detail, render_residuals
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.labels.target_views import render_depths
 from jaxcloseup.photos.pyramids import scene_pyramid
@@ -29,18 +29,23 @@ ALONG, ACROSS = (32, 24), (24, 32)  # width, height
 SIZES = {"a": ALONG, "b": ACROSS}
 
 
+def write_capture(folder, sizes):
+    """Write photographs of random pixels, twice as large as the sizes of each split."""
+    rng = np.random.default_rng(0)
+    for split, named in sizes.items():
+        for name, (width, height) in named.items():
+            pixels = rng.integers(0, 256, (2 * height, 2 * width, 3), np.uint8)
+            write_image(folder / split / f"{name}.png", pixels)
+        lens = {name: {"w": 2 * w, "h": 2 * h, "cx": w, "cy": h} for name, (w, h) in named.items()}
+        listed = [frame(f"{split}/{name}.png", **lens[name]) for name in named]
+        write_json(folder / f"transforms_{split}.json", listed)
+    return load_scene(folder, downscale=2)
+
+
 @pytest.fixture
 def scene(tmp_path):
-    """Two photographs of a split, of random pixels; twice as large in their files."""
-    rng = np.random.default_rng(0)
-    for split in ("train", "test"):
-        for name, (width, height) in SIZES.items():
-            pixels = rng.integers(0, 256, (2 * height, 2 * width, 3), np.uint8)
-            write_image(tmp_path / split / f"{name}.png", pixels)
-        lens = {name: {"w": 2 * w, "h": 2 * h, "cx": w, "cy": h} for name, (w, h) in SIZES.items()}
-        listed = [frame(f"{split}/{name}.png", **lens[name]) for name in SIZES]
-        write_json(tmp_path / f"transforms_{split}.json", listed)
-    return load_scene(tmp_path, downscale=2)
+    """Two photographs of a split, along and across."""
+    return write_capture(tmp_path, {"train": SIZES, "test": SIZES})
 
 
 def render(camera, taken=None):
@@ -54,6 +59,14 @@ def render(camera, taken=None):
 def picture(path):
     image = cv2.imread(str(path))
     return image, image.shape[1::-1]
+
+
+def test_larger_held_out_photographs_pad_no_training_photograph(tmp_path):
+    """Where a capture's only photograph across is held out, detail has the size of the others."""
+    scene = write_capture(tmp_path, {"train": {"a": ALONG, "b": ALONG}, "test": {"c": ACROSS}})
+    assert scene.train.weight.shape[1:] == (24, 32) and scene.test.weight.shape[1:] == (32, 24)
+    found = make_detail(render, scene.train, scene_pyramid(scene)[0], None)
+    assert found.sources.trust.shape == (2, 48, 64)
 
 
 def test_padding_is_neither_scored_nor_written(scene, tmp_path):

@@ -17,6 +17,7 @@ import numpy as np
 from jaxcloseup.app.report.page import Picture, by_section, fill_page
 from jaxcloseup.app.report.plots import Curve, line_plot
 from jaxcloseup.app.report.record_table import Table, format_number, markdown, print_tables
+from jaxcloseup.app.run.stage_names import OWN_CONTROL
 from jaxcloseup.app.score.ladder import MAGNIFICATIONS, PREFIX
 from jaxcloseup.app.score.metrics_text import SPLIT_TITLES
 from jaxcloseup.io.files import write_file, write_json
@@ -106,10 +107,15 @@ class Gain(NamedTuple):
 
 
 def gain_over_control(scenes: Scenes, arm: str, split: str) -> Gain | None:
-    """Return an arm's gain over control on the views that both have; None without such views."""
-    if arm == "control":
+    """Return an arm's gain over control on the views that both have; None without such views.
+
+    Control is the arm's own, if it has one, which takes as many steps as the arm does.
+    """
+    arms = _arms(scenes)
+    own = f"{arm}{OWN_CONTROL}"
+    control = _by_view(scenes, own if own in arms else "control", split, "psnr")
+    if arm == "control" or arm.removesuffix(OWN_CONTROL) in set(arms) - {arm}:
         return None
-    control = _by_view(scenes, "control", split, "psnr")
     pairs: dict[tuple[str, str], list[float]] = {}
     for (scene, seed, view), value in _by_view(scenes, arm, split, "psnr").items():
         if (scene, seed, view) in control:

@@ -18,7 +18,7 @@ import numpy as np
 import jaxcloseup
 from jaxcloseup.app import progress
 from jaxcloseup.app.run.manifest import hash_data
-from jaxcloseup.app.run.photograph_sizes import describe_photographs
+from jaxcloseup.app.run.photograph_sizes import describe_photographs, finest_read
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.residuals import render_residuals, reproduced
 from jaxcloseup.detail.add import Detail, Detailed, add_to_rendering, label_with_detail
@@ -137,9 +137,10 @@ def refresh_detail(
 
 def _hash(programs: Programs, state: TrainState) -> str:
     """Return a hash of what detail depends on: the state, the photographs, this version."""
-    made_by = f"{jaxcloseup.__version__} {_RECIPE} {hash_data(programs.scene)}"
+    finest = finest_read(programs.preset, programs.scene)
+    made_by = f"{jaxcloseup.__version__} {_RECIPE} {finest} {hash_data(programs.scene)}"
     digest = hashlib.sha256(made_by.encode())
-    for leaf in jax.tree.leaves((state.params, state.buffers)):
+    for leaf in jax.tree.leaves((state.params, state.buffers, programs.exposures)):
         digest.update(np.ascontiguousarray(leaf).data)
     return digest.hexdigest()
 

@@ -61,7 +61,10 @@ def fit_minutes(preset: Preset, scene: Scene, minutes: float) -> Fitted:
     left = 60 * minutes - (time.perf_counter() - start - seconds.reading) - seconds.before
     steps = max(_FEWEST, 10 * round(max(left, 30 * minutes) / seconds.step / 10))
     given += [f"baseline_steps={steps}", *_schedules(preset, steps)]
-    return Fitted(with_settings(preset, given), given, programs.read)
+    fitted = with_settings(preset, given)
+    # More steps may read finer photographs, and match these: a resumed run would, from the start.
+    same = finest_read(fitted, scene) == finest_read(preset, scene)
+    return Fitted(fitted, given, programs.read if same else ReadPhotographs(scene))
 
 
 def _schedules(preset: Preset, steps: int) -> list[str]:

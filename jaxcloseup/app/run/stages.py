@@ -21,7 +21,7 @@ from jaxcloseup.app.run.measured_exposures import write_exposures
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.scoring import HeldOut, Scorer, hold_out
 from jaxcloseup.app.run.stage_names import STAGES
-from jaxcloseup.app.run.states import say_which_points_fit, train_baseline, train_coarse
+from jaxcloseup.app.run.states import match, say_which_points_fit, train_baseline, train_coarse
 from jaxcloseup.app.run.step_data import CloseupData, LabeledData, StepData, TrainData
 from jaxcloseup.app.run.timers import forget_compiled, timed
 from jaxcloseup.app.score.audit import audit_labels, left_out_curve
@@ -111,7 +111,8 @@ def run_stages(
     # Without labels `closeup` is its control: the same steps on the same photographs.
     labeled = uses_labels(preset.labels, run.gate)
     if "control" in to_run or ("closeup" in to_run and not labeled):
-        data = TrainData(run.programs.photographs)
+        scale = preset.labels.lr_scale
+        data = TrainData(run.programs.photographs, None if scale == 1 else jnp.float32(scale))
         run.stage, run.state = "control", run.train("control", run.start.state, data)
     if "closeup" in to_run and labeled:
         closeups = closeup_data(run)
@@ -150,12 +151,14 @@ def train_baseline_stage(
         coarse = train_coarse(training, "baseline", keys)
         with timed(training.seconds, "poses"):
             programs = training.programs = kept_or_corrected(programs, coarse, output_dir)
+    match(training)
+    # A run that is cut off is rendered with them, too.
+    write_exposures(output_dir, programs.exposures, programs.scene.names["train"])
     state = train_baseline(training, "baseline", keys, coarse)
     with timed(training.seconds, "depths"):
         start = start_labels(programs, state, keys, expected_depth=labels.expected_depth)
         held_out = hold_out(programs, start)
     write_truth(output_dir / "renders" / "truth", held_out.all)
-    write_exposures(output_dir, programs.exposures, programs.scene.names["train"])
     scorer = Scorer(training, held_out, output_dir, perceptual)
     scorer.score("baseline", start.state)  # the depth of all stages is the one that labels use
     with timed(training.seconds, "gate"):

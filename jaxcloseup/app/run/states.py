@@ -38,7 +38,7 @@ def train_baseline(
 ) -> TrainState:
     """Train stage 1 on photographs alone, from `coarse` or from what it trains before."""
     programs, preset = training.programs, training.programs.preset
-    stereo = _match(training)
+    stereo = match(training)
     if stereo is None and programs.method.renders_pixels and programs.field.depth_loss is not None:
         print("depth is learned from colors alone: depth_from=stereo has no matched photographs")
     if preset.coarse is None:
@@ -53,7 +53,7 @@ def train_baseline(
 
 def train_coarse(training: Training, stage: str, keys: RunKeys) -> TrainState:
     """Train `preset.coarse`, from which `stage` begins."""
-    programs, preset, stereo = training.programs, training.programs.preset, _match(training)
+    programs, preset, stereo = training.programs, training.programs.preset, match(training)
     assert preset.coarse is not None
     coarse = dataclasses.replace(training, programs=programs.coarse)
     return train_stage(
@@ -65,7 +65,7 @@ def train_coarse(training: Training, stage: str, keys: RunKeys) -> TrainState:
     )
 
 
-def _match(training: Training) -> StereoDepths | None:
+def match(training: Training) -> StereoDepths | None:
     """Return depth by stereo, if the preset begins with it; the first call is a part of the run."""
     stereo = training.programs.preset.stereo
     if stereo is None or not stereo.pixels:

@@ -59,7 +59,7 @@ class ArmScorer:
                     self._images[arm, split] = {
                         view.name: np.asarray(seen[view.name].rgb) for view in self._shown[split]
                     }
-        self.scores[arm][str(seed)] = {"skipped": skipped, "splits": splits}
+        self.scores.setdefault(arm, {})[str(seed)] = {"skipped": skipped, "splits": splits}
 
     def outcome(self) -> SweepOutcome:
         """Return all scores, with arms in the order in which the user named them."""

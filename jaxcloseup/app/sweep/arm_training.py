@@ -19,8 +19,9 @@ from jaxcloseup.app.run.loop import Training, TrainingError, train_stage
 from jaxcloseup.app.run.manifest import identity_of
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.scoring import hold_out
+from jaxcloseup.app.run.stage_names import OWN_CONTROL
 from jaxcloseup.app.run.states import say_which_points_fit, train_baseline
-from jaxcloseup.app.run.step_data import ArmsData, LabeledData
+from jaxcloseup.app.run.step_data import ArmsData, LabeledData, StepData, TrainData
 from jaxcloseup.app.score.scores import NO_PERCEPTUAL, Perceptual
 from jaxcloseup.app.sweep.arm_scoring import ArmScorer, SweepOutcome
 from jaxcloseup.app.sweep.ceilings import labels_with_better_depth, true_close_ups
@@ -65,10 +66,13 @@ def run_sweep(
     training.seconds = {} if seconds is None else seconds
     say_which_points_fit(programs)
     starts = Starts(training, seeds)
-    scorer = ArmScorer(programs, hold_out(programs, starts.of(0)), chosen, perceptual)
+    expected = preset.labels.expected_depth  # of all rows, so that their depth can be compared
+    held_out = hold_out(programs, starts.of(0, expected))
+    scorer = ArmScorer(programs, held_out, chosen, perceptual)
     for seed in range(seeds):
         if "baseline" in scorer.scores:
-            scorer.score("baseline", seed, starts.of(seed).state, starts.skipped[seed])
+            state = starts.of(seed, expected).state
+            scorer.score("baseline", seed, state, starts.skipped[seed])
     for first in range(0, len(together), max_parallel):
         group = together[first : first + max_parallel]
         train_together(training, f"arms_{first // max_parallel}", group, starts, scorer)
@@ -178,9 +182,12 @@ def join_arms(
 def train_in_turn(
     training: Training, arm: Arm, seed: int, start: LabelStart, scorer: ArmScorer
 ) -> None:
-    """Train and score one arm on views that are labeled before its first step."""
-    name, programs = f"{arm.name}_{seed}", training.programs
-    state, steps = start.state, programs.preset.closeup_steps
+    """Train and score one arm on views that are labeled before its first step.
+
+    `test_time`, which takes other steps than `control`, has a control of its own.
+    """
+    programs, preset = training.programs, training.programs.preset
+    state, steps, control = start.state, preset.closeup_steps, None
     get_detail = detail_getter(programs, state)
     if arm.kind == "test_time":
         assert programs.scene.test is not None  # `choose_arms` leaves out arms that need it
@@ -188,16 +195,36 @@ def train_in_turn(
         state, data, steps, _ = prepare_target_views(
             programs, start, cameras, arm.labels, arm.settings, get_detail
         )
+        rate = arm.settings.lr_scale
+        if preset.targets is not None:
+            rate = jnp.float32(preset.targets.control_lr_scale)
+        control = TrainData(data.views, rate)
     else:
         exact = scorer.held_out.exact
         labels = label_arm(programs, arm, run_keys(seed), start, get_detail, exact)
         data = LabeledData(programs.photographs, labels, arm.settings)
+    _train_and_score(training, (arm.name, seed), state, data, steps, scorer)
+    if control is not None:
+        own = f"{arm.name}{OWN_CONTROL}", seed
+        _train_and_score(training, own, start.state, control, steps, scorer)
+
+
+def _train_and_score(
+    training: Training,
+    arm: tuple[str, int],
+    state: TrainState,
+    data: StepData,
+    steps: int,
+    scorer: ArmScorer,
+) -> None:
+    """Train and score an arm, a name and a seed; leave out one that is no longer finite."""
+    stage = f"{arm[0]}_{arm[1]}"
     try:
-        state = train_stage(training, name, state, data, steps=steps)
+        state = train_stage(training, stage, state, data, steps=steps)
     except TrainingError as error:
-        print(f"{name} is left out: {error}")
+        print(f"{stage} is left out: {error}")
         return
-    scorer.score(arm.name, seed, state, count_skipped(training.history[name]))
+    scorer.score(*arm, state, count_skipped(training.history[stage]))
 
 
 def label_arm(
