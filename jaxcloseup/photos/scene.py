@@ -14,6 +14,10 @@ from jaxcloseup.io.placement import UNMOVED, Placement
 from jaxcloseup.photos.views import Photograph, Views, camera_at
 
 
+_FINER = 4  # times as fine as photographs are surfaces that may hide points
+_NEARER = 1.01  # times the depth of a surface up to which a point lies on it
+
+
 class SceneError(ValueError):
     """The scene cannot be loaded; the message is one printable sentence that says what to do."""
 
@@ -132,6 +136,8 @@ class Scene:
 def keep_photographs(scene: Scene, chosen: Sequence[int]) -> Scene:
     """Return the scene with some training photographs, and the points that two of them see.
 
+    A point that only photographs see that do not stay would tell of places that none shows.
+
     Args:
       scene: a scene whose metadata say nothing of single training photographs.
       chosen: indices of the training photographs that stay.
@@ -149,12 +155,17 @@ def keep_photographs(scene: Scene, chosen: Sequence[int]) -> Scene:
         return [found[i] for i in chosen] if split == "train" else found
 
     train = take(scene.train)
-    size = np.array([train.cameras.width, train.cameras.height], np.float32)
-    points = jnp.asarray(scene.points)
+    surface = scene.surface
+    exact = None if surface is None else jax.jit(lambda camera: surface(camera).depth)
     times_seen = np.zeros(len(scene.points), int)
     for view in range(len(rows)):
-        pixels, depth = map(np.asarray, points_to_pixels(camera_at(train.cameras, view), points))
-        times_seen += np.all((pixels >= 0) & (pixels < size), axis=-1) & (depth > 0)
+        camera = camera_at(train.cameras, view)
+        depths = None
+        if exact is not None:
+            finer = {"height": _FINER * camera.height, "width": _FINER * camera.width}
+            camera = camera.replace(intrinsics=_FINER * camera.intrinsics, **finer)
+            depths = np.asarray(exact(camera))
+        times_seen += _see(camera, scene.points, depths)
     metadata = dict(scene.metadata)
     if own := metadata.get("own_sizes"):
         metadata["own_sizes"] = own | {"train": [own["train"][i] for i in chosen]}
@@ -167,6 +178,23 @@ def keep_photographs(scene: Scene, chosen: Sequence[int]) -> Scene:
         names=scene.names | {"train": [scene.names["train"][i] for i in chosen]},
         photographs_at=scene.photographs_at and photographs_at,
     )
+
+
+def _see(camera: Camera, points: np.ndarray, depths: np.ndarray | None) -> np.ndarray:
+    """Return which points `[P]` lie in a camera's image, and not behind the depths `[H, W]`."""
+    pixels, depth = map(np.asarray, points_to_pixels(camera, jnp.asarray(points)))
+    size = np.array([camera.width, camera.height], np.float32)
+    seen = np.all((pixels >= 0) & (pixels < size), axis=-1) & (depth > 0)
+    if depths is None:
+        return seen
+    # Hidden is what lies behind all four pixels around it.
+    x, y = np.floor(np.where(seen[:, None], pixels, 0) - 0.5).astype(int).T
+    x, y = (
+        np.clip(corner + np.array([[0], [1]]), 0, end - 1)
+        for corner, end in ((x, camera.width), (y, camera.height))
+    )
+    around = depths[y[:, None], x[None]].max((0, 1))
+    return seen & (depth <= _NEARER * around)
 
 
 def move_photographs(scene: Scene, camtoworld: jax.Array) -> Scene:

@@ -212,7 +212,7 @@ def test_fewer_photographs_are_the_same_ones(scene):
     finer = fewer.photographs_at(DOWNSCALE)
     np.testing.assert_array_equal([photograph.rgb for photograph in finer], fewer.train.rgb)
     assert len(fewer.photographs_at(DOWNSCALE, "test")) == len(scene.test)
-    inside = np.ones(len(scene.points), bool)
+    inside, visible = np.ones((2, len(scene.points)), bool)
     for pose, lens in zip(
         np.asarray(scene.train.cameras.camtoworld)[views],
         np.asarray(scene.train.cameras.intrinsics)[views],
@@ -221,9 +221,18 @@ def test_fewer_photographs_are_the_same_ones(scene):
         x, y, z = ((scene.points - pose[:, 3]) @ pose[:, :3]).T
         column, row = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
         inside &= (z > 0) & (column >= 0) & (column < 48) & (row >= 0) & (row < 27)
-    assert 100 < inside.sum() < len(inside)
-    np.testing.assert_array_equal(fewer.points, scene.points[inside])
-    np.testing.assert_array_equal(fewer.rgb, scene.rgb[inside])
+        # An eighth of a pixel beside the point the surface is as far away, or hides it.
+        fine = Camera(jnp.asarray(pose), jnp.asarray(8 * lens), height=8 * 27, width=8 * 48)
+        depth = np.asarray(scene.surface(fine).depth)
+        y, x = (
+            np.clip(8 * at, 0, 8 * end - 1).astype(int) for at, end in ((row, 27), (column, 48))
+        )
+        visible &= inside & (z < 1.02 * depth[y, x])
+    kept = (scene.points[:, None] == fewer.points[None]).all(-1).any(1)
+    np.testing.assert_array_equal(fewer.points, scene.points[kept])
+    np.testing.assert_array_equal(fewer.rgb, scene.rgb[kept])
+    assert 100 < visible.sum() < 0.9 * inside.sum() and not kept[~inside].any()
+    assert kept[visible].mean() > 0.99 and kept[inside & ~visible].mean() < 0.3
 
 
 def test_photographs_far_apart_are_farther_apart(scene):
