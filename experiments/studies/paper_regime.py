@@ -22,6 +22,7 @@ from experiments.studies.tables import (
     CLOSEUPS,
     ORDINARY,
     Results,
+    field_and_detail,
     finished_runs,
     format_gain,
     gains,
@@ -68,7 +69,6 @@ _ROWS = {
     "test time, control": ("test_time_control", "test_time_control"),
     "test time, labels by the text": ("test_time", "test_time_control"),
     "test time, labels by detail": ("test time, labels by detail", "test_time_control"),
-    "render with detail": ("detail", "control"),
 }
 # Steps from the paper's baseline to ours: flags of runs, each with those before it since a preset.
 LADDER = {
@@ -156,12 +156,7 @@ def _of(method: str, preset: str) -> list[str]:
 
 
 def shorter(preset: Any, factor: int) -> list[str]:
-    """Return settings, as `name=value`, with which stage 1 of a preset is shorter in all parts.
-
-    Args:
-      preset: a preset of splats.
-      factor: what lengths are divided by.
-    """
+    """Return settings, `name=value`, that divide all lengths of stage 1 of a preset of splats."""
     parts = [("", preset, _LENGTHS), ("", preset.field, _LENGTHS)]
     parts += [("density.", preset.field.density, _DENSITY_LENGTHS)]
     return [
@@ -227,14 +222,12 @@ def train_arm(
 def print_scene(name: str, results: Results, others: Mapping[str, Results]) -> None:
     """Print the arms of a scene, and gains by where the nearest photographs look from."""
     rows = []
-    for title, (stage, over) in _ROWS.items():
+    for title, (stage, over) in _rows(results).items():
         if stage in results["stages"]:
-            gained = [
-                "-"
-                if stage == over or over not in results["stages"]
-                else format_gain(gains(results, split, stage, over))
-                for split in (CLOSEUPS, ORDINARY)
-            ]
+            compared = stage != over and over in results["stages"]
+            both = (CLOSEUPS, ORDINARY) if compared else ()
+            gained = [format_gain(gains(results, split, stage, over)) for split in both]
+            gained = gained or ["-", "-"]
             rows.append([title, *_scores(results, stage), *gained])
     rows += [[title, *_scores(other, "baseline"), "-", "-"] for title, other in others.items()]
     header = ["arm", "close-ups: PSNR", "SSIM", "color-corrected", "resolves (px)"]
@@ -243,17 +236,21 @@ def print_scene(name: str, results: Results, others: Mapping[str, Results]) -> N
     print_groups(name, results)
 
 
+def _rows(results: Results) -> dict[str, tuple[str, str]]:
+    """Return the rows, with detail over the stage that it is added to."""
+    return _ROWS | {"render with detail": field_and_detail(results)[::-1]}
+
+
 def print_ladder(name: str, found: Mapping[str, Results]) -> None:
     """Print the control of each step from the paper's baseline to ours, and what it adds."""
     rows, before = [], None
     for title, results in found.items():
         row = [title, *_scores(results, "control")]
         for split in (CLOSEUPS, ORDINARY):
-            views = results["stages"]["control"][split]["views"]
-            old = before and before["stages"]["control"][split]["views"]
-            gained = [views[view]["psnr"] - old[view]["psnr"] for view in views] if old else []
-            row.append(format_gain(gained) if gained else "-")
-        rows.append([*row, *_scores(results, "detail")[:1]])
+            alike = before and gains(results, split, "control", "control", of=before)
+            row.append(format_gain(alike) if alike else "-")
+        detailed = field_and_detail(results)[0] == "control"  # that of labels is another field's
+        rows.append([*row, *(_scores(results, "detail")[:1] if detailed else ["-"])])
         before = results
     header = ["with", "close-ups: PSNR", "SSIM", "color-corrected", "resolves (px)"]
     header += ["ordinary views: PSNR", "SSIM", "adds on close-ups (95 %)", "on ordinary views"]
@@ -280,7 +277,7 @@ def print_groups(name: str, results: Results) -> None:
             if chosen:
                 others = [f"{np.mean([views[view][m] for view in chosen]):.1f}" for m in _GROUPS]
                 control = f"{np.mean([views[view]['psnr'] for view in chosen]):.2f}"
-                gained = [_gain(stages, chosen, *_ROWS[arm]) for arm in _GROUPED]
+                gained = [_gain(stages, chosen, *_rows(results)[arm]) for arm in _GROUPED]
                 rows.append([f"{low} to {high}", str(len(chosen)), *others, control, *gained])
         if rows:
             header = [title, "close-ups", "mean angle", "mean ratio", "control: PSNR", *_GROUPED]

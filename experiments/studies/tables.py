@@ -42,8 +42,9 @@ def finished_runs(
 
 
 def field_and_detail(results: Results) -> tuple[str, str]:
-    """Return the stage of the field alone, and that with detail; short runs have no control."""
-    return "control" if "control" in results["stages"] else "baseline", "detail"
+    """Return the stage of the field alone that has detail, and that with detail."""
+    of = (results.get("detail") or {}).get("stage")
+    return of or ("control" if "control" in results["stages"] else "baseline"), "detail"
 
 
 def score(results: Results, stage: str, split: str, metric: str = "psnr") -> float | None:
@@ -51,9 +52,12 @@ def score(results: Results, stage: str, split: str, metric: str = "psnr") -> flo
     return results["stages"].get(stage, {}).get(split, {}).get(metric)
 
 
-def gains(results: Results, split: str, stage: str, over: str) -> list[float]:
-    """Return by how many dB each view of a stage is better than the same view of another one."""
-    views, others = (results["stages"][name][split]["views"] for name in (stage, over))
+def gains(
+    results: Results, split: str, stage: str, over: str, *, of: Results | None = None
+) -> list[float]:
+    """Return by how many dB each view of a stage is better than that of another one, `of` a run."""
+    views = results["stages"][stage][split]["views"]
+    others = (of or results)["stages"][over][split]["views"]
     return [view["psnr"] - others[name]["psnr"] for name, view in views.items()]
 
 
