@@ -29,6 +29,7 @@ def finished_runs(
 
     Raises:
       CalledProcessError: a run fails.
+      ValueError: two runs have scenes of one name.
     """
     paths = [pathlib.Path(folder) for folder in folders]
     for scene in () if folders else scenes:
@@ -38,6 +39,8 @@ def finished_runs(
             given = [f"--scene={scene}", "--seed=0", f"--output_dir={folder}", *arguments, *resume]
             subprocess.run([sys.executable, "-m", "experiments.run", *given], check=True)
     found = [read_object(path / "results.json") for path in paths]
+    if len({pathlib.Path(results["scene"]).name for results in found}) < len(found):
+        raise ValueError("two runs are of scenes of one name: print them one at a time")
     return {pathlib.Path(results["scene"]).name: results for results in found}
 
 

@@ -101,6 +101,16 @@ def test_one_that_fails_costs_no_other(run, tmp_path, capsys):
     assert "--method=ngp" in command
 
 
+def test_a_sweep_with_other_flags_is_not_mixed_in(run, tmp_path):
+    run(["ngp"], ["table"])
+    before = (tmp_path / "out" / "methods.md").read_text()
+    with pytest.raises(SystemExit, match=r"out was begun with --seeds=1: resume it as it was"):
+        run(["ngp", "surfels"], ["table"], resume=True, seeds=3)
+    assert (tmp_path / "out" / "methods.md").read_text() == before
+    with pytest.raises(SystemExit, match="--scenes=a/table,table has two of one name"):
+        run(["ngp"], ["a/table", "table"], resume=True)
+
+
 @pytest.mark.parametrize(
     ("methods", "given", "message"),
     [

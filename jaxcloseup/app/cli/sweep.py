@@ -69,6 +69,7 @@ with topic("Computers"):
     flags.DEFINE_integer("process_id", None, "which of them this is, from 0", lower_bound=0)
 # Flags that differ from process to process of `--methods`.
 _EACH = ("methods", "method", "scenes", "output_dir", "resume")
+_SHARED = "flags.json"  # in the folder of a sweep of methods: the others, of all its processes
 
 
 def main(_: list[str]) -> None:
@@ -200,16 +201,16 @@ def _check_scenes(captures: "Sequence[Scene]", output_dir: pathlib.Path) -> None
     from jaxcloseup.app.run.manifest import NAME as MANIFEST
     from jaxcloseup.app.store.stored_run import read_fields
 
-    given, names = ",".join(FLAGS.scenes), {scene.name for scene in captures}
+    names = {scene.name for scene in captures}
     if len(names) < len(captures):
-        raise ValueError(f"--scenes={given} has two of one name: sweep them one at a time")
+        raise ValueError(f"{_given_scenes()} has two of one name: sweep them one at a time")
     kept = output_dir / MANIFEST
     if FLAGS.resume and kept.exists():
         before = read_fields(kept, {"scenes": dict})["scenes"]
         if set(before) != names:
             raise ValueError(
-                f"--scenes={given} are not those of {output_dir}, {','.join(before)}: resume it as "
-                "it was begun"
+                f"{_given_scenes()} are not those of {output_dir}, {','.join(before)}: resume it "
+                "as it was begun"
             )
 
 
@@ -229,11 +230,15 @@ def _sweep_methods() -> None:
             _check_flags(preset_from_flags())
         if FLAGS.coordinator is not None:
             raise ValueError("--methods sweeps on one host: leave out --coordinator")
+        scenes = {os.path.basename(os.path.realpath(scene)): scene for scene in FLAGS.scenes}
+        if len(scenes) < len(FLAGS.scenes):
+            raise ValueError(f"{_given_scenes()} has two of one name: sweep them one at a time")
         folder = _choose_folder()
         prepare_to_stop(folder, "sweep")
         lock = lock_output_dir(folder)
-    scenes = {os.path.basename(os.path.realpath(scene)): scene for scene in FLAGS.scenes}
     with lock:
+        with in_one_sentence("sweep", OSError, ValueError):
+            _keep_flags(folder)
         failed = sweep_methods(folder, methods, scenes, _command())
     if failed:
         reason = f"left out, for the reasons above: {', '.join(failed)}"
@@ -253,10 +258,32 @@ def _choose_folder() -> pathlib.Path:
     return pathlib.Path(FLAGS.output_dir)
 
 
-def _command() -> list[str]:
-    """Return words that start a sweep with the flags of this program that all methods share."""
-    words = program_command("sweep")
-    start = words[1:] if words[0] == "python" else ["-m", *words]
+def _given_scenes() -> str:
+    return f"--scenes={','.join(FLAGS.scenes)}"
+
+
+def _keep_flags(folder: pathlib.Path) -> None:
+    """Keep the flags that all methods share; refuse to resume a sweep of methods with others."""
+    from jaxcloseup.io.files import read_object, write_json
+
+    cache = "--compilation_cache="  # changes no result
+    shared = [flag for flag in _shared_flags() if not flag.startswith(cache)]
+    kept, flags = folder / _SHARED, {"flags": sorted(shared)}
+    if FLAGS.resume and kept.exists() and read_object(kept) != flags:
+        before = " ".join(read_object(kept)["flags"]) or "no flags"
+        raise ValueError(f"{folder} was begun with {before}: resume it as it was begun")
+    write_json(kept, flags)
+
+
+def _shared_flags() -> list[str]:
+    """Return the flags of this program that were given and that all methods share."""
     given = [flag for flag in FLAGS.get_key_flags_for_module(__name__) if flag.present]
     shared = "\n".join(flag.serialize() for flag in given if flag.name not in _EACH)
-    return [sys.executable, *start, *(shared.split("\n") if shared else [])]
+    return shared.split("\n") if shared else []
+
+
+def _command() -> list[str]:
+    """Return words that start a sweep with the flags that all methods share."""
+    words = program_command("sweep")
+    start = words[1:] if words[0] == "python" else ["-m", *words]
+    return [sys.executable, *start, *_shared_flags()]
