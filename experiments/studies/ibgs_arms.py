@@ -14,7 +14,6 @@ with networks from other scenes. Two arms change one of these each, in runs of d
   others add to its render. Its control takes as many steps on the photographs themselves.
 """
 
-import dataclasses
 import functools
 import pathlib
 import sys
@@ -38,7 +37,7 @@ from jaxcloseup.app.run.scoring import hold_out
 from jaxcloseup.app.run.step_data import TrainData
 from jaxcloseup.app.score.scores import evaluate
 from jaxcloseup.app.score.targets import Target
-from jaxcloseup.detail.add import Detail, find_candidates
+from jaxcloseup.detail.add import Detail, find_candidates, leave_out
 from jaxcloseup.detail.weights import mean_output, mix
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
@@ -231,7 +230,7 @@ def example(run: TrainedRun, detail: Detail, view: int) -> tuple[Gathered, np.nd
     """Return what the other photographs show of a photograph, and what its render misses."""
     camera, photograph = photograph_at(run, view)
     seen = run.programs.render(run.state, camera)
-    gathered = gather(run, without(detail, view), camera, seen)
+    gathered = gather(run, leave_out(detail, view), camera, seen)
     missing = photograph - jnp.clip(seen.rgb, 0, 1)
     halves = [np.asarray(part, np.float16) for part in gathered[:4]]
     return Gathered(*halves, np.asarray(gathered.seen)), np.asarray(missing, np.float16)
@@ -242,12 +241,6 @@ def photograph_at(run: TrainedRun, view: int) -> tuple[Camera, jax.Array]:
     pyramid, _ = run.programs.pyramid()
     camera = pyramid.camera(camera_at(run.scene.train.cameras, view), view, 0)
     return camera, to_float(pyramid.image(view, 0))[..., :3]
-
-
-def without(detail: Detail, view: int) -> Detail:
-    """Return detail in which a photograph has no trust."""
-    maps = detail.sources.maps.at[view, ..., 1].set(0)
-    return dataclasses.replace(detail, sources=dataclasses.replace(detail.sources, maps=maps))
 
 
 def crop(whole: tuple[Gathered, np.ndarray], rng: np.random.Generator) -> Any:
@@ -275,7 +268,7 @@ def left_over(run: TrainedRun, state: TrainState, detail: Detail) -> Windows:
     for view in range(len(scene.names["train"])):
         camera, photograph = photograph_at(run, view)
         seen = programs.render(state, camera)
-        sharper = detailed(programs, without(detail, view), camera, seen).rgb
+        sharper = detailed(programs, leave_out(detail, view), camera, seen).rgb
         rest = jnp.clip(photograph - (sharper - jnp.clip(seen.rgb, 0, 1)), 0, 1)
         weight = np.ones(rest.shape[:2], np.float32)
         found.append(Photograph(camera, np.asarray(rest), weight))

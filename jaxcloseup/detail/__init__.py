@@ -8,11 +8,11 @@ __all__, __getattr__, __dir__ = lazy_names(
     {
         "add": (
             "Detail Detailed Candidates add_detail add_to_rendering find_candidates "
-            "label_with_detail"
+            "label_with_detail leave_out"
         ),
         "weights": (
             "Networks DetailWeights blend expected_errors known_weights mean_output mix "
-            "one_network write_known"
+            "one_network with_larger_errors write_known"
         ),
         "learn": "Evidence learn_weights make_evidence sample_evidence",
         "residuals": "Residuals make_detail render_residuals reproduced",

@@ -7,6 +7,7 @@ it is there, and how far colors are off in the end (`detail.weights`). Pixels th
 shows are filled (`detail.holes`).
 """
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
@@ -133,6 +134,12 @@ def add_to_rendering(
     pixels = pixel_grid(camera.height, camera.width)
     depth = label_depth(rendering, near=0, far=far)
     return add_detail(detail, camera, pixels, rendering.rgb, rendering.alpha, depth)
+
+
+def leave_out(detail: Detail, view: int) -> Detail:
+    """Return detail to which one photograph, by its index, adds nothing."""
+    maps = detail.sources.maps.at[view, ..., 1].set(0)
+    return detail.replace(sources=dataclasses.replace(detail.sources, maps=maps))
 
 
 def label_with_detail(

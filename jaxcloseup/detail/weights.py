@@ -10,6 +10,7 @@ both.
 
 import functools
 import io
+import math
 import pathlib
 from collections.abc import Sequence
 from typing import Any
@@ -85,6 +86,13 @@ def expected_errors(weights: DetailWeights, features: jax.Array) -> jax.Array:
       The error of the render, then that of the render with its share of the mixture.
     """
     return jnp.exp(mean_output(weights.errors, features))
+
+
+def with_larger_errors(weights: DetailWeights, factor: float) -> DetailWeights:
+    """Return weights that expect errors so many times as large."""
+    *layers, offsets = weights.errors.layers
+    errors = weights.errors.replace(layers=(*layers, offsets + math.log(factor)))
+    return weights.replace(errors=errors)
 
 
 def known_weights(unseen: str | None = None) -> DetailWeights:

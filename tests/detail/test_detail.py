@@ -12,11 +12,18 @@ from tiny_runs import KEPT
 from jaxcloseup.app.methods.method import TargetConfig
 from jaxcloseup.app.run import fine_tuning, gate, kept_detail
 from jaxcloseup.app.run.fine_tuning import fine_tune, tuned_detail
-from jaxcloseup.app.run.kept_detail import detail_getter, detail_path, detailed, find_detail
+from jaxcloseup.app.run.kept_detail import (
+    detail_getter,
+    detail_path,
+    detailed,
+    find_detail,
+    measure_error_scale,
+)
 from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.labels import label_closeups, label_target_views, start_labels
 from jaxcloseup.app.store.stored_run import load_run_scene, read_run, restore
 from jaxcloseup.detail.holes import find_empty
+from jaxcloseup.detail.weights import with_larger_errors
 from jaxcloseup.geometry.cameras import pixel_grid
 from jaxcloseup.io.cache import Stored, load, save
 from jaxcloseup.photos.depth_maps import join_maps
@@ -48,7 +55,8 @@ def found(rendered):
 def test_renders_with_detail_come_nearer_to_the_truth(rendered, found):
     programs, state, _ = rendered
     detail, about = found
-    assert about == {"divisor": 1, "sizes": list(map(list, detail.shown.sizes))}
+    sizes = list(map(list, detail.shown.sizes))
+    assert about == {"divisor": 1, "sizes": sizes, "error_scale": about["error_scale"]}
     for views in (programs.scene.test, programs.scene.test_far):
         camera, truth = camera_at(views.cameras, 0), to_float(views.rgb[0])
         seen = programs.render(state, camera)
@@ -168,6 +176,29 @@ def test_a_tuned_state_has_the_detail_of_photographs_that_see_the_view(rendered,
         for one in (tuned, detail)
     ]
     assert errors[0] < 0.98 * errors[1], errors
+
+
+def test_errors_are_expected_as_large_as_at_photographs_left_out(rendered, found):
+    """Networks that expect a tenth are corrected tenfold; those that expect too much are not."""
+    programs, state, _ = rendered
+    detail, about = found
+    pyramid, _ = programs.pyramid()
+    scales = [
+        measure_error_scale(
+            programs,
+            state,
+            detail.replace(weights=with_larger_errors(detail.weights, factor)),
+            pyramid,
+        )
+        for factor in (0.1 / about["error_scale"], 0.05 / about["error_scale"], 100)
+    ]
+    assert about["error_scale"] >= 1 and scales[2] == 1
+    assert scales[1] == pytest.approx(2 * scales[0], rel=0.02) and scales[0] > 2
+    camera = camera_at(programs.scene.test.cameras, 0)
+    seen = programs.render(state, camera)
+    larger = detail.replace(weights=with_larger_errors(detail.weights, 3))
+    errors = [np.asarray(detailed(programs, one, camera, seen).error) for one in (detail, larger)]
+    np.testing.assert_allclose(errors[1], 3 * errors[0], rtol=1e-4)
 
 
 def test_detail_is_kept_with_its_state_and_made_again_for_another(rendered, found, monkeypatch):

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.studies import ibgs_arms
-from experiments.studies.ibgs_arms import Gathered, Head, add_by_head, train_head, without
-from jaxcloseup.detail.add import Detail
+from experiments.studies.ibgs_arms import Gathered, Head, add_by_head, train_head
+from jaxcloseup.detail.add import Detail, leave_out
 from jaxcloseup.detail.weights import mix
 from jaxcloseup.photos.depth_maps import join_maps
 
@@ -49,6 +49,6 @@ def test_a_photograph_left_out_has_no_trust():
     depth, trust = jnp.ones((3, 4, 5)), jnp.full((3, 4, 5), 0.5)
     sources = join_maps(SimpleNamespace(), depth, trust)
     detail = Detail(None, sources, None, jnp.float32(0), jnp.float32(0))
-    rest = without(detail, 1).sources
+    rest = leave_out(detail, 1).sources
     np.testing.assert_array_equal(rest.trust[:, 0, 0], [0.5, 0, 0.5])
     np.testing.assert_array_equal(rest.inverse_depth, sources.inverse_depth)

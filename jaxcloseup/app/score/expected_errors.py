@@ -1,7 +1,7 @@
 """Compare the errors that detail expects with the actual ones."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,13 +18,18 @@ from jaxcloseup.photos.views import to_float
 TENTHS = 10
 
 
+class PixelErrors(NamedTuple):
+    """Errors of N pixels, mean absolute differences of colors in [0, 1]."""
+
+    expected: np.ndarray  # `[N]`; NaN where nothing is expected
+    actual: np.ndarray  # `[N]`
+    weight: np.ndarray  # `[N]`, 0 where nothing is expected
+
+
 def compare_errors(
     render: Callable[[Camera], Detailed], targets: Sequence[Target]
 ) -> dict[str, Any]:
     """Compare the expected error at each pixel of held-out views with the actual one.
-
-    An affine map first matches each view's colors to the photograph's, because the exposure of a
-    photograph is unknown to the others. Pixels of small expected error weigh more in its fit.
 
     Args:
       render: `camera -> Detailed`.
@@ -35,15 +40,8 @@ def compare_errors(
       no rows, without views.
     """
 
-    def compare(target: Target) -> tuple[np.ndarray, ...]:
-        detailed, (height, width) = render(target.camera), target.weight.shape
-        rgb, error = detailed.rgb[:height, :width], detailed.error[:height, :width]
-        truth, weight = (jnp.asarray(to_float(array)) for array in (target.rgb, target.weight))
-        weight = jnp.where(jnp.isfinite(error), weight, 0)
-        change = fit_colors(rgb, truth, jnp.where(weight > 0, weight / error**2, 0))
-        corrected = jnp.clip(change_colors(rgb, *change), 0, 1)
-        actual = jnp.mean(jnp.abs(corrected - truth), axis=-1)
-        return tuple(np.asarray(values).ravel() for values in (error, actual, weight))
+    def compare(target: Target) -> PixelErrors:
+        return pixel_errors(render(target.camera), target.rgb, target.weight)
 
     views = list(progress.each(compare, targets, "expected errors"))
     if not views:
@@ -72,6 +70,27 @@ def rank_errors(expected: np.ndarray, actual: np.ndarray) -> dict[str, float]:
         return {}
     pearson = np.corrcoef(expected, actual)[0, 1]
     return {"ause": cast(float, curve["ause"]), "pearson": float(pearson)}
+
+
+def pixel_errors(detailed: Detailed, truth: Any, weight: Any) -> PixelErrors:
+    """Return expected and actual errors of the pixels of a view.
+
+    An affine map first matches the view's colors to the photograph's, because the exposure of a
+    photograph is unknown to the others. Pixels of small expected error weigh more in its fit.
+
+    Args:
+      detailed: the view with detail, as large as the photograph or padded.
+      truth: `[H, W, 3]` colors of the photograph, uint8 or float.
+      weight: `[H, W]` of its pixels; uint8 or float.
+    """
+    height, width = weight.shape
+    rgb, error = detailed.rgb[:height, :width], detailed.error[:height, :width]
+    truth, weight = (jnp.asarray(to_float(array)) for array in (truth, weight))
+    weight = jnp.where(jnp.isfinite(error), weight, 0)
+    change = fit_colors(rgb, truth, jnp.where(weight > 0, weight / error**2, 0))
+    corrected = jnp.clip(change_colors(rgb, *change), 0, 1)
+    actual = jnp.mean(jnp.abs(corrected - truth), axis=-1)
+    return PixelErrors(*(np.asarray(values).ravel() for values in (error, actual, weight)))
 
 
 def error_tenths(
