@@ -73,8 +73,9 @@ def _correlate(
 
     def spectrum(colors: jax.Array) -> jax.Array:
         gray = jnp.sum(colors * luma[None, None], axis=-1)
-        mean = safe_divide(jnp.sum(window * gray), jnp.sum(window))
-        return jnp.fft.rfft2((gray - mean) * window)
+        for _ in range(2):  # the second time takes what rounding leaves
+            gray = gray - safe_divide(jnp.sum(window * gray), jnp.sum(window))
+        return jnp.fft.rfft2(gray * window)
 
     def over_rings(values: jax.Array) -> jax.Array:
         return jax.ops.segment_sum((values * times).reshape(-1), which, num_segments=rings)
@@ -108,16 +109,15 @@ def resolved_period(correlation: np.ndarray) -> float:
       correlation: `[RINGS]` from `ring_correlation`, of one image or the mean of several.
 
     Returns:
-      2 where every frequency is resolved, infinity where none is. The first ring, which the window
-      blurs into the mean, does not count.
+      2 where every frequency is resolved, infinity where none is, or where the correlation is not
+      known. The first ring, which the window blurs into the mean, does not count.
     """
-    below = np.flatnonzero(np.asarray(correlation)[1:] < THRESHOLD) + 1
+    below = np.flatnonzero(~(np.asarray(correlation)[1:] >= THRESHOLD)) + 1
     if not len(below):
         return 2.0
     after, centers = int(below[0]), frequencies(len(correlation))
     before = after - 1
-    step = correlation[before] - correlation[after]
-    share = (correlation[before] - THRESHOLD) / step if step > 0 else -1.0
-    if share < 0:
+    if before == 0 or not np.isfinite(correlation[after]):
         return float("inf")
+    share = (correlation[before] - THRESHOLD) / (correlation[before] - correlation[after])
     return float(1 / (centers[before] + share * (centers[after] - centers[before])))

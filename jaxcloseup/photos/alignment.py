@@ -41,7 +41,6 @@ def estimate_motion(
     seen, gray = photograph.mean(-1), shown.mean(-1)
     down, across = jnp.gradient(gray)
     moved = _flow(camera, depth)
-    # As a sum over the last axis, XLA for CPUs compiles this to other, wrong values (jax 0.10.2).
     moved = -(across[None] * moved[..., 0] + down[None] * moved[..., 1])
     columns = jnp.stack([*moved, gray, jnp.ones_like(gray)], axis=-1).reshape(-1, 8)
     weight = jnp.where(depth > 0, weight, 0).reshape(-1)

@@ -5,6 +5,9 @@ import dataclasses
 from jaxcloseup.setting import setting
 
 
+MOST_SAMPLES = 13  # of a patch, along each side: the native library has room for as many
+
+
 @dataclasses.dataclass(frozen=True)
 class StereoConfig:
     """Settings of multi-view stereo."""
@@ -32,3 +35,11 @@ class StereoConfig:
     depth_tolerance: float = setting(0.01, "relative difference of depths that agree")
     confirmations: int = setting(2, "photographs that must confirm a depth", low=1)
     max_cost: float = setting(0.7, "1 - NCC above which nothing is matched", high=1)
+
+    def __post_init__(self) -> None:
+        """Raise a ValueError for samples that do not lie about the center, or are too many."""
+        if 2 * self.radius % self.stride or 2 * self.radius // self.stride >= MOST_SAMPLES:
+            raise ValueError(
+                f"stride {self.stride} must divide twice the radius {self.radius} into fewer than "
+                f"{MOST_SAMPLES} parts"
+            )

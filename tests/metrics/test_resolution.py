@@ -91,6 +91,8 @@ def test_the_ends_of_the_scale():
     nothing = np.asarray(ring_correlation(jnp.full_like(truth, 0.5), truth))
     np.testing.assert_allclose(nothing, 0, atol=1e-5)
     assert resolved_period(nothing) == np.inf
+    first = np.where(np.arange(RINGS) < 1, 0.9, 0.1)  # the ring that does not count
+    assert resolved_period(first) == resolved_period(np.full(RINGS, np.nan)) == np.inf
     line = 1 - np.arange(RINGS) / (RINGS - 1)
     period = resolved_period(line)
     assert np.interp(1 / period, frequencies(), line) == pytest.approx(0.5)

@@ -33,6 +33,13 @@ needs_library = pytest.mark.skipif(
 )
 
 
+def test_patches_lie_about_their_center():
+    assert StereoConfig(radius=6, stride=3).stride == 3
+    for radius, stride in ((4, 3), (12, 1)):  # one aside, one with 25 samples a side
+        with pytest.raises(ValueError, match=f"^stride {stride} must divide twice the radius"):
+            StereoConfig(radius=radius, stride=stride)
+
+
 def exact_planes(views, points):
     """Depths `[V, H, W]` and planes `[V, 3, H, W]` of points, by differences in float64."""
     poses = np.asarray(views.cameras.camtoworld, np.float64)

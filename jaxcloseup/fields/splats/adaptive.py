@@ -122,7 +122,7 @@ def refine(
     *,
     extent: float,
     remove_huge: jax.Array,
-) -> tuple[OffsetSurfels, jax.Array, jax.Array]:
+) -> tuple[OffsetSurfels, jax.Array, jax.Array, jax.Array]:
     """Clone, split and remove surfels.
 
     A clone is an exact copy. Two surfels replace a split one; their centers are drawn from its
@@ -138,8 +138,8 @@ def refine(
       remove_huge: `[]` bool, whether surfels larger than `config.huge` are removed.
 
     Returns:
-      Surfels, `alive [N]`, and `[N]` bool, True where a surfel is new and the optimizer must forget
-      its row.
+      Surfels, `alive [N]`, `[N]` bool, True where a surfel is new and the optimizer must forget its
+      row, and the row `[N]` that each comes from.
     """
     scale = jnp.max(jnp.exp(surfels.log_scales), axis=-1) / extent
     # Per view that saw the surfel: surfels out of sight must not look converged.
@@ -162,7 +162,7 @@ def refine(
         means=jnp.where(split[:, None], moved, surfels.means),
         log_scales=surfels.log_scales - jnp.where(split, jnp.log(config.shrink), 0)[:, None],
     )
-    return surfels, keep | added, added | split
+    return surfels, keep | added, added | split, source
 
 
 def _place_copies(
@@ -206,7 +206,7 @@ def reset_opacities(
 def _refine(key: jax.Array, state: Any, config: AdaptiveConfig, extent: float) -> Any:
     """Return a state whose surfels are refined and whose 2-D gradients accumulate anew."""
     gradients, adam = state.opt_state
-    refined = refine(
+    surfels, alive, changed, source = refine(
         key,
         state.params,
         state.buffers.alive,
@@ -215,8 +215,12 @@ def _refine(key: jax.Array, state: Any, config: AdaptiveConfig, extent: float) -
         extent=extent,
         remove_huge=state.step > config.reset_every,
     )
-    zeros = jax.tree.map(jnp.zeros_like, gradients)
-    return replace_surfels(state.replace(opt_state=(zeros, adam)), *refined)
+    zeros, buffers = jax.tree.map(jnp.zeros_like, gradients), state.buffers
+    if buffers.interval is not None:  # a reset in the same step needs those of new surfels
+        buffers = buffers.replace(interval=buffers.interval[source])
+    return replace_surfels(
+        state.replace(opt_state=(zeros, adam), buffers=buffers), surfels, alive, changed
+    )
 
 
 def _reset(state: Any, config: AdaptiveConfig) -> Any:

@@ -73,7 +73,7 @@ def test_small_surfels_are_cloned_large_split_faint_and_huge_removed(key, num_sc
     alive = np.arange(COUNT) < 10
     before = scene_of(scales, opacities, num_scales)
     gradients = gradients_of(means)
-    after, now_alive, new = grow(key, before, jnp.asarray(alive), gradients, remove_huge=True)
+    after, now_alive, new, _ = grow(key, before, jnp.asarray(alive), gradients, remove_huge=True)
     assert int(now_alive.sum()) == 10 - 2 + 2
     # The surfel with the largest gradient takes the first free row; rows 2 and 3 were just removed.
     clone, halves = 2, (1, 3)
@@ -96,7 +96,7 @@ def test_small_surfels_are_cloned_large_split_faint_and_huge_removed(key, num_sc
     np.testing.assert_array_equal(
         after.means[jnp.array(untouched)], before.means[jnp.array(untouched)]
     )
-    kept, _, _ = grow(key, before, jnp.asarray(alive), gradients, remove_huge=False)
+    kept, *_ = grow(key, before, jnp.asarray(alive), gradients, remove_huge=False)
     np.testing.assert_array_equal(kept.log_scales[3], before.log_scales[3])
 
 
@@ -105,11 +105,14 @@ def test_without_room_the_largest_gradients_come_first(key):
     alive = np.ones(COUNT, bool)
     alive[[4, 7]] = False
     before = scene_of(np.full(COUNT, SMALL), np.full(COUNT, 0.5))
-    after, now_alive, new = grow(key, before, jnp.asarray(alive), gradients, remove_huge=False)
+    after, now_alive, new, source = grow(
+        key, before, jnp.asarray(alive), gradients, remove_huge=False
+    )
     assert now_alive.all()
     np.testing.assert_array_equal(np.nonzero(new)[0], [4, 7])
     np.testing.assert_array_equal(after.means[4], before.means[COUNT - 1])
     np.testing.assert_array_equal(after.means[7], before.means[COUNT - 2])
+    np.testing.assert_array_equal(source[jnp.array([4, 7, 5])], [COUNT - 1, COUNT - 2, 5])
 
 
 def test_a_reset_leaves_nothing_opaque():

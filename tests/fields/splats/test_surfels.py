@@ -145,6 +145,12 @@ def test_regularizers_agree_with_arithmetic():
     gradient = jax.grad(lambda a: normal_inconsistency(normal, surface, a).sum())(alpha)
     assert np.all(gradient == 0)
 
+    # Several views at once, as large as photographs for training: jax 0.10.2 summed them wrongly.
+    rng = np.random.default_rng(0)
+    one, several = (rng.normal(size=size).astype("f4") for size in ((67, 120, 3), (6, 67, 120, 3)))
+    batched = jax.jit(jax.vmap(lambda other: normal_inconsistency(one, other, jnp.ones((67, 120)))))
+    np.testing.assert_allclose(batched(several), 1 - np.sum(one * several, -1), atol=1e-5)
+
     # Two splats of weights 0.5 and 0.25 at depths 2 and 4, in the published mapping.
     near, far = 0.2, 100.0
     mapped = [far / (far - near) * (1 - near / z) for z in (2.0, 4.0)]
