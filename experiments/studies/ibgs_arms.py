@@ -196,8 +196,8 @@ def with_head(run: TrainedRun, detail: Detail, params: Any) -> Render:
 
 def train_head(examples: Sequence[tuple[Gathered, np.ndarray]], steps: int) -> Any:
     """Train a head on what views gather and on what their renders miss, `[H, W, 3]`."""
-    rng, zeros = np.random.default_rng(0), jax.tree.map(lambda array: array[None], examples[0][0])
-    channels = sum(part.shape[-1] for part in zeros[:4]) + 1
+    rng, (first, _) = np.random.default_rng(0), examples[0]
+    channels = sum(part.shape[-1] for part in first[:4]) + 1
     params = Head().init(jax.random.key(0), jnp.zeros((1, 8, 8, channels)))
     optimizer = optax.adam(optax.cosine_decay_schedule(2e-3, steps))
     state = optimizer.init(params)

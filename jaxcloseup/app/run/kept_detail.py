@@ -31,7 +31,7 @@ from jaxcloseup.io.cache import Stored, cached
 from jaxcloseup.photos.depth_maps import GatherSources, join_maps
 from jaxcloseup.photos.pyramids import Pyramid
 from jaxcloseup.photos.scene import Scene
-from jaxcloseup.photos.views import Views, camera_at, to_float
+from jaxcloseup.photos.views import Views, camera_at
 from jaxcloseup.training.state import TrainState
 
 
@@ -123,7 +123,7 @@ def measure_error_scale(
 
     def compare(view: int) -> PixelErrors:
         camera = pyramid.camera(camera_at(programs.scene.train.cameras, view), view, level)
-        rendering, photograph = programs.render(state, camera), to_float(pyramid.image(view, level))
+        rendering, photograph = programs.render(state, camera), pyramid.image(view, level)
         seen = detailed(programs, leave_out(detail, view), camera, rendering)
         return pixel_errors(seen, photograph[..., :3], photograph[..., 3])
 

@@ -134,8 +134,7 @@ def smoothed(surfels: Surfels, interval: jax.Array | None) -> Surfels:
     """
     if interval is None:
         return surfels
-    log_scales = _smoothed_scales(surfels, interval)
-    kept = jnp.exp(jnp.sum(surfels.log_scales - log_scales, axis=-1))
+    log_scales, kept = _smooth_scales(surfels, interval)
     opacity = jnp.clip(jax.nn.sigmoid(surfels.opacity_logits) * kept, 1e-10, 1 - 1e-6)
     return surfels.replace(
         log_scales=log_scales, opacity_logits=jnp.log(opacity) - jnp.log1p(-opacity)
@@ -144,10 +143,12 @@ def smoothed(surfels: Surfels, interval: jax.Array | None) -> Surfels:
 
 def kept_opacity(surfels: Surfels, interval: jax.Array) -> jax.Array:
     """Return the share `[N]` of their opacities that splats keep when they are `smoothed`."""
-    return jnp.exp(jnp.sum(surfels.log_scales - _smoothed_scales(surfels, interval), axis=-1))
+    return _smooth_scales(surfels, interval)[1]
 
 
-def _smoothed_scales(surfels: Surfels, interval: jax.Array) -> jax.Array:
+def _smooth_scales(surfels: Surfels, interval: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return logarithms of scales, and the share of the opacity that is kept."""
     # Scales add as variances, in logarithms, whose range no scale leaves.
     variance = lax.stop_gradient(jnp.maximum(SMOOTHING_VARIANCE * interval**2, 1e-30))
-    return 0.5 * jnp.logaddexp(2 * surfels.log_scales, jnp.log(variance)[:, None])
+    log_scales = 0.5 * jnp.logaddexp(2 * surfels.log_scales, jnp.log(variance)[:, None])
+    return log_scales, jnp.exp(jnp.sum(surfels.log_scales - log_scales, axis=-1))
