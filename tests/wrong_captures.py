@@ -202,7 +202,7 @@ CASES = {
         (frames(*map(frame, ("train/a.png", "x", "y"))), r"2 of 3 listed .* exist \(x, y\)"),
         (frames(*(frame(f"r_{i}") for i in range(4))), r"4 of 4 .*\(r_0, r_1, r_2, \.\.\.\)"),
         (first(mask_path=3), "mask_path is 3"),
-        (first(mask_path="m.png"), r"m\.png cannot be read \(No such file"),
+        (first(mask_path="m/m.png"), r"a\.png': its mask .*m\.png does not exist \(1 of 1 masks"),
         (all_of(first(mask_path="m.png"), pipe("m.png")), NOT_ORDINARY),
         (put("masks/a.png", WHITE), r"masks/a\.png matches both .*train/a\.png and .*test/a"),
         # Poses.

@@ -1,6 +1,7 @@
 """Read what a capture's folder holds: photographs of all splits, and points."""
 
 import collections
+import os
 import pathlib
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -139,6 +140,7 @@ def _read_transforms(folder: pathlib.Path, file: pathlib.Path) -> Content:
         for path, count in absent.items()
     ]
     frames = without_repeats(located.frames)
+    _check_masks(frames)
     if file.name == SINGLE:
         given = splits_from_fields(file, fields, frames)
     else:
@@ -149,6 +151,17 @@ def _read_transforms(folder: pathlib.Path, file: pathlib.Path) -> Content:
     points, rgb, about = _read_ply(file, fields, frames)
     notes = (*located.notes, *unrendered, *about)
     return Content(file, fields, frames, given, (points, rgb), notes=notes)
+
+
+def _check_masks(frames: Sequence[Frame]) -> None:
+    """Raise if masks that frames name do not exist."""
+    masked = [frame for frame in frames if frame.mask]
+    missing = [frame for frame in masked if frame.mask and not os.path.lexists(frame.mask)]
+    if missing:
+        raise SceneError(
+            f"{missing[0].label}: its mask {missing[0].mask} does not exist ({len(missing)} of "
+            f"{len(masked)} masks are missing): restore them, or remove the fields that name them."
+        )
 
 
 def _read_model(folder: pathlib.Path, path: pathlib.Path) -> Content:

@@ -80,11 +80,14 @@ def correct_frames(
         try:
             poses = np.stack([frame.camtoworld for frame in result])
             poses = correct_poses(poses, correction, opengl=opengl)
+            seen = [frame.seen for frame in result]
+            if name == "order":  # which points are seen was found with the pose
+                seen = [seen[int(i)] for i in value.split(",")]
             change = _CHANGES.get(name, lambda frame, _: frame)
             numbers = [] if name in _TEXTS else [float(part) for part in value.split(",")]
             result = [
-                change(frame._replace(camtoworld=pose), numbers)
-                for frame, pose in zip(result, poses, strict=True)
+                change(frame._replace(camtoworld=pose, seen=points), numbers)
+                for frame, pose, points in zip(result, poses, seen, strict=True)
             ]
         except (ValueError, IndexError) as error:
             raise SceneError(f"the correction {correction!r} is unknown: {error}.") from error

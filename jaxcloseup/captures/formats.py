@@ -65,7 +65,13 @@ def read_listing(
     if split in ("given", "listed") and not given:
         given = splits_from_file(folder, content.frames)
     points, rgb = content.points
-    division = divide(scene, content.frames, given, split, points, zoom, find_points=find_points)
+
+    def find_masked(frames: Sequence[Frame]) -> tuple[list[Frame], np.ndarray]:
+        assert find_points is not None
+        return find_points(attach_masks(folder, {"all": list(frames)})["all"])
+
+    find = find_masked if find_points else None
+    division = divide(scene, content.frames, given, split, points, zoom, find_points=find)
     if split != "zoom":  # crops share files with training photographs but show finer detail
         warn_duplicates(folder, division.frames)
     train, fewer = _chosen(scene, division.frames["train"], photographs, choose)

@@ -2,6 +2,7 @@
 
 import collections
 import hashlib
+import os
 import pathlib
 from collections.abc import Sequence
 
@@ -27,6 +28,20 @@ def unique_names(files: Sequence[pathlib.Path]) -> list[str]:
             name = f"{base}_{repeats[base]}"
         names[name] = None
     return list(names)
+
+
+def file_names(files: Sequence[pathlib.Path]) -> list[str]:
+    """Name each file by its name; where names repeat, by its path in the folder of all files."""
+    counts = collections.Counter(file.name for file in files)
+    if len(counts) == len(files):
+        return [file.name for file in files]
+    root = os.path.commonpath([os.path.abspath(file.parent) for file in files])
+    return [
+        file.name
+        if counts[file.name] == 1
+        else pathlib.Path(os.path.relpath(file, root)).as_posix()
+        for file in files
+    ]
 
 
 def _name(text: str) -> str:

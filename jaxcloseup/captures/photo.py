@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxcloseup.captures.mask_values import MaskValues
+from jaxcloseup.captures.photo_files import size_of_image
 from jaxcloseup.captures.scale import check_lens
 from jaxcloseup.captures.world_frames import Frame, frame_intrinsics
 
@@ -57,13 +58,18 @@ class Photo(NamedTuple):
     @property
     def own_size(self) -> tuple[int, int]:
         """Return width and height of the photograph before it was reduced."""
-        own = self.frame.size if self.frame.reduced else None
-        return own or self.stored_size
+        return (whole_size(self.frame) if self.frame.reduced else None) or self.stored_size
 
     def intrinsics(self, half_pixel: bool) -> np.ndarray:
         """Compute fx, fy, cx, cy `[4]` in pixels; `half_pixel` as in `Reading`."""
         whole = resized_intrinsics(self.frame, self.stored_size, self.scaled, half_pixel)
         return whole - np.array([0, 0, *self.corner])
+
+
+def whole_size(frame: Frame) -> tuple[int, int] | None:
+    """Return width and height of a frame's file, which may have a reduced copy; None if unknown."""
+    size = size_of_image(frame.file) or frame.size
+    return size[::-1] if size and frame.turns % 2 else size
 
 
 def resized_intrinsics(

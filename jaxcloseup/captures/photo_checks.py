@@ -124,21 +124,11 @@ def check_sizes(folder: pathlib.Path, photos: Sequence[Photo]) -> None:
     resized = []
     for photo in {(photo.frame.file, photo.frame.size): photo for photo in photos}.values():
         frame = photo.frame
-        if frame.reduced:
-            continue
+        if said := wrong_size(photo):
+            raise SceneError(said)
         (width, height), (w, h) = photo.stored_size, frame.size or photo.stored_size
-        if (width, height) == (w, h):
-            continue
-        # Resizing rounds each side to whole pixels, so the aspect ratio agrees to within one pixel.
-        if abs(width * h / w - height) > 1 and abs(height * w / h - width) > 1:
-            swapped = (w, h) == (height, width)
-            rotated = ", as if rotated by an EXIF orientation" if swapped else ""
-            raise SceneError(
-                f"{frame.label}: the image is {width} x {height} pixels, but w and h are {w} x {h}"
-                f"{rotated}: restore the image that the camera was solved for, or correct w and h."
-            )
-        if is_stand_in(frame):
-            continue  # a note says so
+        if (width, height) == (w, h) or frame.reduced or is_stand_in(frame):
+            continue  # a note tells of reduced ones
         resized.append(f"{frame.listed} is {width} x {height} pixels instead of {w} x {h}")
     if resized:
         more = f" (and {len(resized) - 1} more)" if len(resized) > 1 else ""
@@ -147,3 +137,23 @@ def check_sizes(folder: pathlib.Path, photos: Sequence[Photo]) -> None:
             ImageSizeWarning,
             stacklevel=2,
         )
+
+
+def wrong_size(photo: Photo) -> str:
+    """Say how a photograph was cropped, padded or rotated since its camera was solved for."""
+    frame = photo.frame
+    (width, height), (w, h) = photo.stored_size, frame.size or photo.stored_size
+    # Resizing rounds each side to whole pixels, so the aspect ratio agrees to within one pixel.
+    if frame.reduced or abs(width * h / w - height) <= 1 or abs(height * w / h - width) <= 1:
+        return ""
+    rotated = ", as if rotated by an EXIF orientation" if is_rotated(photo) else ""
+    return (
+        f"{frame.label}: the image is {width} x {height} pixels, but w and h are {w} x {h}"
+        f"{rotated}: restore the image that the camera was solved for, or correct w and h."
+    )
+
+
+def is_rotated(photo: Photo) -> bool:
+    """Return True if width and height are exchanged, against what the capture says."""
+    width, height = photo.stored_size
+    return width != height and photo.frame.size == (height, width)

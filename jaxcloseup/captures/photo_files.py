@@ -3,6 +3,7 @@
 import io
 import math
 import pathlib
+import re
 import threading
 import warnings
 
@@ -17,6 +18,7 @@ from jaxcloseup.photos.scene import SceneError
 
 ENDINGS = {".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"}  # of photographs
 MOST_PIXELS = 170_000_000  # a file of 100 kB may claim a billion of them
+_MARKER = re.compile(rb"\xff+([^\x00\xff])", re.DOTALL)  # of a JPEG, before its scan
 _filters = threading.Lock()  # filters of warnings belong to all threads
 
 
@@ -158,13 +160,15 @@ def _is_truncated_jpeg(data: bytes) -> bool:
     """Return True if a JPEG lacks its end marker; some decoders fill the rest with gray.
 
     The search skips the segments before the scan, since a thumbnail in one of them has its own end
-    marker. Inside the scan, ff d9 is always the end marker.
+    marker. Inside the scan, ff d9 is always the end marker. Decoders skip bytes between segments,
+    and a marker may begin with several ff.
     """
     if not data.startswith(b"\xff\xd8"):
         return False
     position = 2
-    while position + 4 <= len(data) and data[position] == 0xFF:
-        if data[position + 1] == 0xDA:
-            return b"\xff\xd9" not in data[position:]
-        position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
+    while found := _MARKER.search(data, position):
+        if found[1] == b"\xda":
+            return b"\xff\xd9" not in data[found.end() :]
+        length = data[found.end() : found.end() + 2]
+        position = found.end() + int.from_bytes(length, "big")
     return True

@@ -18,6 +18,7 @@ from jaxcloseup.captures.mask_values import MaskValues, read_mask
 from jaxcloseup.captures.photo import CONSTANT, TRANSPARENT, Photo, Reading, resized_intrinsics
 from jaxcloseup.captures.photo_files import composite, decode_image, downscale_image, read_file
 from jaxcloseup.captures.photo_masks import is_dynamic
+from jaxcloseup.captures.reduced_photos import check_reduced
 from jaxcloseup.captures.world_frames import Frame, frame_intrinsics
 from jaxcloseup.io.cache import Stored, cache_path, cached, content_hash, hash_files
 from jaxcloseup.io.memory import installed_memory
@@ -179,7 +180,7 @@ def make_photo(
     stored = width, height = rgb.shape[1], rgb.shape[0]
     downscale = reading.downscale
     if frame.reduced:
-        _check_reduced(frame, stored, downscale)
+        check_reduced(frame, stored, downscale)
         downscale = 1
     if downscale * reading.zoom > min(stored):
         factors = f"downscale {downscale}"
@@ -251,17 +252,6 @@ def _without_alpha(photo: Photo) -> Photo:
         rgb=np.rint(np.minimum(own, 255)).astype(np.uint8),
         mask=np.rint(photo.mask * alpha).astype(np.uint8),
     )
-
-
-def _check_reduced(frame: Frame, size: tuple[int, int], downscale: int) -> None:
-    """Raise if the shrunk copy's size differs from the expected one by more than rounding."""
-    assert frame.size is not None  # `attach_reduced` needs it
-    if any(abs(side - whole / downscale) > 1 for side, whole in zip(size, frame.size, strict=True)):
-        raise SceneError(
-            f"{frame.reduced} is {size[0]} x {size[1]} pixels, which is not {frame.size[0]} x "
-            f"{frame.size[1]} divided by {downscale}: make it again, or rename its folder to use "
-            "the full-size photographs."
-        )
 
 
 def _zoomed(photo: Photo, zoom: int, closeup: bool) -> list[Photo]:

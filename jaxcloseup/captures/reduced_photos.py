@@ -4,6 +4,7 @@ import collections
 import pathlib
 from collections.abc import Sequence
 
+from jaxcloseup.captures.photo import whole_size
 from jaxcloseup.captures.photo_masks import list_pictures
 from jaxcloseup.captures.world_frames import Frame
 from jaxcloseup.photos.scene import SceneError
@@ -88,6 +89,23 @@ def attach_reduced(
         split: [frame._replace(reduced=found[frame.file]) for frame in members]
         for split, members in splits.items()
     }, (f"{name}: using the shrunk photographs in {folder_name}",)
+
+
+def check_reduced(frame: Frame, size: tuple[int, int], downscale: int) -> None:
+    """Check that a shrunk copy has a size that fits its photograph, or the intrinsics' size.
+
+    Raises:
+      SceneError: it differs from both by more than rounding.
+    """
+    own = whole_size(frame)
+    for whole in (own, frame.size):
+        if whole and all(abs(downscale * size[i] - whole[i]) <= downscale for i in (0, 1)):
+            return
+    if own:
+        raise SceneError(
+            f"{frame.reduced} is {size[0]} x {size[1]} pixels, which is not {own[0]} x {own[1]} "
+            f"divided by {downscale}: make it again, or rename its folder."
+        )
 
 
 def _place(file: pathlib.Path, downscale: int) -> pathlib.Path | None:

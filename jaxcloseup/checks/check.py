@@ -9,10 +9,13 @@ from typing import Any
 import numpy as np
 
 from jaxcloseup.captures.contents import list_photographs
+from jaxcloseup.captures.names import file_names
 from jaxcloseup.captures.photo import Reading
+from jaxcloseup.captures.photo_masks import understood_masks
 from jaxcloseup.checks.evidence import gather
 from jaxcloseup.checks.judge import Checked, judge
 from jaxcloseup.io.cache import Stored, cache_path, cached, content_hash, hash_files
+from jaxcloseup.photos.scene import SceneError
 
 
 _MOST = 120  # photographs that are checked; of more, so many evenly spread ones
@@ -43,22 +46,28 @@ def check_capture(
       What was found, of at most 120 photographs, evenly spread.
 
     Raises:
-      SceneError: the capture cannot be read.
+      SceneError: the capture cannot be read, or its photographs are of other sizes than it says.
     """
     reading = (reading or Reading())._replace(downscale=1, zoom=1)
     listed = list_photographs(pathlib.Path(path), format=format, corrections=corrections)
-    frames = listed.frames
+    frames, names = listed.frames, file_names([frame.file for frame in listed.frames])
     if len(frames) > _MOST:
-        frames = [frames[i] for i in np.linspace(0, len(frames) - 1, _MOST).astype(int)]
+        rows = np.linspace(0, len(frames) - 1, _MOST).astype(int)
+        frames, names = [frames[i] for i in rows], [names[i] for i in rows]
+    masks, _ = understood_masks("", frames, inverted=reading.invert_masks)
+    reading = reading._replace(masks=masks)
 
     def make() -> Checked:
-        evidence = gather(frames, reading, lambda done: report(done, len(frames)))
+        evidence = gather(frames, reading, lambda done: report(done, len(frames)), names)
         opengl, whole = listed.format == "transforms", len(frames) == len(listed.frames)
-        return judge(evidence, listed.points, opengl=opengl, ordered=whole)
+        found = judge(evidence, listed.points, opengl=opengl, ordered=whole)
+        if evidence.turned and not any(text.startswith("turn=") for text in found.corrections):
+            raise SceneError(evidence.turned)
+        return found
 
     files = [file for frame in frames for file in (frame.file, frame.mask) if file]
     stats = [(str(file), (s := file.stat()).st_size, s.st_mtime_ns) for file in files]
-    given = [(f.listed, f.camtoworld.tolist(), f.size, f.lens, f.turns) for f in frames]
+    given = [(f.listed, f.camtoworld.tolist(), f.size, f.lens, f.turns) for f in frames], names
     code = hash_files(sorted(pathlib.Path(__file__).parent.glob("*.py")))
     points = content_hash(np.ascontiguousarray(listed.points))
     key = content_hash(repr([code, reading, stats, given, points]).encode())

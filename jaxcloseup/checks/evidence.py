@@ -8,12 +8,15 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from jaxcloseup.captures.photo import Photo, Reading
+from jaxcloseup.captures.names import file_names
+from jaxcloseup.captures.photo import Photo, Reading, resized_intrinsics
+from jaxcloseup.captures.photo_checks import is_rotated, wrong_size
 from jaxcloseup.captures.sift import Features, find_features
 from jaxcloseup.captures.small_photos import read_small
 from jaxcloseup.captures.world_frames import Frame
 from jaxcloseup.checks.epipolar import Cameras
 from jaxcloseup.checks.matches import Matches, find_matches
+from jaxcloseup.photos.scene import SceneError
 
 
 SIDE = 800  # longer side in pixels, about, of photographs that are checked
@@ -24,14 +27,19 @@ class Evidence(NamedTuple):
     """What photographs show, and the cameras that are claimed for them."""
 
     frames: Sequence[Frame]
+    names: Sequence[str]  # of photographs
     cameras: Cameras  # in pixels of the reduced photographs
     gray: Sequence[np.ndarray]  # `[H, W]` uint8 reduced photographs
     matches: Matches
     looks: np.ndarray  # `[V, 4]` what `look` measures
+    turned: str = ""  # what is wrong with the sizes, if all photographs are turned by a quarter
 
 
 def gather(
-    frames: Sequence[Frame], reading: Reading, report: Callable[[int], object] = lambda _: None
+    frames: Sequence[Frame],
+    reading: Reading,
+    report: Callable[[int], object] = lambda _: None,
+    names: Sequence[str] = (),
 ) -> Evidence:
     """Read photographs at about `SIDE` pixels, and match them.
 
@@ -39,9 +47,11 @@ def gather(
       frames: photographs of the capture.
       reading: how photographs are read; its divisors do not count.
       report: receives the number of photographs that are read.
+      names: of photographs; by default those of their files.
 
     Raises:
-      SceneError: a photograph cannot be read.
+      SceneError: a photograph cannot be read, or its size is not what the capture says; unless all
+        are turned by a quarter, which their content may explain.
     """
 
     def measure(frame: Frame) -> tuple[Photo, np.ndarray, Features, np.ndarray]:
@@ -57,12 +67,24 @@ def gather(
             done.append(found)
             report(len(done))
     photos, gray, features, looks = zip(*done, strict=True)
+    wrong = [said for photo in photos if (said := wrong_size(photo))]
+    turned = all(map(is_rotated, photos))
+    if wrong and not turned:
+        raise SceneError(wrong[0])
     cameras = Cameras(
         np.stack([frame.camtoworld for frame in frames]),
-        np.stack([photo.intrinsics(reading.half_pixel) for photo in photos]),
+        np.stack([_intrinsics(photo, turned, reading.half_pixel) for photo in photos]),
         np.array([image.shape[::-1] for image in gray]),
     )
-    return Evidence(frames, cameras, gray, find_matches(features), np.stack(looks))
+    said = wrong[0] if turned else ""
+    names = names or file_names([frame.file for frame in frames])
+    return Evidence(frames, names, cameras, gray, find_matches(features), np.stack(looks), said)
+
+
+def _intrinsics(photo: Photo, turned: bool, half_pixel: bool) -> np.ndarray:
+    """Return fx, fy, cx, cy `[4]` as given, in pixels of the reduced photograph."""
+    size = photo.scaled[::-1] if turned else photo.scaled  # that of which they were given
+    return resized_intrinsics(photo.frame, photo.stored_size, size, half_pixel)
 
 
 def look(rgb: np.ndarray, mask: np.ndarray) -> np.ndarray:

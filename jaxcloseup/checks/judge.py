@@ -47,8 +47,7 @@ def judge(evidence: Evidence, points: np.ndarray, *, opengl: bool, ordered: bool
       opengl: whether the file's matrices have OpenGL's axes, as transforms.json has.
       ordered: whether the evidence is of all photographs, so that an order can be corrected.
     """
-    names = [frame.file.name for frame in evidence.frames]
-    matches, cameras = evidence.matches, evidence.cameras
+    names, matches, cameras = evidence.names, evidence.matches, evidence.cameras
     count = len(matches.views)
     figures: dict[str, Any] = {"photographs": len(names), "matches": count, "points": len(points)}
     found = fit(matches, cameras) if count >= _FEWEST else None

@@ -31,11 +31,11 @@ pycolmap = pytest.importorskip("pycolmap")
 def test_photographs_in_subfolders(tmp_path, capsys):
     """Of two cameras, with equal names, beside what is no photograph of the scene."""
     write_noise(tmp_path / "in", 2)
-    for i, name in enumerate(["left cam", "right", "masks", "images_2", ".hidden", "made"]):
+    for i, name in enumerate(["images", "left cam", "masks", "images_2", ".hidden", "made"]):
         write_noise(tmp_path / "in" / name, 2 + i)
     (tmp_path / "in/made/process.json").write_text("{}")
-    names = ["0.png", "1.png", "left cam/0.png", "left cam/1.png"]
-    names += [f"right/{i}.png" for i in range(3)]
+    names = ["0.png", "1.png", "images/0.png", "images/1.png"]
+    names += [f"left cam/{i}.png" for i in range(3)]
     found, left_out = list_files(tmp_path / "in")
     assert [path.as_posix() for path in found] == names and not left_out
     for i, name in enumerate(names):  # none is a copy of another
@@ -50,6 +50,15 @@ def test_photographs_in_subfolders(tmp_path, capsys):
     assert set(lenses) == {name.replace(" ", "_") for name in names}
     groups = {(pathlib.PurePath(name).parent, lens) for name, lens in lenses.items()}
     assert len(groups) == len(set(lenses.values())) == 3
+
+
+def test_numbered_folders_hold_photographs_unless_beside_their_originals(tmp_path):
+    write_noise(tmp_path / "images_1", 2)
+    write_noise(tmp_path / "images_2", 2)
+    assert len(list_files(tmp_path)[0]) == 4
+    write_noise(tmp_path / "images", 2)
+    found = {path.parent.name for path in list_files(tmp_path)[0]}
+    assert found == {"images", "images_1"}
 
 
 def test_frames_are_sharp_and_evenly_spread():

@@ -76,6 +76,19 @@ def test_truncated_jpeg_with_a_complete_thumbnail(tmp_path, capfd):
         read_image(tmp_path / "a.jpg")
 
 
+@pytest.mark.parametrize("marker", [b"\xff\xdb", b"\xff\xda"])
+@pytest.mark.parametrize("extra", [b"\xff", b"\xff\xff\xff", b"\x00\x07"])
+def test_bytes_between_segments_of_a_jpeg_are_skipped(tmp_path, marker, extra):
+    write_image(tmp_path / "a.jpg")
+    whole = (tmp_path / "a.jpg").read_bytes()
+    at = whole.index(marker)
+    (tmp_path / "b.jpg").write_bytes(whole[:at] + extra + whole[at:])
+    np.testing.assert_array_equal(read_image(tmp_path / "b.jpg"), read_image(tmp_path / "a.jpg"))
+    (tmp_path / "b.jpg").write_bytes(whole[:at] + extra + whole[at:-2])
+    with pytest.raises(SceneError, match="truncated"):
+        read_image(tmp_path / "b.jpg")
+
+
 def test_no_file(tmp_path):
     with pytest.raises(SceneError, match=r"cannot be read \(No such file"):
         read_image(tmp_path / "b.png")

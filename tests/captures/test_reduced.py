@@ -53,6 +53,19 @@ def test_shrunk_photographs_are_used(tmp_path, size):
     assert (load(tmp_path)[0][1] == picture(1)).all()  # not used at full size
 
 
+def test_shrunk_photographs_are_halves_of_photographs_not_of_what_intrinsics_are_for(tmp_path):
+    doubled = {key: 2 * value for key, value in LENS.items()}
+    write_capture(tmp_path, **doubled)
+    for name in ("a.png", "b.png", "c.png"):
+        write_image(tmp_path / "images_2" / name, np.zeros((3, 4, 3), np.uint8))
+    scene = load(tmp_path, downscale=2, corrections=["size=2"])[2]
+    assert scene.metadata["own_sizes"]["train"] == [(9, 7)] * 3
+    write_capture(tmp_path / "right")
+    right = np.asarray(load(tmp_path / "right")[2].train.cameras.intrinsics)
+    scale = np.array([4 / 9, 3 / 7, 4 / 9, 3 / 7])
+    np.testing.assert_allclose(scene.train.cameras.intrinsics, right * scale, rtol=1e-6)
+
+
 @pytest.mark.parametrize("make", [llff_capture, colmap_capture])
 def test_every_format_uses_shrunk_photographs(tmp_path, make):
     if make is colmap_capture:

@@ -33,7 +33,8 @@ _QUALITY = 95  # of a JPEG that was turned
 _KEPT = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}  # formats that COLMAP reads everywhere
 _HEAD = 2**16  # bytes that tell a format
 _OTHER = "is not a photograph"
-_OTHERS = re.compile(r"\..*|masks|images_\d+")  # folders without photographs
+_OTHERS = re.compile(r"\..*|masks")  # folders without photographs
+_REDUCED = re.compile(r"images_[248]")  # and, beside `images`, those of reduced copies
 _NEEDS_CONVERSION = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"}
 
 
@@ -55,8 +56,8 @@ class Copied(NamedTuple):
 def list_files(folder: pathlib.Path) -> tuple[list[pathlib.Path], dict[str, str]]:
     """List the photographs of a folder and its subfolders, and why other files are left out.
 
-    Both by path in the folder. Hidden folders, masks, reduced copies and captures that `process`
-    made are not looked at.
+    Both by path in the folder. Hidden folders, masks, reduced copies beside `images` and captures
+    that `process` made are not looked at.
 
     Raises:
       ProcessingError: it is not a folder, or has fewer than 3 photographs.
@@ -67,7 +68,7 @@ def list_files(folder: pathlib.Path) -> tuple[list[pathlib.Path], dict[str, str]
     for place, folders, names in os.walk(folder, onerror=_refuse):
         inside = pathlib.Path(place).relative_to(folder)
         captured = place != str(folder) and NAME in names
-        folders[:] = [name for name in folders if not captured and not _OTHERS.fullmatch(name)]
+        folders[:] = [] if captured else _with_photographs(folders)
         paths = [inside / name for name in names if not captured and name[0] != "."]
         files += [path for path in paths if (folder / path).is_file()]
     files.sort()
@@ -85,6 +86,12 @@ def list_files(folder: pathlib.Path) -> tuple[list[pathlib.Path], dict[str, str]
             + "".join(unread[:1])
         )
     return photographs, left_out
+
+
+def _with_photographs(folders: Sequence[str]) -> list[str]:
+    """Return the names of folders that may hold photographs of their own."""
+    others = [_OTHERS, _REDUCED] if "images" in folders else [_OTHERS]
+    return [name for name in folders if not any(other.fullmatch(name) for other in others)]
 
 
 def _why_not(path: pathlib.Path) -> str:

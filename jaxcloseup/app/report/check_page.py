@@ -12,6 +12,7 @@ from jaxcloseup.app.report.page import fill_page
 from jaxcloseup.app.report.record_table import Table
 from jaxcloseup.app.run.capture_check import said_of
 from jaxcloseup.captures.contents import Listed
+from jaxcloseup.captures.names import file_names
 from jaxcloseup.captures.photo import Reading
 from jaxcloseup.captures.small_photos import read_small
 from jaxcloseup.checks.judge import Checked
@@ -55,7 +56,8 @@ def write_check(
     poses = np.stack([frame.camtoworld for frame in listed.frames])
     above = draw_cameras(poses, listed.points, listed.rgb)
     worst = [(photo, share) for photo, share in found.worst if share < _ALL_FIT]
-    by_name = {frame.file.name: frame for frame in listed.frames}
+    names = file_names([frame.file for frame in listed.frames])
+    by_name = dict(zip(names, listed.frames, strict=True))
     pictures = [read_small(by_name[photo], reading, _SIDE).rgb for photo, _ in worst]
     figures = [
         (text, f"{found.figures[key]:{form}}")
