@@ -51,6 +51,16 @@ def missing() -> str | None:
     return None
 
 
+def require() -> None:
+    """Load the library.
+
+    Raises:
+      LibraryError: it is not there, or cannot be loaded.
+    """
+    if why := missing():
+        raise LibraryError(why)
+
+
 def available() -> bool:
     """Return whether programs for CPUs can call the library."""
     return missing() is None

@@ -68,6 +68,9 @@ def match_planes(
     Returns:
       `[K, H, W]` costs in [0, 1]: the mean of 1 - NCC, no more than 1, over the `config.best`
       neighbors that fit best. A neighbor that does not show the point counts as 1.
+
+    Raises:
+      LibraryError: the library is to be called, and is not there.
     """
     camera = camera_at(photographs.cameras, reference)
     others = camera_at(photographs.cameras, jnp.maximum(neighbors, 0))
@@ -76,8 +79,11 @@ def match_planes(
     arrays = _Arrays(photographs, reference, neighbors, transforms, planes)
     natively = functools.partial(_match_natively, config=config)
     in_jax = functools.partial(_match_in_jax, config=config)
-    if native is None and library.available():
+    single = transforms.dtype == planes.dtype == photographs.weight.dtype == jnp.float32
+    if native is None and single and library.available():
         return jax.lax.platform_dependent(arrays, cpu=natively, default=in_jax)
+    if native:
+        library.require()
     return natively(arrays) if native else in_jax(arrays)
 
 

@@ -10,6 +10,7 @@ import subprocess
 import sys
 
 import jax
+import jax.numpy as jnp
 import pytest
 from absl import flags
 from absl.testing import flagsaver
@@ -21,6 +22,8 @@ from jaxcloseup.app.methods.shared import splat_training
 from jaxcloseup.app.run.scene_input import load_scene
 from jaxcloseup.fields.splats.config import RasterizeConfig
 from jaxcloseup.fields.splats.raster_plan import plan_raster
+from jaxcloseup.fields.volume.config import HashGridConfig
+from jaxcloseup.fields.volume.hash_grid import hash_features
 from jaxcloseup.native import library
 
 
@@ -113,3 +116,11 @@ def test_to_ask_for_it_in_vain_is_one_sentence(hidden, capture_folder, tmp_path,
     ):
         run.main(["run"])
     assert "\n" not in error.value.code and library.INSTALL in error.value.code
+
+
+def test_a_library_that_is_asked_for_and_missing_is_named(hidden):
+    config = HashGridConfig(levels=2, log2_entries=4)
+    table, x = jnp.zeros((sum(config.entries), config.features)), jnp.zeros((3, 1))
+    with pytest.raises(library.LibraryError, match="was not built"):
+        hash_features(table, config, x, native=True)
+    assert not hash_features(table, config, x).any()

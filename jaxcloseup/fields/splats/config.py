@@ -56,7 +56,7 @@ class RasterizeConfig:
     """Static settings of the rasterizer; the sizes change no image whose pairs fit.
 
     Raises:
-      ValueError: there is no such compositor or platform.
+      ValueError: there is no such compositor or platform, or `near` is not positive.
     """
 
     capacity: int = setting(
@@ -96,7 +96,9 @@ class RasterizeConfig:
     )
 
     def __post_init__(self) -> None:
-        """Check the names."""
+        """Check the names and the near plane."""
+        if not self.near > 0:
+            raise ValueError(f"near must be a positive depth, not {self.near}")
         if self.compositor not in COMPOSITORS:
             raise ValueError(
                 f'RasterizeConfig.compositor must be one of {COMPOSITORS}, not "{self.compositor}"'

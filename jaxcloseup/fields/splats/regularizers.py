@@ -23,6 +23,8 @@ def depth_to_normal(camera: Camera, depth: jax.Array) -> jax.Array:
       depth: `[H, W]` z-depth; 0 where it is undefined.
     """
     chex.assert_shape(depth, (camera.height, camera.width))
+    if min(depth.shape) < 3:  # all is border
+        return jnp.zeros((*depth.shape, 3), depth.dtype)
     pixels = pixel_grid(camera.height, camera.width).astype(depth.dtype)
     points = pixels_to_points(camera, pixels, depth)
     down = points[2:, 1:-1] - points[:-2, 1:-1]

@@ -98,7 +98,10 @@ def _blend(
 ) -> SplatImage:
     """Project surfels and blend their colors and normals."""
     plan = plan_raster(config, height=camera.height, width=camera.width)
-    if plan.compositor == "native" and surfels_native.can_render(surfels):
+    if not opacity.size:  # nothing can be gathered from no rows: one that is not drawn
+        surfels = jax.tree.map(lambda leaf: jnp.ones((1, *leaf.shape[1:]), leaf.dtype), surfels)
+        opacity = jnp.zeros(1, opacity.dtype)
+    if plan.compositor == "native" and surfels_native.can_render(surfels, opacity, camera):
         sums, median = surfels_native.render_sums(surfels, opacity, camera, config)
         return image_of(sums, median, jnp.zeros((), jnp.int32))
     # Only surfels that may show are projected, and only pairs that draw are listed.

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_derivatives import CustomVJPPrimal, custom_vjp_primal_tree_values
+from jax.custom_derivatives import CustomVJPPrimal, SymbolicZero, custom_vjp_primal_tree_values
 
 from jaxcloseup.fields.splats.config import RasterizeConfig
 from jaxcloseup.fields.splats.layout import MOMENTS
@@ -21,9 +21,11 @@ from jaxcloseup.geometry.cameras import Camera
 FEATURES = 6  # color and normal
 
 
-def can_render(surfels: Surfels) -> bool:
-    """Return whether the native library renders such surfels."""
-    return surfels.means.dtype == jnp.float32 and surfels.log_scales.shape[1] == 2
+def can_render(surfels: Surfels, opacity: jax.Array, camera: Camera) -> bool:
+    """Return whether the native library renders such surfels, as `render_sums` takes them."""
+    arrays = jax.tree.leaves((surfels, opacity, _numbers_of(camera)))
+    single = all(array.dtype == jnp.float32 for array in arrays)
+    return single and surfels.log_scales.shape[1] == 2
 
 
 def render_sums(
@@ -101,7 +103,7 @@ def _is_primal(leaf: Any) -> bool:
 
 def _as_array(bar: Any) -> jax.Array:
     """Return a cotangent, which may be a symbolic zero, as an array."""
-    return bar if isinstance(bar, jax.Array) else jnp.zeros(bar.shape, bar.dtype)
+    return jnp.zeros(bar.shape, bar.dtype) if isinstance(bar, SymbolicZero) else jnp.asarray(bar)
 
 
 def _call(

@@ -39,10 +39,13 @@ def hash_features(
       config: sizes.
       positions: `[3, M]` in [0, 1]; others are taken to the nearest such position.
       native: whether to call the native library; None: where it is there and a program is
-        compiled for CPUs.
+        compiled for CPUs. Its derivative by the table has no further derivative; that of JAX has.
 
     Returns:
       `[levels, features, M]`.
+
+    Raises:
+      LibraryError: the library is to be called, and is not there.
     """
     chex.assert_shape(table, (sum(config.entries), config.features))
     chex.assert_shape(positions, (3, None))
@@ -56,6 +59,8 @@ def hash_features(
             cpu=functools.partial(_in_library, config),
             default=functools.partial(_in_jax, config),
         )
+    if native:
+        library.require()
     return (_in_library if native else _in_jax)(config, table, positions)
 
 

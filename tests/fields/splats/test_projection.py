@@ -10,6 +10,7 @@ import reference_splats as reference
 from splat_scenes import IDENTITY, NEAR, pixel_centers, random_scene, to_surfels
 from splat_scenes import to_camera as make_camera
 
+from jaxcloseup.fields.splats.config import RasterizeConfig
 from jaxcloseup.fields.splats.projection import project_discs, surfel_columns, to_camera
 
 
@@ -134,3 +135,5 @@ def test_near_must_be_positive():
     discs, _ = to_camera(surfel_columns(to_surfels(random_scene(0))), make_camera())
     with pytest.raises(ValueError, match="near must be a positive depth"):
         project_discs(discs, np.ones(16), np.ones((3, 16)), make_camera(), near=0.0)
+    with pytest.raises(ValueError, match="near must be a positive depth"):
+        RasterizeConfig(near=-1.0)

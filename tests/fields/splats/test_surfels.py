@@ -15,6 +15,7 @@ from jaxcloseup.fields.splats.regularizers import (
     scale_free_distortion,
 )
 from jaxcloseup.fields.splats.spherical_harmonics import rgb_to_sh, sh_basis, sh_to_rgb
+from jaxcloseup.geometry.cameras import Camera
 
 
 def test_surfels_fill_the_gaps_between_points(key):
@@ -119,6 +120,13 @@ def test_normals_of_a_plane_are_exact():
     assert np.all(found[1:-1, 1:19] @ (turn @ normal) > 0)
     assert np.all(found[:, 19:] == 0) and np.all(found[[0, -1]] == 0)
     assert np.all(np.isfinite(gradient))
+
+
+@pytest.mark.parametrize("size", [(1, 5), (2, 3), (4, 1)])
+def test_images_that_are_all_border_have_no_normals(size):
+    camera = Camera(jnp.eye(3, 4), jnp.array([9.0, 9, 2, 1]), *size)
+    normal = depth_to_normal(camera, jnp.ones(size))
+    assert normal.shape == (*size, 3) and not normal.any()
 
 
 def test_float32_normals_agree_with_opencv():

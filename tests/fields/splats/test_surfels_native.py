@@ -73,3 +73,40 @@ def test_a_batch_of_cameras_is_each_camera():
     for i in range(2):
         alone = color(surfels, jax.tree.map(lambda leaf, i=i: leaf[i], cameras))
         np.testing.assert_array_equal(together[i], alone)
+
+
+def test_a_cotangent_of_numpy_counts_as_one_of_jax():
+    """Of an output of the library's own derivative, whose missing cotangents are zeros."""
+    surfels, alive, camera = to_surfels(SCENES["in front"]), jnp.ones(16, bool), to_camera()
+    config = dataclasses.replace(CONFIG, compositor="native")
+
+    def median(surfels):
+        return render_surfels(surfels, alive, camera, config).aux.median_depth
+
+    depth, pull = jax.vjp(median, surfels)
+    (by_numpy,), (by_jax,) = pull(np.ones(depth.shape, np.float32)), pull(jnp.ones_like(depth))
+    assert np.abs(by_jax.means).max() > 0
+    np.testing.assert_array_equal(by_numpy.means, by_jax.means)
+
+
+def test_cameras_of_double_precision_are_not_given_to_the_library():
+    surfels, alive, camera = to_surfels(SCENES["in front"]), jnp.ones(16, bool), to_camera()
+    expected = render_surfels(surfels, alive, camera, CONFIG).rgb
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
+        camera = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), camera)
+        config = dataclasses.replace(CONFIG, compositor="native")
+        rgb = render_surfels(surfels, alive, camera, config).rgb
+        assert rgb.dtype == jnp.float64
+        np.testing.assert_allclose(rgb, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("compositor", ["native", "loops"])
+def test_no_surfels_are_an_empty_image(compositor):
+    none = jax.tree.map(lambda leaf: leaf[:0], to_surfels(SCENES["in front"]))
+    config = dataclasses.replace(CONFIG, compositor=compositor)
+
+    def brightness(surfels):
+        return jnp.sum(render_surfels(surfels, jnp.ones(0, bool), to_camera(), config).rgb)
+
+    value, bars = jax.value_and_grad(brightness)(none)
+    assert value == 0 and bars.means.shape == (0, 3)
