@@ -13,7 +13,23 @@ if TYPE_CHECKING:  # type checkers do not follow the lazy list below
     from jaxcloseup.fields.contract import RadianceField, Rendering
     from jaxcloseup.fields.splats.render import render_surfels
     from jaxcloseup.fields.splats.surfels import Surfels, surfels_from_points
-    from jaxcloseup.geometry.cameras import Camera
+    from jaxcloseup.geometry.cameras import (
+        Camera,
+        pixel_grid,
+        pixels_to_points,
+        pixels_to_rays,
+        points_to_pixels,
+    )
+    from jaxcloseup.geometry.masks import depth_consistent, in_bounds, rgb_consistent
+    from jaxcloseup.geometry.poses import (
+        PoseSettings,
+        closeup_position,
+        perturb_rotation,
+        sample_anchor,
+        sample_closeup_camera,
+    )
+    from jaxcloseup.geometry.rotations import euler_to_matrix, matrix_to_euler, quaternion_to_matrix
+    from jaxcloseup.geometry.warp import ForwardWarp, backward_warp, forward_warp
     from jaxcloseup.labels.config import LabelConfig, pseudo_settings
     from jaxcloseup.labels.make import PseudoLabel, PseudoSettings, make_label
     from jaxcloseup.labels.target_views import best_source, label_views
@@ -29,7 +45,13 @@ if TYPE_CHECKING:  # type checkers do not follow the lazy list below
 __all__, __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "geometry.cameras": "Camera",
+        "geometry.cameras": "Camera pixel_grid pixels_to_points pixels_to_rays points_to_pixels",
+        "geometry.masks": "depth_consistent in_bounds rgb_consistent",
+        "geometry.poses": (
+            "PoseSettings closeup_position perturb_rotation sample_anchor sample_closeup_camera"
+        ),
+        "geometry.rotations": "euler_to_matrix matrix_to_euler quaternion_to_matrix",
+        "geometry.warp": "ForwardWarp backward_warp forward_warp",
         "labels.config": "LabelConfig pseudo_settings",
         "labels.make": "PseudoLabel PseudoSettings make_label",
         "labels.target_views": "best_source label_views",

@@ -19,6 +19,20 @@ PACKAGES = sorted(
 )
 
 
+# What other people's code may import from the package itself.
+CONTRACTS = """
+Camera pixel_grid pixels_to_rays pixels_to_points points_to_pixels euler_to_matrix matrix_to_euler
+quaternion_to_matrix PoseSettings closeup_position sample_anchor perturb_rotation
+sample_closeup_camera backward_warp ForwardWarp forward_warp in_bounds depth_consistent
+rgb_consistent Surfels surfels_from_points render_surfels Rendering RadianceField Views
+PseudoSettings PseudoLabel make_label best_source TrainState train_step pseudo_step load_scene
+"""
+
+
+def test_contracts_are_importable_from_the_package():
+    assert set(CONTRACTS.split()) <= set(jaxcloseup.__all__)
+
+
 def public_names(package):
     """Functions and classes without a leading underscore that the package's modules define."""
     for path in set(pathlib.Path(package.__file__).parent.glob("[a-z]*.py")):

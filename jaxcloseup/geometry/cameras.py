@@ -214,7 +214,8 @@ def crop_camera(camera: Camera, corner: jax.Array, *, height: int, width: int) -
       height: height of the part in pixels.
       width: width of the part in pixels.
     """
-    moved = jnp.concatenate([jnp.zeros(2), jnp.asarray(corner, camera.intrinsics.dtype)])
+    corner = jnp.asarray(corner, camera.intrinsics.dtype)
+    moved = jnp.concatenate([jnp.zeros_like(corner), corner])
     return camera.replace(intrinsics=camera.intrinsics - moved, height=height, width=width)
 
 

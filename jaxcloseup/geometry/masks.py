@@ -38,4 +38,5 @@ def rgb_consistent(a: jax.Array, b: jax.Array, tolerance: jax.Array | float) -> 
     This is the paper's mask M = |I' - I*| < epsilon.
     """
     chex.assert_equal_shape([a, b])
-    return jnp.all(jnp.abs(a - b) < tolerance, axis=-1)
+    apart = jnp.where(a > b, a - b, b - a)  # differences of unsigned integers wrap
+    return jnp.all(apart < tolerance, axis=-1)

@@ -121,6 +121,8 @@ def forward_warp(
             depth=jnp.full(shape, jnp.inf, depth.dtype),
             hit=jnp.zeros(shape, bool),
         )
+    if not depth.size:
+        return into
     pixels = jnp.where(usable[:, None], pixels, 0)
     target = _index(pixels[:, 1], height) * width + _index(pixels[:, 0], width)
     target = jnp.where(usable, target, height * width)
@@ -230,7 +232,7 @@ def draw_nearest(
     Args:
       buffer: depths `[N]`, inf where empty, and int32 sources `[N]`, `NO_SOURCE` where empty.
       target: `[M]` int32 entry where each source falls; N and above are not drawn.
-      depth: `[M]` depths of the sources.
+      depth: `[M]` depths of the sources, finite.
       source: `[M]` int32 indices of the sources.
 
     Returns:
@@ -240,7 +242,7 @@ def draw_nearest(
     # Two scatters with commutative minima: the result does not depend on their order. The first
     # finds the nearest depth of each entry, the second the lowest index among its sources.
     nearest = before.at[target].min(depth, mode="drop")
-    wins = depth == nearest.at[target].get(mode="fill", fill_value=jnp.nan)
+    wins = depth == nearest.at[target].get(mode="fill", fill_value=-jnp.inf)
     sources = jnp.where(nearest < before, NO_SOURCE, sources)
     return nearest, sources.at[jnp.where(wins, target, nearest.size)].min(source, mode="drop")
 

@@ -181,6 +181,10 @@ def label_pixels(
       A `PseudoLabel` over `[...]`.
     """
     chex.assert_equal_shape_prefix([pixels, depth], depth.ndim)
+    # Loops of traced length have no derivative; nothing may try to take one.
+    camera, pixels, depth, sources, settings = jax.lax.stop_gradient(
+        (camera, pixels, depth, sources, settings)
+    )
     views = sources.views
     # I': lift with D', read the source photographs where the points project. The loop reads one
     # photograph at a time, because their number is traced.

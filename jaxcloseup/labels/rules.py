@@ -82,14 +82,22 @@ def pool_label_loss(
 
 
 def _pool(batch: Batch, labeled: Batch) -> Batch:
-    """Return one batch with the pixels of both; `labeled` has one camera for all its pixels."""
+    """Return one batch with the pixels of both; `labeled` has one camera for all its pixels.
+
+    Pixels alone do not need the size of their camera's image, which may differ. Labels have no
+    measured depth.
+    """
     count = labeled.weight.size
-    cameras = jax.tree.map(
-        lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), labeled.cameras
+    size = {"height": batch.cameras.height, "width": batch.cameras.width}
+    cameras, measured = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)),
+        (
+            labeled.cameras.replace(**size),
+            jax.tree.map(lambda leaf: jnp.zeros_like(leaf[0]), batch.measured),
+        ),
     )
-    return jax.tree.map(
-        lambda *leaves: jnp.concatenate(leaves), batch, labeled._replace(cameras=cameras)
-    )
+    labeled = labeled._replace(cameras=cameras, measured=measured)
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), batch, labeled)
 
 
 class LabelRule(NamedTuple):

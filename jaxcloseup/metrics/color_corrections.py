@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcloseup.geometry.numerics import safe_divide
-from jaxcloseup.metrics.image_metrics import psnr
+from jaxcloseup.metrics.image_metrics import in_single, psnr
 
 
 HIGHEST = jax.lax.Precision.HIGHEST
@@ -22,6 +22,7 @@ def gsplat_cc_psnr(image: jax.Array, target: jax.Array, *, weight: jax.Array) ->
     The fit is that of the image to the target, a * target + b, and its inverse corrects the image.
     Arguments as in `psnr`; a channel of one color stays as it is.
     """
+    image, target, weight = in_single(image, target, weight)
     share = safe_divide(weight, jnp.sum(weight), fill=jnp.nan)[..., None]
 
     def mean(values: jax.Array) -> jax.Array:
@@ -41,6 +42,7 @@ def multinerf_cc_psnr(image: jax.Array, target: jax.Array, *, weight: jax.Array)
     Each channel becomes a polynomial of all three, of degree 2, by least squares over pixels that
     are clipped neither before nor after. Arguments as in `psnr`.
     """
+    image, target, weight = in_single(image, target, weight)
     usable = _is_usable(image)
 
     def correct(_: jax.Array, corrected: jax.Array) -> jax.Array:

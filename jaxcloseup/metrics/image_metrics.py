@@ -31,7 +31,7 @@ def psnr(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = None
       target: `[H, W, 3]` in [0, 1].
       weight: `[H, W]` weight of each pixel in the mean; 1 by default.
     """
-    weight = _check(image, target, weight)
+    image, target, weight = in_single(image, target, weight)
     return -10 * jnp.log10(_weighted_mean((image - target) ** 2, weight))
 
 
@@ -51,7 +51,7 @@ def ssim(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = None
     Raises:
       ValueError: a side of the image has fewer than 11 pixels.
     """
-    weight = _check(image, target, weight)
+    image, target, weight = in_single(image, target, weight)
     if min(image.shape[:2]) < SSIM_TAPS:
         raise ValueError(f"SSIM needs {SSIM_TAPS} pixels a side: the image is {image.shape[:2]}.")
     import dm_pix  # here, so that fields can be imported without it
@@ -93,7 +93,7 @@ def cc_psnr(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = N
     colors span less than three dimensions, as in a gray image, the change of least norm applies.
     Arguments as in `psnr`.
     """
-    weight = _check(image, target, weight)
+    image, target, weight = in_single(image, target, weight)
     fitted = change_colors(image, *fit_colors(image, target, weight))
     return psnr(jnp.clip(fitted, 0, 1), target, weight=weight)
 
@@ -142,15 +142,25 @@ def change_colors(image: jax.Array, matrix: jax.Array, offset: jax.Array) -> jax
     return matmul(image, matrix[None]) + offset[None, None]
 
 
-def _check(image: jax.Array, target: jax.Array, weight: jax.Array | None) -> jax.Array:
-    """Check shapes and types, and return the weight or ones."""
+def in_single(
+    image: jax.Array, target: jax.Array, weight: jax.Array | None
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Check two images and weights of pixels, 1 by default, and return them in float32 at least.
+
+    A sum over an image overflows half precision.
+    """
     chex.assert_shape(image, (None, None, 3))
     chex.assert_equal_shape([image, target])
     chex.assert_type([image, target], float)
     if weight is None:
-        return jnp.ones(image.shape[:2], image.dtype)
+        weight = jnp.ones(image.shape[:2], jnp.float32)
     chex.assert_shape(weight, image.shape[:2])
-    return weight
+    arrays = jnp.asarray(image), jnp.asarray(target), jnp.asarray(weight)
+    double = any(array.dtype == jnp.float64 for array in arrays)
+    image, target, weight = (
+        array.astype(jnp.float64 if double else jnp.float32) for array in arrays
+    )
+    return image, target, weight
 
 
 def _weighted_mean(values: jax.Array, weight: jax.Array) -> jax.Array:

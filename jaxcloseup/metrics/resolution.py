@@ -8,12 +8,12 @@ is no longer mostly what is there.
 
 import functools
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxcloseup.geometry.numerics import safe_divide
+from jaxcloseup.metrics.image_metrics import in_single
 
 
 RINGS = 40  # rings of equal width up to the finest frequency, half a period for each pixel
@@ -42,15 +42,13 @@ def ring_correlation(
     Raises:
       ValueError: a side of the image has fewer than `SMALLEST` pixels.
     """
-    chex.assert_shape(image, (None, None, 3))
-    chex.assert_equal_shape([image, truth])
+    image, truth, weight = in_single(image, truth, weight)
     height, width = image.shape[:2]
     if min(height, width) < SMALLEST:
         raise ValueError(
             f"ring correlation needs {SMALLEST} pixels a side: the image is {height, width}."
         )
     window = jnp.asarray(np.outer(np.hanning(height), np.hanning(width)), image.dtype)
-    weight = jnp.ones_like(window) if weight is None else weight
     rings, which, times = _rings(height, width)
     found = _correlate(image, truth, window, weight, which, times, rings=rings)
     return jnp.interp(frequencies(), frequencies(rings), found)

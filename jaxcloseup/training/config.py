@@ -7,7 +7,11 @@ from jaxcloseup.setting import setting
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
-    """How much one step looks at."""
+    """How much one step looks at.
+
+    Raises:
+      ValueError: whole photographs and single labeled pixels would share a mean.
+    """
 
     num_rays: int | None = setting(
         1024, "pixels of photographs in a step; none takes one whole photograph", low=1
@@ -27,3 +31,12 @@ class TrainConfig:
         "of the draws moves the parameters",
         low=1,
     )
+
+    def __post_init__(self) -> None:
+        """Check that both losses can be joined."""
+        single = self.num_rays is not None or self.num_label_rays is None
+        if self.label_rule != "paper" and not single:
+            raise ValueError(
+                f"label_rule {self.label_rule} pools single pixels: give num_rays, or set "
+                "num_label_rays=none"
+            )

@@ -33,3 +33,5 @@ def test_colors_agree_if_every_channel_does():
     b = jnp.array([[0.5, 0.625, 0.375], [0.5, 0.5, 0.75], [0.5, 0.5, 0.5]])
     np.testing.assert_array_equal(rgb_consistent(a, b, 0.25), [True, False, True])
     assert not jnp.any(rgb_consistent(a, a, 0.0))
+    levels = jnp.array([[2, 2, 2]], jnp.uint8), jnp.array([[3, 3, 3]], jnp.uint8)
+    assert rgb_consistent(*levels, 2).all() and rgb_consistent(*levels[::-1], 2).all()

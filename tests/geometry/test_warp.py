@@ -117,6 +117,21 @@ def test_invalid_sources_are_not_drawn(key):
     assert jnp.all(jnp.isinf(nothing.depth))
 
 
+def test_no_sources_leave_the_target_as_it_is(key):
+    values, pixels, depth = sources(key)
+    first = forward_warp(values, pixels, depth, shape=(HEIGHT, WIDTH))
+    none = (values[:0], pixels[:0], depth[:0])
+    both = forward_warp(*none, shape=(HEIGHT, WIDTH), into=first)
+    jax.tree.map(np.testing.assert_array_equal, both, first)
+    assert not forward_warp(*none, shape=(HEIGHT, WIDTH)).hit.any()
+
+
+def test_no_step_on_the_way_is_nan(key):
+    """So that programs can look for NaN of their own."""
+    with jax.debug_nans(True):
+        forward_warp(*sources(key), shape=(HEIGHT, WIDTH))
+
+
 def test_the_same_camera_maps_every_pixel_to_itself(key, image):
     camera = Camera(jnp.eye(3, 4), jnp.array([8.0, 7, 4.4, 3.1]), HEIGHT, WIDTH)
     depth = jax.random.uniform(key, (HEIGHT, WIDTH), minval=1, maxval=2)

@@ -155,6 +155,18 @@ def test_jit_and_vmap(pair, weight, name):
     np.testing.assert_allclose(batched(images, targets, weights), single, rtol=1e-4)
 
 
+@pytest.mark.parametrize("name", METRICS)
+@pytest.mark.parametrize("dtype", [jnp.float16, jnp.bfloat16])
+def test_half_precision_is_measured_in_single(name, dtype):
+    """A sum over 90,000 pixels overflows 16 bits."""
+    rng = np.random.default_rng(3)
+    image, target = (jnp.asarray(rng.uniform(size=(300, 300, 3)), dtype) for _ in range(2))
+    found = METRICS[name](image, target)
+    assert found.dtype == jnp.float32
+    single = METRICS[name](image.astype(jnp.float32), target.astype(jnp.float32))
+    np.testing.assert_array_equal(found, single)
+
+
 def test_wrong_inputs_are_refused(pair, weight):
     with pytest.raises(ValueError, match="SSIM needs 11 pixels a side"):
         ssim(pair[0][:10], pair[1][:10])

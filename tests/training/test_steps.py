@@ -8,9 +8,11 @@ import plane
 import pytest
 from tiny_training import RATE, fresh_state, one_color_field, settings
 
+from jaxcloseup.labels.make import label_sources
 from jaxcloseup.photos.views import sample_image, sample_pixels
+from jaxcloseup.photos.windows import view_windows
 from jaxcloseup.training.config import TrainConfig
-from jaxcloseup.training.steps import labeled_step, pseudo_step, run_steps, train_step
+from jaxcloseup.training.steps import closeup_step, labeled_step, pseudo_step, run_steps, train_step
 
 
 @pytest.fixture(scope="module")
@@ -94,6 +96,20 @@ def test_pooling_weighs_photographs_and_labels_by_their_pixels(capture):
     mean = (64 * photographs + kept * labels) / (64 + kept)
     expected = state.params - RATE * 2 * (state.params - mean)
     np.testing.assert_allclose(pooled.params, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("rule", ["pooled", "released"])
+def test_windows_and_labels_of_other_sizes_are_pooled(capture, rule):
+    """Every pixel has the field's one color, so the loss is that of all pixels, wherever from."""
+    views, depths = capture
+    windows = view_windows(views, plane.HEIGHT // 2, plane.WIDTH // 2)
+    state, sources = fresh_state(), label_sources(views, depths)
+    step = bind(closeup_step, num_rays=64, num_label_rays=256, label_rule=rule)
+    after, metrics = step(state, windows, sources, settings(use_mask=0.0))
+    assert 0 < metrics["label_coverage"] <= 1 and np.isfinite(metrics["loss"])
+    assert np.abs(after.params - state.params).max() > 0
+    with pytest.raises(ValueError, match="pools single pixels: give num_rays"):
+        TrainConfig(num_rays=None, num_label_rays=256, label_rule=rule)
 
 
 def test_the_control_sees_the_same_photographs(capture):

@@ -83,14 +83,12 @@ def composite_intervals(
 
 def _composite(rgb: jax.Array, optical: jax.Array, depth: jax.Array) -> Composite:
     """Composite samples of optical depths `[..., S]`."""
-    # Optical depth in front of each sample. A sum stays precise where transmittance is tiny.
-    before = jnp.cumsum(optical[..., :-1], axis=-1)
-    before = jnp.concatenate([jnp.zeros_like(optical[..., :1]), before], axis=-1)
-    transmittance = jnp.exp(-before)
+    # From the optical depth behind each sample. A sum stays precise where transmittance is tiny.
+    after = jnp.exp(-jnp.cumsum(optical, axis=-1))
+    transmittance = jnp.concatenate([jnp.ones_like(after[..., :1]), after[..., :-1]], axis=-1)
     weights = transmittance * -jnp.expm1(-optical)
     alpha = jnp.sum(weights, axis=-1)
     expected = jnp.sum(weights * depth, axis=-1)
-    after = transmittance - weights
     median = jnp.where((transmittance >= 0.5) & (after < 0.5), depth, 0)
     return Composite(
         weights=weights,

@@ -26,7 +26,7 @@ class _TrunkConfig:
 class NerfConfig(_TrunkConfig):
     """The network and its sampling; the defaults are the original's."""
 
-    num_coarse: int = setting(64, "stratified samples per ray of the coarse network", low=1)
+    num_coarse: int = setting(64, "stratified samples per ray of the coarse network", low=2)
     num_fine: int = setting(
         64, "importance samples per ray; the fine network sees these and the coarse ones", low=1
     )

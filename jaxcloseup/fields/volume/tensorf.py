@@ -183,10 +183,17 @@ def _grown(state: Any, old: int, new: int) -> Any:
         planes = jnp.einsum("ni,kj,mijc->mnkc", take, take, factors["planes"], precision="highest")
         return {"planes": planes, "lines": lines}
 
+    structure: Any = jax.tree.structure(state.params)
+
+    def is_like_params(part: Any) -> bool:
+        return bool(jax.tree.structure(part) == structure)
+
     params = state.params | {name: grow(state.params[name]) for name in ("density", "color")}
-    # Moments of other vertices say nothing of these; counts of steps stay.
+    # Moments of other vertices say nothing of these; counts of steps and rates stay.
     opt_state = jax.tree.map(
-        lambda x: jnp.zeros_like(x) if jnp.issubdtype(x.dtype, jnp.floating) else x, state.opt_state
+        lambda part: jax.tree.map(jnp.zeros_like, part) if is_like_params(part) else part,
+        state.opt_state,
+        is_leaf=is_like_params,
     )
     buffers = TensorfBuffers(jnp.asarray(new, jnp.int32))
     return state.replace(params=params, buffers=buffers, opt_state=opt_state)

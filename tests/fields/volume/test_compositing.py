@@ -76,3 +76,12 @@ def test_gradients_stay_finite(density):
 
     gradient = jax.jit(jax.grad(total))(jnp.full(5, density))
     assert np.all(np.isfinite(gradient)), gradient
+
+
+@pytest.mark.parametrize("count", [10, 13, 26, 30])
+def test_the_median_is_where_half_is_crossed_once(count):
+    """Fog of which an interval's edge takes exactly half the light, up to rounding."""
+    density = jnp.full(64, np.log(2) / count * 32, jnp.float32)
+    edges = jnp.linspace(1.0, 3.0, 65)
+    seen = compositing.composite_intervals(None, density, edges, jnp.ones(()))
+    np.testing.assert_allclose(seen.median_depth, 1 + count / 32, atol=1 / 32)

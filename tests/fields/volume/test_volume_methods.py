@@ -316,7 +316,7 @@ def test_a_grid_that_grows_shows_the_same_scene():
         shapes, _ = jax.eval_shape(grown.init, jax.random.key(0), *[jnp.zeros((1, 3))] * 2)
         numbers = np.random.default_rng(5)
         params = jax.tree.map(lambda x: numbers.normal(size=x.shape), shapes)
-        moments = {"mu": jax.tree.map(np.ones_like, params), "count": np.int32(7)}
+        moments = {"mu": jax.tree.map(np.ones_like, params), "count": np.int32(7), "rate": 0.5}
         x = numbers.uniform(-1, 1, (3, 20))
 
         @jax.jit
@@ -333,4 +333,4 @@ def test_a_grid_that_grows_shows_the_same_scene():
             np.testing.assert_allclose(now, before, atol=1e-12)
             assert after.buffers.vertices == (5 if step == 4 else 3)
             assert np.all(after.opt_state["mu"]["color"]["lines"] == (0 if step == 4 else 1))
-            assert after.opt_state["count"] == 7
+            assert after.opt_state["count"] == 7 and after.opt_state["rate"] == 0.5
