@@ -47,6 +47,7 @@ class Detail(struct.PyTreeNode):
       finer: `[]` log2 of how much finer the finest level is than the photographs that the model
         learned from.
       grain: `[]` typical radius of the model's splats, world units; 0 of a model without.
+      confirmed: `[]` part in [0, 1] of what the networks take to be there that is added.
     """
 
     shown: Pyramid
@@ -54,6 +55,7 @@ class Detail(struct.PyTreeNode):
     weights: DetailWeights
     finer: jax.Array
     grain: jax.Array
+    confirmed: jax.Array | float = 1.0
 
 
 class Detailed(NamedTuple):
@@ -113,7 +115,7 @@ def add_detail(
     """
     depth = _smooth(detail.grain, camera, depth)
     gathered = gather_parts(camera, pixels, depth, detail.sources, detail.shown, SETTINGS)
-    sharper = _add(detail.weights, detail.finer, gathered, rgb, alpha, depth)
+    sharper = _add(detail.weights, detail.finer, detail.confirmed, gathered, rgb, alpha, depth)
     seen = gathered[0].weight > 0
     del gathered  # 70 bytes for each pixel
     filled = _fill(camera, pixels, sharper.rgb, alpha, seen, detail.sources)
@@ -185,6 +187,7 @@ def _smooth(grain: jax.Array, camera: Camera, depth: jax.Array) -> jax.Array:
 def _add(
     weights: DetailWeights,
     finer: jax.Array,
+    confirmed: jax.Array | float,
     gathered: tuple[Gathered, Gathered],
     rgb: jax.Array,
     alpha: jax.Array,
@@ -195,7 +198,7 @@ def _add(
     outputs, errors = predict_by_strips(weights, finer, gathered, instead, alpha, depth)
     mixed, weight = mix(jnp.moveaxis(outputs, 0, -1), residual.mean, instead)
     seen = residual.weight > 0
-    weight = jnp.where(seen, weight, 0)
+    weight = jnp.where(seen, confirmed * weight, 0)
     added = weight[..., None] * mixed
     # Photographs and view may differ in exposure, so detail keeps the mean color of the view.
     shift = safe_divide(jnp.sum(added, axis=(0, 1)), jnp.sum(weight))

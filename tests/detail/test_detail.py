@@ -12,15 +12,10 @@ from tiny_runs import KEPT
 from jaxcloseup.app.methods.method import TargetConfig
 from jaxcloseup.app.run import fine_tuning, gate, kept_detail
 from jaxcloseup.app.run.fine_tuning import fine_tune, tuned_detail
-from jaxcloseup.app.run.kept_detail import (
-    detail_getter,
-    detail_path,
-    detailed,
-    find_detail,
-    measure_error_scale,
-)
+from jaxcloseup.app.run.kept_detail import detail_getter, detail_path, detailed, find_detail
 from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.labels import label_closeups, label_target_views, start_labels
+from jaxcloseup.app.run.left_out import check_left_out
 from jaxcloseup.app.store.stored_run import load_run_scene, read_run, restore
 from jaxcloseup.detail.holes import find_empty
 from jaxcloseup.detail.weights import with_larger_errors
@@ -56,7 +51,8 @@ def test_renders_with_detail_come_nearer_to_the_truth(rendered, found):
     programs, state, _ = rendered
     detail, about = found
     sizes = list(map(list, detail.shown.sizes))
-    assert about == {"divisor": 1, "sizes": sizes, "error_scale": about["error_scale"]}
+    checked = {name: about[name] for name in ("error_scale", "confirmed")}
+    assert about == {"divisor": 1, "sizes": sizes, **checked}
     for views in (programs.scene.test, programs.scene.test_far):
         camera, truth = camera_at(views.cameras, 0), to_float(views.rgb[0])
         seen = programs.render(state, camera)
@@ -183,15 +179,10 @@ def test_errors_are_expected_as_large_as_at_photographs_left_out(rendered, found
     programs, state, _ = rendered
     detail, about = found
     pyramid, _ = programs.pyramid()
-    scales = [
-        measure_error_scale(
-            programs,
-            state,
-            detail.replace(weights=with_larger_errors(detail.weights, factor)),
-            pyramid,
-        )
-        for factor in (0.1 / about["error_scale"], 0.05 / about["error_scale"], 100)
-    ]
+    scales = []
+    for factor in (0.1 / about["error_scale"], 0.05 / about["error_scale"], 100):
+        other = detail.replace(weights=with_larger_errors(detail.weights, factor), confirmed=1.0)
+        scales.append(check_left_out(programs, state, other, pyramid).error_scale)
     assert about["error_scale"] >= 1 and scales[2] == 1
     assert scales[1] == pytest.approx(2 * scales[0], rel=0.02) and scales[0] > 2
     camera = camera_at(programs.scene.test.cameras, 0)
@@ -199,6 +190,30 @@ def test_errors_are_expected_as_large_as_at_photographs_left_out(rendered, found
     larger = detail.replace(weights=with_larger_errors(detail.weights, 3))
     errors = [np.asarray(detailed(programs, one, camera, seen).error) for one in (detail, larger)]
     np.testing.assert_allclose(errors[1], 3 * errors[0], rtol=1e-4)
+
+
+def test_detail_that_photographs_do_not_confirm_is_halved(rendered, found):
+    """The others' residuals of a photograph are what it lacks, its opposite, or noise."""
+    programs, state, _ = rendered
+    detail, _ = found
+    detail = detail.replace(confirmed=1.0)
+    pyramid, _ = programs.pyramid()
+    values = np.asarray(detail.shown.values)
+    opposite = -np.maximum(values, -127)
+    noise = np.random.default_rng(0).permutation(values)
+    confirmed = [
+        check_left_out(
+            programs, state, detail.replace(shown=detail.shown.replace(values=shown)), pyramid
+        ).confirmed
+        for shown in (values, noise, opposite)
+    ]
+    assert 1 >= confirmed[0] > 0.8 and 0.5 <= confirmed[1] < confirmed[0] and confirmed[2] == 0.5
+    camera = camera_at(programs.scene.test.cameras, 0)
+    seen = programs.render(state, camera)
+    half, whole = (
+        detailed(programs, detail.replace(confirmed=part), camera, seen) for part in (0.5, 1.0)
+    )
+    np.testing.assert_allclose(half.weight, 0.5 * whole.weight, rtol=1e-6)
 
 
 def test_detail_is_kept_with_its_state_and_made_again_for_another(rendered, found, monkeypatch):

@@ -17,12 +17,12 @@ import numpy as np
 
 import jaxcloseup
 from jaxcloseup.app import progress
+from jaxcloseup.app.run.left_out import LeftOut, check_left_out
 from jaxcloseup.app.run.manifest import hash_data
 from jaxcloseup.app.run.photograph_sizes import describe_photographs, finest_read
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.residuals import render_residuals, reproduced
-from jaxcloseup.app.score.expected_errors import PixelErrors, error_tenths, pixel_errors
-from jaxcloseup.detail.add import Detail, Detailed, add_to_rendering, label_with_detail, leave_out
+from jaxcloseup.detail.add import Detail, Detailed, add_to_rendering, label_with_detail
 from jaxcloseup.detail.residuals import Residuals, trusted_depths
 from jaxcloseup.detail.weights import DetailWeights, known_weights, with_larger_errors
 from jaxcloseup.fields.contract import Rendering
@@ -31,12 +31,11 @@ from jaxcloseup.io.cache import Stored, cached
 from jaxcloseup.photos.depth_maps import GatherSources, join_maps
 from jaxcloseup.photos.pyramids import Pyramid
 from jaxcloseup.photos.scene import Scene
-from jaxcloseup.photos.views import Views, camera_at
+from jaxcloseup.photos.views import Views
 from jaxcloseup.training.state import TrainState
 
 
-_LEFT_OUT = 8  # photographs that tell how large errors are
-_RECIPE = 14  # a change of how detail is made raises it, so that kept detail is made again
+_RECIPE = 15  # a change of how detail is made raises it, so that kept detail is made again
 
 
 def detailed(programs: Programs, detail: Detail, camera: Camera, rendering: Rendering) -> Detailed:
@@ -74,7 +73,7 @@ def find_detail(
 
     Returns:
       The detail, and a record for JSON: `divisor` of the photographs' size that the finest level
-      has, `sizes` of the levels, and `error_scale`, see `measure_error_scale`.
+      has, `sizes` of the levels, and what `check_left_out` found.
     """
     if path is None:
         return make_detail(programs, state)
@@ -103,34 +102,15 @@ def make_detail(programs: Programs, state: TrainState) -> tuple[Detail, dict[str
     finer = jnp.float32(np.log2(pyramid.sizes[0][1] / scene.train.cameras.width))
     sources, weights = _sources(scene.train, found), _weights(scene)
     detail = Detail(found.shown, sources, weights, finer, _grain(programs, state))
-    scale = measure_error_scale(programs, state, detail, pyramid)
-    detail = detail.replace(weights=with_larger_errors(weights, scale))
+    checked = check_left_out(programs, state, detail, pyramid)
     sizes = list(map(list, pyramid.sizes))
-    return detail, {"divisor": divisor, "sizes": sizes, "error_scale": scale}
+    about = {"divisor": divisor, "sizes": sizes, **checked._asdict()}
+    return _as_checked(detail, checked), about
 
 
-def measure_error_scale(
-    programs: Programs, state: TrainState, detail: Detail, pyramid: Pyramid
-) -> float:
-    """Return how many times as large as expected errors are at photographs left out, 1 or more.
-
-    The networks learned from drawn scenes, whose poses and colors are exact. Photographs of a real
-    scene differ by more than its detail, and each tells so when the others show it. That is still
-    too hopeful, since the field has learned from it, too; so errors are never expected smaller.
-    """
-    level = pyramid.sizes.index(detail.sources.trust.shape[1:])
-    count = len(pyramid)
-
-    def compare(view: int) -> PixelErrors:
-        camera = pyramid.camera(camera_at(programs.scene.train.cameras, view), view, level)
-        rendering, photograph = programs.render(state, camera), pyramid.image(view, level)
-        seen = detailed(programs, leave_out(detail, view), camera, rendering)
-        return pixel_errors(seen, photograph[..., :3], photograph[..., 3])
-
-    views = sorted({round(view) for view in np.linspace(0, count - 1, _LEFT_OUT)})
-    found = map(np.concatenate, zip(*map(compare, views), strict=True))
-    ratios = [row["actual"] / row["expected"] for row in error_tenths(*found)]
-    return max(1.0, float(np.median(ratios))) if ratios else 1.0
+def _as_checked(detail: Detail, checked: LeftOut) -> Detail:
+    weights = with_larger_errors(detail.weights, checked.error_scale)
+    return detail.replace(weights=weights, confirmed=jnp.float32(checked.confirmed))
 
 
 def _weights(scene: Scene) -> DetailWeights:
@@ -198,8 +178,8 @@ def _unpack(scene: Scene, stored: Stored) -> tuple[Detail, dict[str, Any]]:
     shown = Pyramid(arrays["values"], arrays["intrinsics"], arrays["extents"])
     cameras = shown.cameras(cameras, level)
     sources = join_maps(cameras, arrays["inverse_depth"], arrays["trust"])
-    weights = with_larger_errors(_weights(scene), about["error_scale"])
-    return Detail(shown, sources, weights, arrays["finer"], arrays["grain"]), about
+    detail = Detail(shown, sources, _weights(scene), arrays["finer"], arrays["grain"])
+    return _as_checked(detail, LeftOut(**{name: about[name] for name in LeftOut._fields})), about
 
 
 def _check(stored: Stored, sizes: tuple[tuple[int, int], ...], cameras: Camera) -> None:
@@ -221,5 +201,5 @@ def _check(stored: Stored, sizes: tuple[tuple[int, int], ...], cameras: Camera) 
         raise ValueError("images of other sizes")
     if depths[1:] not in sizes:
         raise ValueError("depth maps of another size")
-    if set(stored.record) != {"divisor", "sizes", "error_scale"}:
+    if set(stored.record) != {"divisor", "sizes", *LeftOut._fields}:
         raise ValueError("another record")
