@@ -65,12 +65,7 @@ def read_listing(
     if split in ("given", "listed") and not given:
         given = splits_from_file(folder, content.frames)
     points, rgb = content.points
-
-    def find_masked(frames: Sequence[Frame]) -> tuple[list[Frame], np.ndarray]:
-        assert find_points is not None
-        return find_points(attach_masks(folder, {"all": list(frames)})["all"])
-
-    find = find_masked if find_points else None
+    find = find_points and _with_masks(folder, find_points)
     division = divide(scene, content.frames, given, split, points, zoom, find_points=find)
     if split != "zoom":  # crops share files with training photographs but show finer detail
         warn_duplicates(folder, division.frames)
@@ -101,6 +96,11 @@ def read_listing(
         downscale=downscale,
         placement=placement,
     )
+
+
+def _with_masks(folder: pathlib.Path, find_points: FindPoints) -> FindPoints:
+    """Return a function that finds points where masks show something."""
+    return lambda frames: find_points(attach_masks(folder, {"all": list(frames)})["all"])
 
 
 def _chosen(

@@ -140,7 +140,7 @@ def check_sizes(folder: pathlib.Path, photos: Sequence[Photo]) -> None:
 
 
 def wrong_size(photo: Photo) -> str:
-    """Say how a photograph was cropped, padded or rotated since its camera was solved for."""
+    """Describe how a photograph was cropped, padded or rotated since its camera was solved for."""
     frame = photo.frame
     (width, height), (w, h) = photo.stored_size, frame.size or photo.stored_size
     # Resizing rounds each side to whole pixels, so the aspect ratio agrees to within one pixel.

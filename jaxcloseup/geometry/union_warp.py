@@ -125,7 +125,8 @@ def union_warp(
       A `ForwardWarp` with `[...]` in place of `[H, W]`, without gradient.
     """
     chex.assert_rank([values, sources.depth], [4, 2])
-    return _union_warp(sources, cameras, values, camera, pixels, jnp.asarray(exclude, jnp.int32))
+    arguments = jax.lax.stop_gradient((sources, cameras, values, camera, pixels))
+    return _union_warp(*arguments, jnp.asarray(exclude, jnp.int32))
 
 
 @jax.custom_batching.custom_vmap
@@ -137,9 +138,6 @@ def _union_warp(
     pixels: jax.Array,
     exclude: jax.Array,
 ) -> ForwardWarp:
-    sources, cameras, values, camera, pixels = jax.lax.stop_gradient(
-        (sources, cameras, values, camera, pixels)
-    )
     chosen = jnp.floor(pixels.reshape(-1, 2)).astype(jnp.int32)
     chosen = jnp.clip(chosen, 0, jnp.array([[camera.width - 1, camera.height - 1]]))
     chosen = chosen[:, 1] * camera.width + chosen[:, 0]

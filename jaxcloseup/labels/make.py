@@ -182,12 +182,10 @@ def label_pixels(
     """
     chex.assert_equal_shape_prefix([pixels, depth], depth.ndim)
     # Loops of traced length have no derivative; nothing may try to take one.
-    camera, pixels, depth, sources, settings = jax.lax.stop_gradient(
-        (camera, pixels, depth, sources, settings)
-    )
+    given = camera, pixels, depth, sources, settings
+    camera, pixels, depth, sources, settings = jax.lax.stop_gradient(given)
     views = sources.views
-    # I': lift with D', read the source photographs where the points project. The loop reads one
-    # photograph at a time, because their number is traced.
+    # I': lift with D', read where points project, one photograph at a time: how many is traced.
     points = pixels_to_points(camera, pixels, depth)
     defined = depth > 0
     sample = points.reshape(-1, 3)[:: max(1, depth.size // _RANKING_PIXELS)]
@@ -217,7 +215,7 @@ def label_pixels(
     keep = jnp.where(settings.use_mask > 0, agree, union.hit | ~from_forward)
     rgb = jnp.where(from_forward, forward, backward)
     weight = jnp.where(defined & keep, weight, 0)
-    return jax.lax.stop_gradient(PseudoLabel(rgb, weight, backward, forward))
+    return PseudoLabel(rgb, weight, backward, forward)
 
 
 def _read_source(
