@@ -1,14 +1,12 @@
 """What photographs tell of detail when the others show them."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.score.expected_errors import PixelErrors, error_tenths, pixel_errors
-from jaxcloseup.detail.add import Detail, Detailed, add_to_rendering, leave_out
+from jaxcloseup.detail.add import Detail, add_to_rendering, leave_out
 from jaxcloseup.photos.pyramids import Pyramid
 from jaxcloseup.photos.views import camera_at, to_float
 from jaxcloseup.training.state import TrainState
@@ -21,7 +19,8 @@ class LeftOut(NamedTuple):
     """What photographs tell that are left out.
 
     Attributes:
-      error_scale: how many times as large as the networks expect errors are, 1 or more.
+      error_scale: how many times as large as the networks expect errors are, 1 or more, where all
+        their detail is added.
       confirmed: part of the networks' detail that is added.
     """
 
@@ -48,7 +47,7 @@ def check_left_out(
     )
     best = np.sum(added * missing) / max(np.sum(added**2), 1e-12)
     confirmed = (1 + float(np.clip(best, 0, 1))) / 2
-    found = map(np.concatenate, zip(*(view.errors(confirmed) for view in shown), strict=True))
+    found = map(np.concatenate, zip(*(view.errors for view in shown), strict=True))
     ratios = [row["actual"] / row["expected"] for row in error_tenths(*found)]
     return LeftOut(max(1.0, float(np.median(ratios))) if ratios else 1.0, confirmed)
 
@@ -57,24 +56,14 @@ class _Shown(NamedTuple):
     """A photograph that others show.
 
     Attributes:
-      seen: its render with what they add.
-      rgb: `[H, W, 3]` the render.
-      added: `[H, W, 3]` what they add, with the photograph's weight.
+      added: `[H, W, 3]` what they add to its render, with the photograph's weight.
       missing: `[H, W, 3]` what the render lacks, with the same weight.
-      photograph: `[H, W, 4]` colors and weight.
+      errors: expected and actual errors of the render with all that they add.
     """
 
-    seen: Detailed
-    rgb: jax.Array
     added: np.ndarray
     missing: np.ndarray
-    photograph: Any
-
-    def errors(self, confirmed: float) -> PixelErrors:
-        """Return errors where that part of what is added is added."""
-        colors, weight = self.photograph[..., :3], self.photograph[..., 3]
-        rgb = self.rgb + confirmed * (self.seen.rgb - self.rgb)
-        return pixel_errors(self.seen._replace(rgb=rgb), colors, weight)
+    errors: PixelErrors
 
 
 def _show_left_out(
@@ -84,8 +73,8 @@ def _show_left_out(
     camera = pyramid.camera(camera_at(programs.scene.train.cameras, view), view, level)
     rendering, photograph = programs.render(state, camera), pyramid.image(view, level)
     seen = add_to_rendering(leave_out(detail, view), camera, rendering, far=programs.scene.far)
-    rgb = jnp.clip(rendering.rgb, 0, 1)
-    truth = to_float(np.asarray(photograph))
+    truth, rgb = to_float(np.asarray(photograph)), np.clip(rendering.rgb, 0, 1)
     # Holes that are filled are no detail.
     weight = np.sqrt(np.where(seen.weight > 0, truth[..., 3], 0))[..., None]
-    return _Shown(seen, rgb, weight * (seen.rgb - rgb), weight * (truth[..., :3] - rgb), photograph)
+    added, missing = weight * (seen.rgb - rgb), weight * (truth[..., :3] - rgb)
+    return _Shown(added, missing, pixel_errors(seen, truth[..., :3], truth[..., 3]))
