@@ -67,7 +67,7 @@ def predict_by_strips(
             return jnp.concatenate([mean_planes(networks, features) for networks in both])
 
         found = jax.lax.map(outputs, jnp.arange(chunks))
-        return jnp.moveaxis(found, 0, 1).reshape(4, rows, width)
+        return jnp.moveaxis(found, 0, 1).reshape(4, rows, width).astype(jnp.float32)
 
     def by_strips() -> jax.Array:
         ends = sorted({height * i // _LOOPS for i in range(_LOOPS + 1)})

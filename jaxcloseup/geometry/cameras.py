@@ -165,10 +165,13 @@ def pixels_to_rays(camera: Camera, pixels: jax.Array) -> tuple[jax.Array, jax.Ar
       pixels: `[..., 2]` continuous (x, y).
 
     Returns:
-      `[..., 3]` origins and `[..., 3]` directions. Directions have unit camera-z, not unit length.
+      `[..., 3]` origins and `[..., 3]` directions, of the camera's type. Directions have unit
+      camera-z, not unit length.
     """
     _check_camera(camera)
     chex.assert_axis_dimension(pixels, -1, 2)
+    # With 64 bits, `pixel_grid` has them, and a camera of 32 bits has no more to say.
+    pixels = jnp.asarray(pixels, camera.intrinsics.dtype)
     focal, center = camera.intrinsics[:2], camera.intrinsics[2:]
     xy = (pixels - _match(center, pixels)) / _match(focal, pixels)
     in_camera = jnp.concatenate([xy, jnp.ones_like(xy[..., :1])], axis=-1)

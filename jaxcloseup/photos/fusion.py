@@ -201,4 +201,5 @@ def _add_view(
     if values.shape[-1]:
         read = backward_warp(to_float(values[view]), landed)
         near, shown = near + share, shown + share[:, None] * read
-    return _Sums(sums.distance + weight * distance, sums.weight + weight, near, shown)
+    new = _Sums(sums.distance + weight * distance, sums.weight + weight, near, shown)
+    return jax.tree.map(lambda total, before: total.astype(before.dtype), new, sums)

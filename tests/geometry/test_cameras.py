@@ -7,6 +7,7 @@ import reference
 
 from jaxcloseup.geometry.cameras import (
     Camera,
+    crop_camera,
     pixel_grid,
     pixels_to_points,
     pixels_to_rays,
@@ -155,3 +156,16 @@ def test_a_wrong_shape_is_refused():
         points_to_pixels(camera, jnp.zeros((4, 2)))
     with pytest.raises(AssertionError):
         pixels_to_rays(camera.replace(camtoworld=jnp.eye(4)), jnp.zeros((4, 2)))
+
+
+def test_rays_have_the_type_of_their_camera():
+    """With 64 bits, a pixel grid has them; what follows must not change its type for that."""
+    with jax.enable_x64(True):
+        camera = Camera(
+            jnp.eye(3, 4, dtype=jnp.float32), jnp.array([9, 9, 3, 2], jnp.float32), 4, 6
+        )
+        grid = pixel_grid(4, 6)
+        depth = jnp.ones((4, 6), jnp.float32)
+        assert grid.dtype == jnp.float64
+        assert pixels_to_points(camera, grid, depth).dtype == jnp.float32
+        assert crop_camera(camera, jnp.array([1, 2]), height=2, width=2).intrinsics.dtype == "f4"
