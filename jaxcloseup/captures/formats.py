@@ -11,7 +11,7 @@ from jaxcloseup.captures.choosing import choose_photographs
 from jaxcloseup.captures.contents import placed, read_content
 from jaxcloseup.captures.leftovers import unused_note
 from jaxcloseup.captures.listed_splits import splits_from_file
-from jaxcloseup.captures.photo_files import size_of_image
+from jaxcloseup.captures.photo import whole_size
 from jaxcloseup.captures.photo_masks import attach_masks
 from jaxcloseup.captures.placing import describe_offset
 from jaxcloseup.captures.reduced_photos import attach_reduced, note_stand_ins
@@ -72,8 +72,8 @@ def read_listing(
     train, fewer = _chosen(scene, division.frames["train"], photographs, choose)
     frames = attach_masks(folder, division.frames | {"train": train})
     if downscale is None:
-        sizes = (size_of_image(frame.file) or frame.size for frame in frames["train"])
-        downscale = fitting_divisor(filter(None, sizes), zoom**2 * pixels)
+        sizes = filter(None, map(whole_size, frames["train"]))
+        downscale = fitting_divisor(sizes, zoom**2 * pixels)
     frames, reduced = attach_reduced(scene, frames, downscale)
     keep = np.ones(len(points), bool)
     if fewer or len(frames) > 1:

@@ -1,8 +1,8 @@
 """Read photographs small and fast, for what needs no more than features."""
 
 from jaxcloseup.captures.distortion import undistort, undistortion_map
-from jaxcloseup.captures.photo import Photo, Reading
-from jaxcloseup.captures.photo_files import read_file, size_of_image
+from jaxcloseup.captures.photo import Photo, Reading, whole_size
+from jaxcloseup.captures.photo_files import read_file
 from jaxcloseup.captures.photo_reading import make_photo
 from jaxcloseup.captures.world_frames import Frame
 
@@ -15,7 +15,7 @@ def read_small(frame: Frame, reading: Reading, side: int) -> Photo:
     Raises:
       SceneError: the photograph or its mask cannot be read, or their sizes differ.
     """
-    largest = max(size_of_image(frame.file) or frame.size or (side,))
+    largest = max(whole_size(frame) or (side,))
     reading = reading._replace(downscale=max(1, round(largest / side)), zoom=1)
     picture, mask = read_file(frame.file), read_file(frame.mask) if frame.mask else None
     plain = frame._replace(distortion=None, reduced=None)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from jaxcloseup.captures.names import file_names
-from jaxcloseup.captures.photo import Photo, Reading, resized_intrinsics
+from jaxcloseup.captures.photo import Photo, Reading
 from jaxcloseup.captures.photo_checks import is_rotated, wrong_size
 from jaxcloseup.captures.sift import Features, find_features
 from jaxcloseup.captures.small_photos import read_small
@@ -26,7 +26,6 @@ _FEATURES = 1500  # of a photograph
 class Evidence(NamedTuple):
     """What photographs show, and the cameras that are claimed for them."""
 
-    frames: Sequence[Frame]
     names: Sequence[str]  # of photographs
     cameras: Cameras  # in pixels of the reduced photographs
     gray: Sequence[np.ndarray]  # `[H, W]` uint8 reduced photographs
@@ -67,24 +66,19 @@ def gather(
             done.append(found)
             report(len(done))
     photos, gray, features, looks = zip(*done, strict=True)
-    wrong = [said for photo in photos if (said := wrong_size(photo))]
+    wrong = next(filter(None, map(wrong_size, photos)), "")
     turned = all(map(is_rotated, photos))
     if wrong and not turned:
-        raise SceneError(wrong[0])
+        raise SceneError(wrong)
+    if turned:  # intrinsics stay those given, of photographs that are not
+        photos = [photo._replace(scaled=photo.scaled[::-1]) for photo in photos]
     cameras = Cameras(
         np.stack([frame.camtoworld for frame in frames]),
-        np.stack([_intrinsics(photo, turned, reading.half_pixel) for photo in photos]),
+        np.stack([photo.intrinsics(reading.half_pixel) for photo in photos]),
         np.array([image.shape[::-1] for image in gray]),
     )
-    said = wrong[0] if turned else ""
     names = names or file_names([frame.file for frame in frames])
-    return Evidence(frames, names, cameras, gray, find_matches(features), np.stack(looks), said)
-
-
-def _intrinsics(photo: Photo, turned: bool, half_pixel: bool) -> np.ndarray:
-    """Return fx, fy, cx, cy `[4]` as given, in pixels of the reduced photograph."""
-    size = photo.scaled[::-1] if turned else photo.scaled  # that of which they were given
-    return resized_intrinsics(photo.frame, photo.stored_size, size, half_pixel)
+    return Evidence(names, cameras, gray, find_matches(features), np.stack(looks), wrong)
 
 
 def look(rgb: np.ndarray, mask: np.ndarray) -> np.ndarray:

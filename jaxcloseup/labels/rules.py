@@ -89,14 +89,13 @@ def _pool(batch: Batch, labeled: Batch) -> Batch:
     """
     count = labeled.weight.size
     size = {"height": batch.cameras.height, "width": batch.cameras.width}
-    cameras, measured = jax.tree.map(
-        lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)),
-        (
-            labeled.cameras.replace(**size),
-            jax.tree.map(lambda leaf: jnp.zeros_like(leaf[0]), batch.measured),
-        ),
+    cameras = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), labeled.cameras.replace(**size)
     )
-    labeled = labeled._replace(cameras=cameras, measured=measured)
+    unknown = jax.tree.map(
+        lambda leaf: jnp.zeros((count, *leaf.shape[1:]), leaf.dtype), batch.measured
+    )
+    labeled = labeled._replace(cameras=cameras, measured=unknown)
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), batch, labeled)
 
 

@@ -51,14 +51,18 @@ def missing() -> str | None:
     return None
 
 
-def require() -> None:
+def require(wanted: str, instead: str) -> None:
     """Load the library.
+
+    Args:
+      wanted: what needs it.
+      instead: what to do where it is not there.
 
     Raises:
       LibraryError: it is not there, or cannot be loaded.
     """
     if why := missing():
-        raise LibraryError(why)
+        raise LibraryError(f"{wanted} cannot run: {why}; {INSTALL}, or {instead}")
 
 
 def available() -> bool:

@@ -83,7 +83,7 @@ def match_planes(
     if native is None and single and library.available():
         return jax.lax.platform_dependent(arrays, cpu=natively, default=in_jax)
     if native:
-        library.require()
+        library.require("native=True", "leave it out")
     return natively(arrays) if native else in_jax(arrays)
 
 

@@ -139,7 +139,7 @@ def test_a_photograph_is_judged_by_three_pairs(pairs, judged):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_any_order_of_poses_is_found(evidence, seed):
-    order = np.random.default_rng(seed).permutation(len(evidence.frames))
+    order = np.random.default_rng(seed).permutation(len(evidence.names))
     mixed = evidence.cameras._replace(camtoworld=evidence.cameras.camtoworld[order])
     found = find_order(evidence.matches, mixed)
     np.testing.assert_array_equal(order[found], np.arange(len(order)))
@@ -235,7 +235,7 @@ def test_noise_is_no_known_mistake(evidence, corner):
 
 
 def test_exchanged_photographs_are_named(evidence):
-    order = np.arange(len(evidence.frames))
+    order = np.arange(len(evidence.names))
     order[[2, 8]] = 8, 2
     cameras = evidence.cameras._replace(camtoworld=evidence.cameras.camtoworld[order])
     found = judge(evidence._replace(cameras=cameras), np.zeros((0, 3)), opengl=True)

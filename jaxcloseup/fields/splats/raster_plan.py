@@ -56,10 +56,8 @@ def _compositor(name: str, platform: str, tile: int) -> str:
     """
     if name == "native" and platform != "cpu":
         raise library.LibraryError('compositor "native" runs on CPUs alone: use "auto"')
-    if name == "native" and not library.available():
-        raise library.LibraryError(
-            f'compositor "native" cannot run: {library.missing()}; {library.INSTALL}, or use "auto"'
-        )
+    if name == "native":
+        library.require('compositor "native"', 'use "auto"')
     if name != "auto":
         return name
     if platform == "cpu" and library.available():

@@ -60,7 +60,7 @@ def hash_features(
             default=functools.partial(_in_jax, config),
         )
     if native:
-        library.require()
+        library.require("native=True", "leave it out")
     return (_in_library if native else _in_jax)(config, table, positions)
 
 
