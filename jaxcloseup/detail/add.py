@@ -35,8 +35,8 @@ from jaxcloseup.photos.views import Views, camera_at
 # closely.
 SETTINGS = GatherSettings(), GatherSettings(tolerance=0.02)
 # Share of a hole that is filled. What no photograph shows may be unlike its surroundings, and where
-# it is alike, the rest leaves a sixth of the squared error.
-_FILLED = 0.6
+# it is alike, half leaves a quarter of the squared error.
+_FILLED = 0.5
 
 
 class Detail(struct.PyTreeNode):
@@ -65,8 +65,8 @@ class Detailed(NamedTuple):
     """An image with detail.
 
     Attributes:
-      rgb: `[H, W, 3]` in [0, 1]; where no photograph saw a surface, a part of what a render lacks
-        in opacity has the colors around it.
+      rgb: `[H, W, 3]` in [0, 1]; where no photograph saw a surface, half of what a render lacks in
+        opacity has the colors around it.
       weight: `[H, W]` in [0, 1], how far the photographs' detail is trusted.
       footprint: `[H, W]` side of the finest pixel that saw the surface, in pixels of the view;
         infinity where no photograph saw it.
