@@ -62,7 +62,7 @@ class Checkpoints:
             raise CheckpointError(
                 f"{path} cannot be read ({why}): start a new run in another output folder."
             ) from error
-        for name in sorted(kept.keys() | identity.keys()):
+        for name in sorted(kept.keys() | identity.keys(), key=lambda name: (name != "scene", name)):
             if kept.get(name) != identity.get(name):
                 raise CheckpointError(
                     f"{self.folder} belongs to another run, {_difference(name, kept, identity)}: "

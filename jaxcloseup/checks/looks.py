@@ -23,7 +23,7 @@ def describe_looks(looks: np.ndarray, names: Sequence[str]) -> list[str]:
     """
     contrast, sharpness, black, white = looks.T
     kinds = {
-        "constant": contrast < _CONSTANT,
+        "constant, or masked whole": contrast < _CONSTANT,
         "blurred beside the others": sharpness < _BLURRED * np.median(sharpness),
         "underexposed": black > np.median(black) + _CLIPPED,
         "overexposed": white > np.median(white) + _CLIPPED,

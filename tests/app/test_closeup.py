@@ -148,8 +148,10 @@ def test_a_field_without_splats_is_one_sentence(closeup, kept, monkeypatch):
 
 
 def test_an_empty_pixel_is_one_sentence(closeup, kept):
-    with pytest.raises(SystemExit, match=r"--pixel=500,1 is outside the view"):
+    with pytest.raises(SystemExit, match=r"--at=2:500,1 is outside the view"):
         closeup(kept, at=["2:500,1"])
+    with pytest.raises(SystemExit, match=r"--at=none is no training view"):
+        closeup(kept, at=["none:5,1"])
 
 
 def test_a_page_of_one_file_needs_no_other(closeup, presented):

@@ -19,7 +19,14 @@ from jaxcloseup.app.cli import doctor, sweep, topics
 from jaxcloseup.app.cli import flags as shared
 from jaxcloseup.app.cli import main as command
 from jaxcloseup.app.cli import run as program
-from jaxcloseup.app.cli.output_folder import LOCK, check_unused, choose_output_dir, lock_output_dir
+from jaxcloseup.app.cli.output_folder import (
+    LOCK,
+    check_unused,
+    check_writable,
+    choose_output_dir,
+    lock_output_dir,
+)
+from jaxcloseup.app.cli.start import in_one_sentence
 from jaxcloseup.app.run.scene_input import load
 from jaxcloseup.photos.scene import SceneError
 
@@ -125,7 +132,10 @@ def test_help_shows_each_shared_flag_under_one_topic():
         ),
         ("run --stages=polish", "--stages takes names of baseline, control, closeup, "),
         ("run --method=magic", "--method=magic must be one of surfels, "),
+        ("run --minutes=inf", "--minutes=inf must be a number of at least 0.1"),
+        ("closeup x --near=nan", "--near=nan must be a number between 1 and 1000"),
         ("run table", "table is not a flag: flags begin with --"),
+        ("check x --fix", "--fix is for training: give it to "),
         ("run --scene", "--scene needs a value"),
         ("render --fps=fast", "--fps=fast must be a number"),
         ("render --pixels=1,2", "--pixels is not a flag: perhaps --pixel is meant; --help lists"),
@@ -137,6 +147,21 @@ def test_wrong_words_are_one_sentence(words, message):
     done = call("-m", "jaxcloseup", name, *rest)
     assert done.returncode == 1 and done.stdout == "" and done.stderr.count("\n") == 1
     assert done.stderr.startswith(f"jaxcloseup {name}: {message}")
+
+
+def test_what_the_system_refuses_is_one_sentence(tmp_path):
+    said = r"/none cannot be read or written \(No such file or directory\): name another place"
+    with pytest.raises(SystemExit, match=said), in_one_sentence("run", OSError):
+        (tmp_path / "none").read_bytes()
+
+
+def test_a_place_that_is_read_only_is_refused_at_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda path, mode: path != tmp_path)
+    for make in (check_unused, check_writable):
+        with pytest.raises(PermissionError, match=f"--output_dir={tmp_path}/a/b cannot be written"):
+            make(tmp_path / "a" / "b")
+    (tmp_path / "a").mkdir()
+    assert check_unused(tmp_path / "a" / "b") == tmp_path / "a" / "b"
 
 
 def test_sentences_repeat_how_the_program_was_started(tmp_path):

@@ -22,6 +22,7 @@ from jaxcloseup.app import methods
 from jaxcloseup.app.cli import render, run, sweep
 from jaxcloseup.app.methods import registry
 from jaxcloseup.app.methods.registry import METHODS
+from jaxcloseup.app.methods.settings import with_settings
 from jaxcloseup.app.methods.shared import splat_training
 from jaxcloseup.app.methods.shared.splat_training import extent, make_field
 from jaxcloseup.app.run.keys import run_keys
@@ -192,6 +193,11 @@ def test_the_shapes_of_a_state_are_those_of_the_state(scene):
     programs = Programs(TINY_SURFELS, dataclasses.replace(scene, points=points, rgb=points))
     shapes, state = state_shapes(programs), initial_state(programs, run_keys(0))
     chex.assert_trees_all_equal_shapes_and_dtypes(shapes, state)
+
+
+def test_a_coarse_model_has_room_for_no_more_than_the_fine_one(scene):
+    small = with_settings(METHODS["surfels"].presets["quick"], ["capacity=5000"])
+    assert Programs(small, scene).coarse.preset.field.capacity == 5000
 
 
 @pytest.fixture

@@ -174,6 +174,7 @@ def test_a_video_that_is_none_or_shows_no_motion_is_one_sentence(tmp_path):
             run_process(video=str(path), output_dir=str(tmp_path / "out"))  # the same again
         assert "\n" not in error.value.code
         assert not (tmp_path / "out" / "images").exists()
+        assert (tmp_path / "out").exists() == (path.name != "video.mp4")
 
 
 def test_pycolmap_is_not_installed(tmp_path, monkeypatch):

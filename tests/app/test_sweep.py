@@ -177,9 +177,13 @@ def test_a_sweep_cut_off_and_resumed_ends_the_same(capture_folder, tmp_path, mon
         ({"set": ["capacity=0"]}, "--set=capacity=0: capacity must be between 1 and 100000000"),
         ({"arms": ["label=warp+depth_error=0+expected_depth=1"]}, "do not go together"),
         ({"scenes": ["nowhere"]}, "nowhere"),
+        ({"scenes": ["plane0"], "arms": ["oracle"]}, "plane0 can have none of them, for the true"),
     ],
 )
-def test_flags_that_make_no_sense_are_one_sentence(parsed_flags, tmp_path, changes, message):
+def test_flags_that_make_no_sense_are_one_sentence(
+    parsed_flags, capture_folder, tmp_path, monkeypatch, changes, message
+):
+    monkeypatch.chdir(capture_folder.parent)
     out = str(tmp_path / "out")
     with flagsaver.flagsaver(output_dir=out, **changes), pytest.raises(SystemExit, match=message):
         sweep.main(["sweep"])

@@ -27,6 +27,11 @@ share(CAPTURE, OUTPUT)
 
 def main(arguments: list[str]) -> None:
     """Check the capture that the command line names; exit with 1 if it does not fit."""
+    name = program_name("check")
+    if len(arguments) != 2:
+        sys.exit(f"{name}: name one folder, as in {name} capture")
+    if FLAGS.fix:
+        sys.exit(f"{name}: --fix is for training: give it to {program_name('run')}")
     with loading():
         from jaxcloseup.app import progress
         from jaxcloseup.app.report.check_page import write_check
@@ -35,10 +40,8 @@ def main(arguments: list[str]) -> None:
         from jaxcloseup.checks.judge import MISFIT
         from jaxcloseup.photos.scene import SceneError
     set_up()
-    if len(arguments) != 2:
-        sys.exit(f"{program_name('check')}: name one folder, as in {program_name('check')} capture")
     path = pathlib.Path(arguments[1])
-    options = {name: FLAGS[name].value for name in CAPTURE}
+    options = {flag: FLAGS[flag].value for flag in CAPTURE}
     with in_one_sentence("check", SceneError, OSError):
         folder = check_unused(
             FLAGS.output_dir or dated(pathlib.Path("outputs", path.resolve().name, "check"))

@@ -11,6 +11,7 @@ import pathlib
 from absl import flags
 
 from jaxcloseup.app.cli.flags import COMPUTERS
+from jaxcloseup.app.cli.output_folder import check_writable
 from jaxcloseup.app.cli.start import in_one_sentence, loading, set_up
 from jaxcloseup.app.cli.topics import share
 
@@ -42,6 +43,7 @@ def main(_: list[str]) -> None:
     with in_one_sentence("evaluate", SceneError, OSError, ValueError):
         if output.exists():
             raise ValueError(f"--output={output} already exists: name a new file, or remove it")
+        check_writable(output, "output")
         perceptual = find_perceptual(FLAGS.lpips_weights)
         with progress.showing():
             results = evaluate_folders(FLAGS.renders, FLAGS.truth, FLAGS.masks, perceptual)

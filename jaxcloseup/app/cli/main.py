@@ -40,7 +40,7 @@ def main() -> None:
         print(describe())
         return
     if name not in PROGRAMS:
-        sys.exit(f"jaxcloseup: {name} is not a program: choose {', '.join(PROGRAMS)}")
+        sys.exit(f"jaxcloseup: {name} is not a program: choose {', '.join(_listed())}")
     end_at_ctrl_c(program_name(name))
     from jaxcloseup.app.cli.start import start
 
@@ -49,11 +49,14 @@ def main() -> None:
     start(program)
 
 
+def _listed() -> dict[str, str]:
+    return PROGRAMS | {"doctor": "print versions, devices, the native library and the extras"}
+
+
 def _print_usage() -> None:
     width = max(map(len, PROGRAMS))
     usage = "usage: jaxcloseup PROGRAM [--flag=value ...]; `jaxcloseup PROGRAM --help` has flags\n"
-    listed = PROGRAMS | {"doctor": "print versions, devices, the native library and the extras"}
-    programs = [f"  {program:{width}}  {what}" for program, what in listed.items()]
+    programs = [f"  {program:{width}}  {what}" for program, what in _listed().items()]
     try:
         print("\n".join([usage, *programs]), flush=True)
     except BrokenPipeError:  # `--help | head`: Python would write the rest when it ends

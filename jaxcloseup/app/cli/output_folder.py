@@ -35,6 +35,7 @@ def check_unused(folder: str | pathlib.Path) -> pathlib.Path:
 
     Raises:
       FileExistsError: the folder holds files, or the path is a file.
+      PermissionError: it cannot be made.
     """
     path = pathlib.Path(folder)
     if path.exists() and (not path.is_dir() or any(file.name != LOCK for file in path.iterdir())):
@@ -42,7 +43,24 @@ def check_unused(folder: str | pathlib.Path) -> pathlib.Path:
             f"--output_dir={folder} already exists and is not empty: name a new folder, or remove "
             "it first"
         )
+    check_writable(path)
     return path
+
+
+def check_writable(path: pathlib.Path, flag: str = "output_dir") -> None:
+    """Refuse a file or folder that surely cannot be made, before the work that it is to hold.
+
+    `flag` is the one that names it.
+
+    Raises:
+      PermissionError: one sentence that names the flag.
+    """
+    there = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+    if not os.access(there, os.W_OK | os.X_OK if there.is_dir() else os.W_OK):
+        raise PermissionError(
+            f"--{flag}={path} cannot be written ({there} is read-only): name a place where you may "
+            "write"
+        )
 
 
 def choose_output_dir(

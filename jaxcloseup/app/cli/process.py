@@ -84,8 +84,6 @@ def _check_flags() -> "tuple[Request, pathlib.Path]":
     """Return what the flags ask for and the folder of the capture; nothing is written."""
     from jaxcloseup.app.process.pipeline import Request
     from jaxcloseup.app.process.solver_process import ProcessingError, check_pycolmap
-    from jaxcloseup.app.process.video_frames import LARGEST
-    from jaxcloseup.io.files import check_file
 
     if (FLAGS.images is None) == (FLAGS.video is None):
         raise ProcessingError("give either --images=FOLDER or --video=FILE")
@@ -94,13 +92,6 @@ def _check_flags() -> "tuple[Request, pathlib.Path]":
     if FLAGS.images is not None and FLAGS.count is not None:
         raise ProcessingError("--count is for --video: remove photographs that you do not want")
     images, video = (None if x is None else pathlib.Path(x) for x in (FLAGS.images, FLAGS.video))
-    if video is not None:
-        try:
-            check_file(video, most=LARGEST)
-        except OSError as error:
-            raise ProcessingError(
-                f"--video={video} cannot be read ({error.strerror}): name a video file"
-            ) from error
     check_pycolmap()
     request = Request(images, video, FLAGS.count or COUNT, FLAGS.lens, FLAGS.pairs)
     return request, pathlib.Path(FLAGS.output_dir)

@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+import math
 import os
 import pathlib
 import re
@@ -17,7 +18,7 @@ from jaxcloseup.app.cli.invocation import program_name
 from jaxcloseup.app.cli.topics import describe_flag, flags_by_topic
 from jaxcloseup.io.files import cache_folder
 from jaxcloseup.io.memory import reuse_freed_memory
-from jaxcloseup.io.messages import describe_option
+from jaxcloseup.io.messages import describe_option, printable
 
 
 FLAGS = flags.FLAGS
@@ -38,6 +39,10 @@ def start(program: types.ModuleType) -> None:
         os._exit(0)
     reuse_freed_memory()
     os.environ["XLA_FLAGS"] = " ".join([_COMPILED_FOR_SPEED, os.environ.get("XLA_FLAGS", "")])
+    # For each kept program XLA writes an error where names of instructions differ that are its own.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
+    name = program_name(pathlib.Path(program.__file__ or "").stem)
 
     def parse(words: list[str]) -> list[str]:
         try:
@@ -45,10 +50,13 @@ def start(program: types.ModuleType) -> None:
         except flags.Error as error:
             reason = _explain(error)
         else:
-            if len(rest) <= 1 + getattr(program, "OPERANDS", 0):
+            if len(rest) > 1 + getattr(program, "OPERANDS", 0):
+                reason = f"{rest[-1]} is not a flag: flags begin with --"
+            elif endless := _endless():
+                reason = endless
+            else:
                 return rest
-            reason = f"{rest[-1]} is not a flag: flags begin with --"
-        sys.exit(f"{program_name(pathlib.Path(program.__file__ or '').stem)}: {reason}")
+        sys.exit(f"{name}: {reason}")
 
     app.run(program.main, flags_parser=parse)
 
@@ -72,7 +80,27 @@ def in_one_sentence(program: str, *errors: type[Exception]) -> Iterator[None]:
     try:
         yield
     except errors as error:
-        sys.exit(f"{program_name(program)}: {error}")
+        sys.exit(f"{program_name(program)}: {_sentence(error)}")
+
+
+def _sentence(error: Exception) -> str:
+    """Return what an error says; of one that the system raised, with what to do."""
+    if isinstance(error, OSError) and error.strerror and error.filename:
+        file = printable(os.fsdecode(error.filename))
+        return (
+            f"{file} cannot be read or written ({error.strerror}): name another place, or change "
+            "its permissions"
+        )
+    return str(error)
+
+
+def _endless() -> str | None:
+    """Return what is wrong with a flag whose number is infinite or none; None without one."""
+    for name in FLAGS:
+        flag = FLAGS[name]
+        if isinstance(flag.value, float) and not math.isfinite(flag.value):
+            return f"--{name}={flag.value} must be {_wanted(flag.parser)}"
+    return None
 
 
 def _explain(error: flags.Error) -> str:

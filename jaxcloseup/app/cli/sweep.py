@@ -113,6 +113,7 @@ def _sweep() -> None:
             load(name, options) for name, (options, _) in zip(FLAGS.scenes, checked, strict=True)
         ]
         _check_scenes(scenes, output_dir)
+        _check_arms(scenes, preset)
         lock = lock_output_dir(output_dir) if first else contextlib.nullcontext()
     if hosts is not None:
         # Hosts that are done wait for the first one, which writes the tables.
@@ -211,6 +212,18 @@ def _check_scenes(captures: "Sequence[Scene]", output_dir: pathlib.Path) -> None
             raise ValueError(
                 f"{_given_scenes()} are not those of {output_dir}, {','.join(before)}: resume it "
                 "as it was begun"
+            )
+
+
+def _check_arms(captures: "Sequence[Scene]", preset: "Preset") -> None:
+    from jaxcloseup.app.sweep.named_arms import make_arm, why_not
+
+    for scene in captures:
+        reasons = [why_not(make_arm(name, preset), scene) for name in FLAGS.arms]
+        if all(reasons):
+            raise ValueError(
+                f"--arms={','.join(FLAGS.arms)}: {scene.name} can have none of them, for "
+                f"{reasons[0]}: name others"
             )
 
 

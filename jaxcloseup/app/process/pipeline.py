@@ -18,7 +18,7 @@ from jaxcloseup.app.process.options import LENSES
 from jaxcloseup.app.process.pairs import choose_pairing, expected_seconds
 from jaxcloseup.app.process.photo_folder import Copied, copy_photographs, list_files
 from jaxcloseup.app.process.solver_process import ProcessingError, run_job
-from jaxcloseup.app.process.video_frames import extract_frames
+from jaxcloseup.app.process.video_frames import extract_frames, open_video
 from jaxcloseup.app.progress import saying
 from jaxcloseup.captures.contents import list_photographs
 from jaxcloseup.io.files import write_file
@@ -53,6 +53,7 @@ class Request:
             )
             held = [[path.as_posix(), size] for path, size in sizes]
         if self.video is not None:
+            open_video(self.video).release()
             held = [[self.video.name, self.video.stat().st_size]]
         return {
             "images": None if self.images is None else str(self.images.resolve()),

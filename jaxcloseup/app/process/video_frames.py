@@ -96,7 +96,7 @@ def _survey(video: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
     before, sharpness, motion = None, [], []
     with progress("looking for sharp frames", "frames") as report:
-        claimed = int(_open(video).get(cv2.CAP_PROP_FRAME_COUNT))
+        claimed = int(open_video(video).get(cv2.CAP_PROP_FRAME_COUNT))
         for _, frame in _frames(video):
             gray = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
             sharpness.append(cv2.Laplacian(_reduced(gray, _SHARP_WIDTH), cv2.CV_32F).var())
@@ -115,7 +115,12 @@ def _survey(video: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
     return np.array(sharpness), np.array(motion)
 
 
-def _open(video: pathlib.Path) -> cv2.VideoCapture:
+def open_video(video: pathlib.Path) -> cv2.VideoCapture:
+    """Open a video.
+
+    Raises:
+      ProcessingError: it cannot be read, or is none.
+    """
     # Without these levels, FFmpeg and OpenCV print errors of their own.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     level = cv2.utils.logging.getLogLevel()
@@ -140,7 +145,7 @@ def _frames(
     video: pathlib.Path, chosen: Sequence[int] | None = None
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Yield indices and frames of a video, uint8 BGR `[H, W, 3]`: the chosen ones, or all."""
-    opened = _open(video)
+    opened = open_video(video)
     try:
         for index in itertools.count():
             if (chosen is not None and index > chosen[-1]) or not opened.grab():

@@ -156,6 +156,8 @@ class Programs:
         """Return the programs that train the preset's coarse model; all seeds share them."""
         assert self.preset.coarse is not None
         field = self.preset.coarse.field
+        # The fine model begins with all that the coarse one has.
+        field = dataclasses.replace(field, capacity=min(field.capacity, self.preset.field.capacity))
         preset = dataclasses.replace(self.preset, field=field, coarse=None, windows=None)
         return Programs(preset, self.scene, read=self.read)
 

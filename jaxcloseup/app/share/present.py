@@ -94,9 +94,9 @@ def present(
 
 
 def _place(scene: Scene, name: str, pixel: tuple[float, float]) -> Place:
-    view = find_view(scene, name)
+    view = find_view(scene, name, flag="at")
     camera = scene.own_camera("train", view)
-    check_pixel(camera, pixel)
+    check_pixel(camera, pixel, given=f"--at={name}:")
     return Place(view, pixel[0] / camera.width, pixel[1] / camera.height)
 
 

@@ -140,8 +140,12 @@ def find_view(scene: Scene, name: str, *, flag: str = "from") -> int:
     raise CameraError(f"--{flag}={name} is no training view of {scene.name}: choose one of {some}")
 
 
-def check_pixel(camera: Camera, pixel: tuple[float, float]) -> tuple[int, int]:
+def check_pixel(
+    camera: Camera, pixel: tuple[float, float], *, given: str = "--pixel="
+) -> tuple[int, int]:
     """Return the row and column of a pixel (x, y) of a camera.
+
+    `given` is how it was given, up to its numbers.
 
     Raises:
       CameraError: the pixel is outside the image.
@@ -149,7 +153,7 @@ def check_pixel(camera: Camera, pixel: tuple[float, float]) -> tuple[int, int]:
     x, y = pixel
     if not (0 <= x < camera.width and 0 <= y < camera.height):
         raise CameraError(
-            f"--pixel={x:g},{y:g} is outside the view: choose a pixel within the "
+            f"{given}{x:g},{y:g} is outside the view: choose a pixel within the "
             f"{camera.width} x {camera.height} pixels of the photograph"
         )
     return int(y), int(x)

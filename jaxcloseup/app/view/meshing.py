@@ -67,11 +67,11 @@ def write_run_mesh(
     region = _seen_region(maps, min_views) if region is None else scene.placement.to_scene(region)
     side = scene.placement.scale * voxel if voxel else np.ptp(region, axis=0).max() / resolution
     mesh = _fuse(maps, surface.make_grid(region, side), scene.placement.scale)
-    write_mesh(output_dir / "mesh.ply", mesh, scene.placement)
     if texture is not None and stage is not None:
         detail, _ = find_detail(programs, state, detail_path(record.folder, stage))
         textured = texture_mesh(mesh, detail, texture)
         write_file(output_dir / "mesh.glb", pack_mesh_glb(textured, placement=scene.placement))
+    write_mesh(output_dir / "mesh.ply", mesh, scene.placement)
     about = {
         "stage": stage,
         **_in_capture(side, region, scene.placement),
