@@ -54,10 +54,8 @@ def judge(evidence: Evidence, points: np.ndarray, *, opengl: bool, ordered: bool
     corrections: tuple[str, ...] = ()
     if found is None:
         verdict = UNKNOWN
-        sentence = (
-            f"{len(names)} photographs, poses are not checked: only {count} features match between "
-            "them"
-        )
+        photographs = f"{len(names)} photograph{'s' * (len(names) != 1)}"
+        sentence = f"{photographs}, poses are not checked: only {count} features match between them"
     else:
         figures |= {"share": found.share, "median": found.median}
         verdict, sentence, corrections = _judge_poses(

@@ -4,6 +4,7 @@ import os
 import pathlib
 import re
 import sys
+import warnings
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ from posing import run_process, write_noise
 from wrong_input import HEIC, put
 
 from jaxcloseup.app.process import solver_process
+from jaxcloseup.app.process.from_above import draw_cameras
 from jaxcloseup.app.process.pairs import (
     choose_pairing,
     expected_seconds,
@@ -209,3 +211,10 @@ def test_a_run_on_photographs_names_the_command(tmp_path):
     (tmp_path / "none").mkdir()
     with pytest.raises(SceneError, match=r"none holds no capture: add transforms_train\.json"):
         load_scene(tmp_path / "none")
+
+
+def test_one_camera_is_shown_from_above():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        shown = draw_cameras(np.eye(3, 4)[None], np.zeros((0, 3)), np.zeros((0, 3)))
+    assert shown.startswith(b"\x89PNG")

@@ -112,8 +112,7 @@ def _sweep() -> None:
         scenes = [
             load(name, options) for name, (options, _) in zip(FLAGS.scenes, checked, strict=True)
         ]
-        _check_scenes(scenes, output_dir)
-        _check_arms(scenes, preset)
+        _check_scenes(scenes, preset, output_dir)
         lock = lock_output_dir(output_dir) if first else contextlib.nullcontext()
     if hosts is not None:
         # Hosts that are done wait for the first one, which writes the tables.
@@ -198,13 +197,15 @@ def _check_flags(preset: "Preset") -> None:
         print("warning: without the arm control there are no gains in the tables")
 
 
-def _check_scenes(captures: "Sequence[Scene]", output_dir: pathlib.Path) -> None:
+def _check_scenes(captures: "Sequence[Scene]", preset: "Preset", output_dir: pathlib.Path) -> None:
     from jaxcloseup.app.run.manifest import NAME as MANIFEST
     from jaxcloseup.app.store.stored_run import read_fields
+    from jaxcloseup.app.sweep.named_arms import check_possible
 
     names = {scene.name for scene in captures}
     if len(names) < len(captures):
         raise ValueError(f"{_given_scenes()} has two of one name: sweep them one at a time")
+    check_possible(FLAGS.arms, preset, captures)
     kept = output_dir / MANIFEST
     if FLAGS.resume and kept.exists():
         before = read_fields(kept, {"scenes": dict})["scenes"]
@@ -212,18 +213,6 @@ def _check_scenes(captures: "Sequence[Scene]", output_dir: pathlib.Path) -> None
             raise ValueError(
                 f"{_given_scenes()} are not those of {output_dir}, {','.join(before)}: resume it "
                 "as it was begun"
-            )
-
-
-def _check_arms(captures: "Sequence[Scene]", preset: "Preset") -> None:
-    from jaxcloseup.app.sweep.named_arms import make_arm, why_not
-
-    for scene in captures:
-        reasons = [why_not(make_arm(name, preset), scene) for name in FLAGS.arms]
-        if all(reasons):
-            raise ValueError(
-                f"--arms={','.join(FLAGS.arms)}: {scene.name} can have none of them, for "
-                f"{reasons[0]}: name others"
             )
 
 

@@ -37,7 +37,7 @@ def draw_cameras(poses: np.ndarray, points: np.ndarray, rgb: np.ndarray) -> byte
     if len(flat):
         near, far = np.percentile(flat, [2, 98], axis=0)
         low, high = np.minimum(low, near), np.maximum(high, far)
-    side = max(high - low)
+    side = float(max(high - low)) or 1.0  # one camera, or all in one place
     figure, axes = plt.subplots(figsize=(8, 8), layout="constrained")
     axes.scatter(flat[:, 0], flat[:, 1], s=3, c=np.clip(rgb, 0, 1), linewidths=0)
     length = side / 25

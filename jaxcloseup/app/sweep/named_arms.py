@@ -1,6 +1,7 @@
 """The arms of a sweep: the rows of the paper's Table 1, ceilings, and any settings of labels."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -125,6 +126,21 @@ def why_not(arm: Arm, scene: Scene) -> str | None:
     if scene.test is None and arm.kind == "test_time":
         return "it has no close-ups to label"
     return None
+
+
+def check_possible(names: Sequence[str], preset: Preset, scenes: Sequence[Scene]) -> None:
+    """Refuse arms of which a scene can have none.
+
+    Raises:
+      ValueError: one sentence that names the flag.
+    """
+    for scene in scenes:
+        reasons = [why_not(make_arm(name, preset), scene) for name in names]
+        if all(reasons):
+            raise ValueError(
+                f"--arms={','.join(names)}: {scene.name} can have none of them, for {reasons[0]}: "
+                "name others"
+            )
 
 
 def describe(arms: list[Arm]) -> dict[str, Any]:
