@@ -112,3 +112,10 @@ def write_points(folder, points):
     header += [*(f"property double {axis}" for axis in "xyz"), "end_header"]
     rows = [" ".join(f"{value:.9g}" for value in point) for point in points]
     (folder / "points3d.ply").write_text("\n".join([*header, *rows, ""]))
+
+
+def project(points, cameras, view):
+    """Return the pixels `[N, 2]` of world points in one of several cameras."""
+    pose, lens = cameras.camtoworld[view], cameras.intrinsics[view]
+    local = (points - pose[:, 3]) @ pose[:, :3]
+    return local[:, :2] / local[:, 2:] * lens[:2] + lens[2:]

@@ -27,7 +27,13 @@ from jaxcloseup.app.methods.shared import splat_training
 from jaxcloseup.app.methods.shared.splat_training import extent, make_field
 from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.run.states import FEWEST_POINTS, initial_points, initial_state, state_shapes
+from jaxcloseup.app.run.states import (
+    FEWEST_POINTS,
+    initial_points,
+    initial_state,
+    say_which_points_fit,
+    state_shapes,
+)
 from jaxcloseup.artifacts.surfel_ply import read_surfels, write_surfels
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.fields.contract import Rendering
@@ -195,9 +201,15 @@ def test_the_shapes_of_a_state_are_those_of_the_state(scene):
     chex.assert_trees_all_equal_shapes_and_dtypes(shapes, state)
 
 
-def test_a_coarse_model_has_room_for_no_more_than_the_fine_one(scene):
-    small = with_settings(METHODS["surfels"].presets["quick"], ["capacity=5000"])
-    assert Programs(small, scene).coarse.preset.field.capacity == 5000
+def test_a_coarse_model_has_room_for_no_more_than_the_fine_one(scene, capsys):
+    scene = dataclasses.replace(scene, points=np.zeros((12_000, 3)), rgb=np.zeros((12_000, 3)))
+    quick = METHODS["surfels"].presets["quick"]
+    for given, room, name in ([], 10_000, "coarse.capacity"), (["capacity=5000"], 5000, "capacity"):
+        programs = Programs(with_settings(quick, given), scene)
+        assert programs.coarse.preset.field.capacity == room
+        say_which_points_fit(programs)
+        said = f"training begins with {room} of 12000 points: --set {name}=N makes room for more"
+        assert said in capsys.readouterr().out
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from textured_corner import HEIGHT, LENS, WIDTH, draw, poses, write_corner, write_points
+from textured_corner import HEIGHT, LENS, WIDTH, draw, poses, project, write_corner, write_points
 
 from jaxcloseup.captures.contents import list_photographs
 from jaxcloseup.captures.corrections import correct_frames
@@ -15,10 +15,9 @@ from jaxcloseup.captures.load import load_scene
 from jaxcloseup.captures.photo import Reading
 from jaxcloseup.captures.world_frames import frame_intrinsics
 from jaxcloseup.checks.check import check_capture
-from jaxcloseup.checks.epipolar import Cameras, epipolar_errors, fit
+from jaxcloseup.checks.epipolar import Cameras
 from jaxcloseup.checks.evidence import gather
 from jaxcloseup.checks.judge import judge
-from jaxcloseup.checks.matches import Matches
 from jaxcloseup.checks.order import find_order
 from jaxcloseup.photos.scene import SceneError
 
@@ -75,66 +74,6 @@ def each_matrix(function):
             frame["transform_matrix"] = function(np.array(frame["transform_matrix"])).tolist()
 
     return edit
-
-
-def seen_together(count=60):
-    """World points and cameras, with matches that are exact."""
-    rng = np.random.default_rng(1)
-    cameras = Cameras(poses(4), np.tile(LENS, (4, 1)), np.tile([WIDTH, HEIGHT], (4, 1)))
-    points = rng.uniform(0, 1.5, (count, 3))
-    views, pixels = [], []
-    for i in range(4):
-        for j in range(i):
-            views.append(np.tile([i, j], (count, 1)))
-            pixels.append(np.stack([project(points, cameras, view) for view in (i, j)], 1))
-    views, pixels = np.concatenate(views), np.concatenate(pixels)
-    return Matches(views, pixels, np.zeros((len(views), 2, 3), np.uint8)), cameras
-
-
-def project(points, cameras, view):
-    pose, lens = cameras.camtoworld[view], cameras.intrinsics[view]
-    local = (points - pose[:, 3]) @ pose[:, :3]
-    return local[:, :2] / local[:, 2:] * lens[:2] + lens[2:]
-
-
-def test_epipolar_errors_are_distances_from_what_any_depth_shows():
-    """The witness projects all depths of one camera's ray into the other, and conversely."""
-    matches, cameras = seen_together()
-    assert epipolar_errors(matches, cameras).max() < 1e-6
-    rng = np.random.default_rng(2)
-    moved = matches._replace(pixels=matches.pixels + rng.normal(scale=4, size=matches.pixels.shape))
-    found = epipolar_errors(moved, cameras)
-    depths = np.geomspace(0.05, 1e4, 40_000)
-    for row in range(0, len(found), 37):
-        errors = []
-        for a, b in ((0, 1), (1, 0)):
-            pose, lens = (x[moved.views[row, a]] for x in (cameras.camtoworld, cameras.intrinsics))
-            local = np.append((moved.pixels[row, a] - lens[2:]) / lens[:2], 1)
-            along = pose[:, 3] + depths[:, None] * (pose[:, :3] @ local)
-            inside = project(along, cameras, moved.views[row, b])
-            errors.append(np.linalg.norm(inside - moved.pixels[row, b], axis=1).min())
-        # Angles times pixels at the radius: exact on the axis, within the lens's cosine elsewhere.
-        assert found[row] == pytest.approx(np.mean(errors), rel=0.3, abs=0.05)
-
-
-def test_points_behind_a_camera_do_not_fit():
-    """A camera that looks away sees nothing, though epipolar lines are the same."""
-    matches, cameras = seen_together()
-    behind = cameras._replace(camtoworld=cameras.camtoworld * np.array([-1, 1, -1, 1]))
-    assert fit(matches, behind).share < 0.05
-
-
-@pytest.mark.parametrize(("pairs", "judged"), [(3, True), (2, False)])
-def test_a_photograph_is_judged_by_three_pairs(pairs, judged):
-    """Two pairs may both be of a pattern that repeats, and lie anywhere."""
-    matches, cameras = seen_together()
-    last = (matches.views == 3).any(1)
-    pixels = np.where(last[:, None, None], matches.pixels[:, ::-1], matches.pixels)
-    kept = ~last | (matches.views[:, 1] < pairs)
-    found = fit(matches._replace(pixels=pixels).take(kept), cameras)
-    np.testing.assert_array_equal(np.isfinite(found.by_best), [True, True, judged, judged])
-    assert found.by_best[0] == 1 and not found.precise[3]
-    assert not judged or found.by_best[3] < 0.3
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -41,7 +41,6 @@ def start(program: types.ModuleType) -> None:
     os.environ["XLA_FLAGS"] = " ".join([_COMPILED_FOR_SPEED, os.environ.get("XLA_FLAGS", "")])
     # For each kept program XLA writes an error where names of instructions differ that are its own.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-
     name = program_name(pathlib.Path(program.__file__ or "").stem)
 
     def parse(words: list[str]) -> list[str]:

@@ -165,10 +165,9 @@ def initial_points(key: jax.Array, scene: Scene, count: int = 5000) -> tuple[Any
 def say_which_points_fit(programs: Programs) -> None:
     """Print how many of the initial points a field begins with, if not with all."""
     preset, count = programs.preset, len(programs.scene.points)
-    coarse = preset.coarse
-    field, name = (
-        (preset.field, "capacity") if coarse is None else (coarse.field, "coarse.capacity")
-    )
-    most = programs.method.max_points(field)
+    first = preset.field if preset.coarse is None else programs.coarse.preset.field
+    most = programs.method.max_points(first)
     if most is not None and count > most:
+        alike = most == programs.method.max_points(preset.field)
+        name = "capacity" if alike else "coarse.capacity"
         print(f"training begins with {most} of {count} points: --set {name}=N makes room for more")
