@@ -4,7 +4,7 @@ The residual of a photograph is the photograph minus the model's render of its v
 another view, it adds what the model did not learn, unless photographs disagree or depth is wrong:
 then it is noise. Networks that were trained on true close-ups of other scenes predict how much of
 it is there, and how far colors are off in the end (`detail.weights`). Pixels that no photograph
-shows are filled (`detail.holes`).
+shows are half filled (`detail.holes`).
 """
 
 import dataclasses
