@@ -87,11 +87,11 @@ def corner_views(count=5):
     return Views(cameras, rgb, jnp.ones(rgb.shape[:3])), np.stack(points)
 
 
-def write_corner(folder, **fields):
+def write_corner(folder, cameras=None, **fields):
     """Write the capture as `transforms.json` with its points, and return its fields."""
     (folder / "images").mkdir(parents=True)
     frames, points = [], []
-    for i, pose in enumerate(poses()):
+    for i, pose in enumerate(poses() if cameras is None else cameras):
         image, world = draw(pose)
         name = f"images/{i:02d}.png"
         cv2.imwrite(str(folder / name), image[..., ::-1])

@@ -96,6 +96,24 @@ def fit(matches: Matches, cameras: Cameras) -> Fit:
     return Fit(float(inside.mean()), median, fitting, by_view, by_best, precise)
 
 
+def capture_parallax(matches: Matches, cameras: Cameras) -> float:
+    """Estimate how far features move between a capture's two farthest cameras, in degrees.
+
+    It is the median over matches that fit, each of which moves by an angle between two cameras
+    that are so far apart; 0 where no camera moves.
+    """
+    matches = matches.take(epipolar_errors(matches, cameras) <= FITTING)
+    rays, _ = _rays(matches, cameras)
+    centers = cameras.camtoworld[:, :, 3]
+    apart = np.linalg.norm(centers[:, None] - centers, axis=-1)
+    between = apart[tuple(matches.views.T)]
+    moved = between > 0
+    if not moved.any():
+        return 0.0
+    angles = _angle(rays[:, 0], rays[:, 1])[moved] * apart.max() / between[moved]
+    return min(180.0, float(np.degrees(np.median(angles))))
+
+
 def _shares(group: np.ndarray, true: np.ndarray) -> np.ndarray:
     """Return the share of each group that is true."""
     return np.bincount(group, true) / np.bincount(group)
@@ -107,9 +125,8 @@ def _rays(matches: Matches, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
     flat = (matches.pixels - lenses[..., 2:]) / lenses[..., :2]
     local = np.concatenate([flat, np.ones((*flat.shape[:-1], 1))], -1)
     world = np.einsum("mvij,mvj->mvi", cameras.camtoworld[matches.views, :, :3], local)
-    squared = np.sum(
-        local**2, -1
-    )  # 1 / cos^2, by which a pixel far from the axis is a smaller angle
+    # 1 / cos^2, by which a pixel far from the axis is a smaller angle
+    squared = np.sum(local**2, -1)
     focal = np.sqrt(lenses[..., 0] * lenses[..., 1])
     return world / np.sqrt(np.sum(world**2, -1, keepdims=True)), focal * squared
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxcloseup.checks.epipolar import Fit, fit
+from jaxcloseup.checks.epipolar import Fit, capture_parallax, fit
 from jaxcloseup.checks.evidence import SIDE, Evidence
 from jaxcloseup.checks.looks import describe_looks, exposures
 from jaxcloseup.checks.mistakes import find_mistake
@@ -21,6 +21,7 @@ _BLURRED = 0.8  # pixels of median error from which close-ups are blurred
 _SHOWN = 0.3  # share of points with texture in two photographs, below which a turn may show more
 _OUT_OF_VIEW = 0.05  # share of points in two views, below which they are of no use
 _FEW_VIEWS = 3  # of photographs that depth needs; most that see a point may be hidden from it
+_LEAST_PARALLAX = 3.0  # degrees, with which half a pixel of 800 is 1 or 2 percent of depth
 _BAD = 0.3  # share of a photograph's fitting matches below which its pose is wrong
 
 
@@ -172,8 +173,14 @@ def _coverage(evidence: Evidence, points: np.ndarray, figures: dict[str, Any]) -
     axes = cameras.camtoworld[:, :, 2]
     cosine = np.sum(axes[pairs[:, 0]] * axes[pairs[:, 1]], -1)
     angle = float(np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1))))
-    figures |= {"neighbor_degrees": angle, "without_matches": int(alone)}
+    parallax = capture_parallax(evidence.matches, cameras)
+    figures |= {"neighbor_degrees": angle, "without_matches": int(alone), "parallax": parallax}
     notes = []
+    if parallax < _LEAST_PARALLAX:
+        notes.append(
+            f"half of the features move by at most {parallax:.1f} degrees between the two cameras "
+            "that are farthest apart, so depth is uncertain: take photographs from more places"
+        )
     if alone:
         share = "shares" if alone == 1 else "share"
         notes.append(f"{alone} of {len(axes)} photographs {share} no features with others")

@@ -212,6 +212,18 @@ def test_photographs_without_features_are_not_judged(tmp_path):
     assert any("are constant" in note for note in found.notes)
 
 
+def test_photographs_from_one_place_are_noticed(evidence, corner, tmp_path):
+    """A camera that turns on the spot says nothing of depth, and its poses fit."""
+    turning = poses()[3:8]
+    turning[:, :, 3] = turning[0, :, 3]
+    write_corner(tmp_path / "spot", turning)
+    found = check_capture(tmp_path / "spot")
+    assert found.verdict == "fits"
+    assert any("move by at most 0.0 degrees" in note for note in found.notes)
+    whole = judge(evidence, list_photographs(corner).points, opengl=True)
+    assert not any("more places" in note for note in whole.notes)
+
+
 def test_dark_and_blurred_photographs_are_named(copy):
     folder = copy(lambda fields: None)
     for name, change in (

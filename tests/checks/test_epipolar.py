@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from textured_corner import HEIGHT, LENS, WIDTH, poses, project
 
-from jaxcloseup.checks.epipolar import Cameras, epipolar_errors, fit
+from jaxcloseup.checks.epipolar import Cameras, capture_parallax, epipolar_errors, fit
 from jaxcloseup.checks.matches import Matches
 
 
@@ -47,6 +47,26 @@ def test_points_behind_a_camera_do_not_fit():
     matches, cameras = seen_together()
     behind = cameras._replace(camtoworld=cameras.camtoworld * np.array([-1, 1, -1, 1]))
     assert fit(matches, behind).share < 0.05
+
+
+def test_parallax_is_the_angle_at_surfaces_between_the_farthest_cameras():
+    """A feature straight ahead of the middle of five cameras in a row, matched between neighbors.
+
+    One pair that does not fit, and one without a distance, do not count.
+    """
+    places = np.array([-2.0, -1, 0, 1, 2])
+    poses = np.tile(np.eye(3, 4), (5, 1, 1))
+    poses[:, 0, 3] = places / 10
+    cameras = Cameras(poses, np.tile(LENS, (5, 1)), np.tile([WIDTH, HEIGHT], (5, 1)))
+    views = np.array([[1, 2], [2, 3], [3, 4], [0, 1]])
+    seen = [project(np.array([[0.0, 0, 4]]), cameras, view)[0] for view in range(5)]
+    pixels = np.array(seen)[views]
+    pixels[3] += np.array([[0, 0], [30, 30]])
+    matches = Matches(views, pixels, np.zeros((4, 2, 3), np.uint8))
+    expected = 2 * np.degrees(np.arctan(0.2 / 4))
+    assert capture_parallax(matches, cameras) == pytest.approx(expected, rel=0.01)
+    poses[:, 0, 3] = 0
+    assert capture_parallax(matches, cameras) == 0
 
 
 @pytest.mark.parametrize(("pairs", "judged"), [(3, True), (2, False)])

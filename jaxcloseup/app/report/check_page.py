@@ -25,6 +25,7 @@ _FIGURES = {
     "photographs": ("photographs", ","),
     "without_matches": ("photographs that share no features with others", ","),
     "neighbor_degrees": ("degrees between similar photographs, median", ".1f"),
+    "parallax": ("degrees by which features move between the farthest cameras, median", ".0f"),
     "views": ("photographs that have a point in view, median", ".0f"),
     "degrees": ("widest angle between them in degrees, median", ".0f"),
     "nearest": ("distance of the nearest, as a share of the usual one", ".2f"),
