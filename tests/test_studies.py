@@ -169,6 +169,19 @@ def test_each_step_of_the_ladder_keeps_those_before_it_since_a_preset(monkeypatc
     assert all("--seed=0" in words for words in made)
 
 
+def test_the_ladder_begins_at_the_other_tables_run_where_that_is_finished(tmp_path, monkeypatch):
+    made = []
+    given = SimpleNamespace(shorter=10, given=["choose=first"], output_dir=str(tmp_path))
+    monkeypatch.setattr(paper_regime, "FLAGS", given)
+    monkeypatch.setattr(paper_regime, "_run", lambda folder, *words: made.append(folder.name))
+    paper_regime.ladder_results("table")
+    (tmp_path / "paper_choose_first_shorter_10").mkdir()
+    write_run(tmp_path / "paper_choose_first_shorter_10" / "table", "table")
+    paper_regime.ladder_results("table")
+    own = [f"ladder_{index}_choose_first_shorter_10" for index in range(5)]
+    assert made == [*own, "paper_choose_first_shorter_10", *own[1:]]
+
+
 def test_a_shorter_regime_has_no_other_proportions():
     preset = METHODS["surfels"].presets["paper_adaptive"]
     found = dict(text.split("=") for text in paper_regime.shorter(preset, 10))

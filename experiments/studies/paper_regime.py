@@ -81,7 +81,7 @@ LADDER = {
 # What `--shorter` divides: settings of presets that are counts of steps before the close-ups.
 _LENGTHS = ("baseline_steps", "means_lr_steps", "sh_every", "regularize_from")
 _DENSITY_LENGTHS = ("every", "start", "stop", "reset_every")
-_ALONE = ("--stages=control,detail",)  # of all runs of the ladder after the first
+_ALONE = ("--stages=control,detail",)  # of runs of the ladder alone
 _GROUPED = ("labels by the text", "labels by detail", "render with detail")
 # What close-ups are grouped by, as `describe_proximity` names it, and the bounds of groups.
 _GROUPS = {
@@ -139,8 +139,10 @@ def ladder_results(scene: str) -> dict[str, Results]:
         if added[0].startswith("--preset="):
             given, added = _of("surfels", added[0].removeprefix("--preset=")), added[1:]
         given = [*given, *added]
-        kind, alone = (f"ladder_{index}", _ALONE) if index else ("paper", ())
-        if results := _run(_folder(kind), scene, *given, *alone):
+        folder = _folder(f"ladder_{index}")
+        if not index and (_folder("paper") / pathlib.Path(scene).name / "results.json").exists():
+            folder = _folder("paper")  # of the other tables
+        if results := _run(folder, scene, *given, *_ALONE):
             found[title] = results
     return found
 
