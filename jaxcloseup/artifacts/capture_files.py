@@ -9,6 +9,7 @@ import pathlib
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 
 from jaxcloseup.io.files import write_file, write_json
@@ -110,6 +111,15 @@ def write_transforms(
     }
     about = {"camera_model": "PINHOLE", "ply_file_path": POINTS, "near": near, "far": far}
     write_json(path, {**about, **lists, "frames": frames})
+
+
+def write_mask(path: pathlib.Path, shown: np.ndarray) -> None:
+    """Write a mask `[H, W]`, true where pixels count, as a PNG of one channel.
+
+    Raises:
+      OSError: one sentence that names the path and the reason.
+    """
+    write_file(path, cv2.imencode(".png", np.where(shown, np.uint8(255), np.uint8(0)))[1].tobytes())
 
 
 def _write_lines(path: pathlib.Path, columns: str, lines: Sequence[str]) -> None:

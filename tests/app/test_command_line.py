@@ -181,7 +181,7 @@ def test_sentences_repeat_how_the_program_was_started(tmp_path):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"output_dir": "here", "resume": True}, "--resume finds no run in --output_dir="),
+        ({"output_dir": "here", "resume": True}, "--resume finds nothing to resume in"),
         ({"scene": "tabel"}, r"tabel is neither a folder nor a built-in"),
         ({"scene": "capture", "format": "llff"}, "holds no capture in the format llff"),
         ({"output_dir": "full"}, "already exists and is not empty"),

@@ -124,6 +124,20 @@ def test_runs_without_close_ups_are_compared_on_ordinary_views(tmp_path, compare
     assert len(page.pictures()) == 15
 
 
+def test_runs_that_trained_at_other_sizes_are_compared(tmp_path, compare):
+    """Their photographs are reduced otherwise, so hashes differ; scored alike, they compare."""
+    at = {"scored_at": [80, 60], "seconds": {"baseline": 120.0, "compile": 60.0}}
+    folders = [
+        write_run(tmp_path / name, [psnr] * 4, resolution=size, **at)
+        for name, psnr, size in (("u", 20.0, [40, 30]), ("v", 21.0, [20, 15]))
+    ]
+    (folders[1] / "manifest.json").write_text('{"data_sha256": "other", "resumed": true}')
+    about, _ = compare(*folders)
+    assert about["verdict"].startswith("Close-ups are best in v, with a PSNR of 21.0 dB")
+    # Compiling is part of a stage's seconds; those before a run was resumed are not known.
+    assert about["differences"]["minutes"] == ["2", "-"]
+
+
 def test_runs_that_cannot_be_compared_are_refused_in_a_sentence(tmp_path, compare):
     one = write_run(tmp_path / "one", [20, 21, 22, 23])
 

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 
+import cv2
 import jax
 import numpy as np
 import plane
@@ -107,6 +108,10 @@ def test_masks_and_far_origins_are_kept(capture_folder, tmp_path):
     assert [f["file_path"] for f in fields["frames"]] == [f"images/a_{i}_b.png" for i in range(5)]
     np.testing.assert_allclose(own_poses(again), own_poses(scene), atol=1e-6)
     np.testing.assert_array_equal(again.train.weight, weight)
+    # nerfstudio wants masks of one channel, of all photographs or of none.
+    masks = [cv2.imread(str(tmp_path / f["mask_path"]), -1) for f in fields["frames"]]
+    assert [mask.shape for mask in masks] == 5 * [(plane.HEIGHT, plane.WIDTH)]
+    assert [mask.min() for mask in masks] == [0, 255, 255, 255, 255]
 
 
 def test_a_mistake_is_one_sentence(export, kept, tmp_path, monkeypatch):

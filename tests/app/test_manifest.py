@@ -82,6 +82,14 @@ def test_a_run_that_another_commit_continues_warns(tmp_path, monkeypatch):
     manifest.write_manifest(tmp_path, {})
 
 
+def test_a_resumed_run_does_not_say_what_its_last_process_used(tmp_path):
+    for resumed in (False, True):
+        manifest.write_manifest(tmp_path, {}, {"baseline": 2.0}, resumed=resumed)
+        found = json.loads((tmp_path / manifest.NAME).read_text())
+        assert found["resumed"] == resumed and found["finished"]
+        assert (found["core_seconds"] is None) == (found["peak_bytes"] is None) == resumed
+
+
 def test_the_hash_of_target_views_covers_their_cameras(capture_folder):
     scene = load_scene(str(capture_folder))
     known = manifest.hash_targets(scene)

@@ -118,7 +118,7 @@ def test_a_sweep_with_other_flags_is_not_mixed_in(run, tmp_path):
         (["sharp"], {}, "--methods=sharp must name some of"),
         (["ngp", "surfels"], {"preset": "reduced"}, "--preset=reduced is not for --method=ngp"),
         (["surfels", "ngp"], {"arms": ["depth=1"]}, "--arms=depth=1"),
-        (["ngp"], {"resume": True}, "--resume finds no sweep in --output_dir=.*out"),
+        (["ngp"], {"resume": True}, "--resume finds nothing to resume in --output_dir=.*out"),
     ],
 )
 def test_a_mistake_is_one_sentence_before_anything_begins(run, tmp_path, methods, given, message):

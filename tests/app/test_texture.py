@@ -58,7 +58,7 @@ def read_between(image, places):
 def test_a_surface_has_the_colors_of_its_photographs():
     mesh = flat_mesh()
     cameras = [plane.camera_above(x, 0, 2.0, tilt=tilt) for x, tilt in ((-0.2, 0.1), (0.2, -0.1))]
-    textured = texturing.texture_mesh(mesh, detail_of(cameras), 4096)
+    textured = texturing.texture_mesh(mesh, texturing.lay_out(mesh, 4096), detail_of(cameras))
     image = np.asarray(PIL.Image.open(io.BytesIO(textured.texture)), np.float64)
     shares = np.random.default_rng(0).dirichlet([0.5] * 3, size=(len(mesh.faces), 3))
 
@@ -84,7 +84,7 @@ def test_a_surface_has_the_colors_of_its_photographs():
 
 def test_triangles_share_no_texels():
     mesh = flat_mesh(5)
-    atlas = texturing.lay_out(mesh, 512, finest=12)
+    atlas = texturing.lay_out(mesh, 512)._replace(side=12)
     places = texturing.texture_places(atlas).reshape(-1, 3, 2)
     rows = -(-len(atlas.triangles) // atlas.columns)
     texels = places * [atlas.columns * atlas.side, atlas.side * rows]
@@ -101,4 +101,4 @@ def test_triangles_share_no_texels():
 
 def test_too_many_triangles_are_one_sentence():
     with pytest.raises(texturing.TextureError, match="--texture=64 has no room for 1057 triangles"):
-        texturing.lay_out(flat_mesh(), 64, finest=12)
+        texturing.lay_out(flat_mesh(), 64)

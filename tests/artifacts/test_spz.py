@@ -16,11 +16,11 @@ from jaxcloseup.io.placement import Placement
 FLIP = np.diag([1.0, -1, -1])
 
 
-def by_hand(packed):
+def by_hand(packed, *, flags=0):
     """Read a file of version 3, one splat after the other."""
     data = gzip.decompress(packed)
-    magic, version, count, degree, bits, flags, reserved = struct.unpack_from("<4sIIBBBB", data)
-    assert (magic, version, flags, reserved) == (b"NGSP", 3, 0, 0)
+    magic, version, count, degree, bits, *others = struct.unpack_from("<4sIIBBBB", data)
+    assert (magic, version, *others) == (b"NGSP", 3, flags, 0)
     bases = (degree + 1) ** 2 - 1
     sizes = [9, 1, 3, 3, 4, 3 * bases]
     starts = 16 + count * np.cumsum([0, *sizes])
@@ -106,3 +106,18 @@ def test_splats_are_placed_and_those_without_numbers_are_left_out():
     np.testing.assert_allclose(first["log_scales"][:2], scales, atol=1 / 31)
     thin = max(-10, scales.min() - np.log(1000))
     assert first["log_scales"][2] == pytest.approx(thin, abs=1 / 31)
+
+
+def test_a_filter_that_keeps_light_is_said():
+    surfels = to_surfels(random_scene(3))
+    packed, _ = pack_spz(surfels, jnp.ones(16, bool), antialiased=True)
+    assert len(by_hand(packed, flags=1)[0]) == 16
+
+
+def test_radii_beyond_the_formats_range_are_said():
+    """It has logarithms of -10 to 5.94: in millimeters a room has larger ones."""
+    surfels = to_surfels(random_scene(3, num_scales=3))
+    with pytest.warns(UserWarning, match="2 of 16 splats are made larger or smaller"):
+        scales = surfels.log_scales.at[0].set(6.5).at[1].set(-11.0)
+        scales = scales.at[2].set(jnp.array([-12.0, 0, 1]))
+        pack_spz(surfels.replace(log_scales=scales), jnp.ones(16, bool))

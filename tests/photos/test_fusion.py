@@ -18,7 +18,7 @@ from tiny_runs import HALF
 from jaxcloseup.app.cli import mesh as program
 from jaxcloseup.app.score import mesh_error
 from jaxcloseup.app.store import stored_run
-from jaxcloseup.app.view import surface
+from jaxcloseup.app.view import meshing, surface
 from jaxcloseup.artifacts.mesh_files import Mesh, surface_mesh, write_mesh
 from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_rays
 from jaxcloseup.io.ply import read_vertices
@@ -258,6 +258,9 @@ def test_a_mistake_is_one_sentence(run, monkeypatch):
     ):
         with pytest.raises(SystemExit, match=f"jaxcloseup mesh: .*{sentence}"):
             run(**flags_)
+    monkeypatch.setattr(meshing, "find_detail", None)  # refused before that
+    with pytest.raises(SystemExit, match=r"--texture=256 has no room for .* triangles"):
+        run(texture=256, resolution=80)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(SystemExit, match='install jaxcloseup with the extra "mesh"'):
         run()

@@ -64,24 +64,26 @@ def check_writable(path: pathlib.Path, flag: str = "output_dir") -> None:
 
 
 def choose_output_dir(
-    folder: str | None, scene: str, method: str, *, resume: bool = False
+    folder: str | None, scene: str, method: str, *, resume: bool = False, kept: str = CHECKPOINTS
 ) -> pathlib.Path:
     """Return the output folder: a new or empty one, or with `resume` that of a run to resume.
+
+    `kept` is what such a folder holds once it can be resumed.
 
     Raises:
       OSError: one sentence that names the flag.
     """
     if resume:
-        if folder is None or not (pathlib.Path(folder) / CHECKPOINTS).is_dir():
+        if folder is None or not (pathlib.Path(folder) / kept).exists():
             raise FileNotFoundError(
-                f"--resume finds no run in --output_dir={folder or ''}: name the folder of one "
-                "that was cut off"
+                f"--resume finds nothing to resume in --output_dir={folder or ''}: name the folder "
+                "of a run or sweep that was cut off"
             )
         return pathlib.Path(folder)
     if folder is None:
         scene_name = os.path.basename(os.path.realpath(scene))  # of `..` too
         return check_unused(dated(pathlib.Path("outputs", scene_name, method)))
-    if (pathlib.Path(folder) / CHECKPOINTS).is_dir():
+    if (pathlib.Path(folder) / kept).exists():
         raise FileExistsError(
             f"--output_dir={folder} already exists and is not empty: resume its training with "
             "--resume, or name a new folder"
@@ -128,10 +130,12 @@ def lock_output_dir(folder: pathlib.Path) -> contextlib.AbstractContextManager[A
     return file
 
 
-def prepare_to_stop(folder: pathlib.Path, program: str | None = None) -> None:
+def prepare_to_stop(
+    folder: pathlib.Path, program: str | None = None, *, kept: str = CHECKPOINTS
+) -> None:
     """Let Ctrl-C remove unfinished files from an output folder, and print how to resume.
 
-    `program` resumes training in the folder; None cannot be resumed.
+    `program` resumes training in the folder once it holds `kept`; None cannot be resumed.
     """
     arguments = sys.argv[1:]
     if FLAGS.output_dir is None:
@@ -141,8 +145,10 @@ def prepare_to_stop(folder: pathlib.Path, program: str | None = None) -> None:
         remove_unfinished(folder)
         if program is None:
             return "stopped"
-        if not (folder / CHECKPOINTS).is_dir():
-            return "stopped before training began: give the same command again"
+        if not (folder / kept).exists():
+            used = folder.is_dir() and any(file.name != LOCK for file in folder.iterdir())
+            again = f"remove {folder}, and give" if used else "give"
+            return f"stopped before training began: {again} the same command again"
         resume = [] if "--resume" in arguments else ["--resume"]
         command = shlex.join([*program_command(program), *arguments, *resume])
         return f"stopped: resume it with {command}"

@@ -25,12 +25,7 @@ from jaxcloseup.app.cli.flags import (
     preset_from_flags,
 )
 from jaxcloseup.app.cli.invocation import program_command, program_name
-from jaxcloseup.app.cli.output_folder import (
-    LOCK,
-    choose_output_dir,
-    lock_output_dir,
-    prepare_to_stop,
-)
+from jaxcloseup.app.cli.output_folder import choose_output_dir, lock_output_dir, prepare_to_stop
 from jaxcloseup.app.cli.start import in_one_sentence, loading, set_up
 from jaxcloseup.app.cli.topics import share, topic
 from jaxcloseup.app.methods.registry import METHODS
@@ -235,8 +230,10 @@ def _sweep_methods() -> None:
         scenes = {os.path.basename(os.path.realpath(scene)): scene for scene in FLAGS.scenes}
         if len(scenes) < len(FLAGS.scenes):
             raise ValueError(f"{_given_scenes()} has two of one name: sweep them one at a time")
-        folder = _choose_folder()
-        prepare_to_stop(folder, "sweep")
+        folder = choose_output_dir(
+            FLAGS.output_dir, "sweep", "methods", resume=FLAGS.resume, kept=_SHARED
+        )
+        prepare_to_stop(folder, "sweep", kept=_SHARED)
         lock = lock_output_dir(folder)
     with lock:
         with in_one_sentence("sweep", OSError, ValueError):
@@ -246,18 +243,6 @@ def _sweep_methods() -> None:
         reason = f"left out, for the reasons above: {', '.join(failed)}"
         sys.exit(f"{program_name('sweep')}: {reason}")
     print(f"tables: {folder / 'methods.md'}")
-
-
-def _choose_folder() -> pathlib.Path:
-    """Return the output folder, whose subfolders hold what is to be resumed."""
-    if not FLAGS.resume:
-        return choose_output_dir(FLAGS.output_dir, "sweep", "methods")
-    if FLAGS.output_dir is None or not (pathlib.Path(FLAGS.output_dir) / LOCK).exists():
-        raise FileNotFoundError(
-            f"--resume finds no sweep in --output_dir={FLAGS.output_dir or ''}: name the folder of "
-            "one that was cut off"
-        )
-    return pathlib.Path(FLAGS.output_dir)
 
 
 def _given_scenes() -> str:

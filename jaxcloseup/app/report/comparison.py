@@ -75,8 +75,7 @@ def differences(runs: Sequence[Finished]) -> Table:
     """Return a row for each fact and setting in which the runs differ."""
     facts = []
     for run in runs:
-        seconds = [value for value in run.results["seconds"].values() if _is_number(value)]
-        about = _about(run) | {"stage": run.stage, "minutes": f"{sum(seconds) / 60:.0f}"}
+        about = _about(run) | {"stage": run.stage, "minutes": _minutes(run)}
         facts.append(about | _flat(run.results["config"]))
     names = dict.fromkeys(itertools.chain.from_iterable(facts))
     body = [[name, *(_text(known.get(name)) for known in facts)] for name in names]
@@ -84,8 +83,11 @@ def differences(runs: Sequence[Finished]) -> Table:
     return Table("Differences between the runs", ["", *(run.name for run in runs)], body)
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float)
+def _minutes(run: Finished) -> str | None:
+    """Return the minutes of a run; None if it was resumed, because only the last are known."""
+    seconds = {**run.results["seconds"], "compile": 0}  # which the stages' own seconds hold
+    counted = (value for value in seconds.values() if isinstance(value, int | float))
+    return None if run.resumed else f"{sum(counted) / 60:.0f}"
 
 
 def _about(run: Finished) -> dict[str, Any]:

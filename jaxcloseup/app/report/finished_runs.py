@@ -34,6 +34,7 @@ class Finished(NamedTuple):
     folder: pathlib.Path  # its folder
     results: Mapping[str, Any]  # its `results.json`
     photographs: str  # hash of its training data
+    resumed: bool  # whether several processes trained it, the last of which knows its own time
     stage: str  # the stage that is compared
     scores: Mapping[str, Any]  # scores of that stage by split
 
@@ -74,6 +75,7 @@ def _read(folder: pathlib.Path, name: str) -> Finished:
         raise RunError(f"--runs: {folder} has no results.json: name folders of finished runs")
     results = read_fields(path, _RESULTS)
     about = read_fields(folder / "manifest.json", {"data_sha256": str})
+    resumed = about.get("resumed") is True
     stages = results["stages"]
     stage = next((stage for stage in (*_STAGES, *stages) if stage in stages), None)
     if stage is None or not _is_scored(stages[stage]):
@@ -81,7 +83,8 @@ def _read(folder: pathlib.Path, name: str) -> Finished:
             f"{path}: stages must hold scores by stage and split: restore the file from a copy of "
             "the run"
         )
-    return Finished(name, folder, results, about["data_sha256"], stage, stages[stage])
+    photographs, scores = about["data_sha256"], stages[stage]
+    return Finished(name, folder, results, photographs, resumed, stage, scores)
 
 
 def _is_scored(splits: Any) -> bool:
@@ -120,12 +123,19 @@ def _check_alike(first: Finished, run: Finished) -> None:
     elif size != other:
         why = f"has views of {_pixels(size)} and {run.name} of {_pixels(other)}"
         advice = "name runs with one --score_width"
-    elif _views(first) != _views(run) or first.photographs != run.photographs:
+    elif _views(first) != _views(run) or not _same_photographs(first, run):
         why = f"and {run.name} have other photographs, or another split of them"
         advice = "name runs with one --split of the same photographs"
     else:
         return
     raise RunError(f"--runs cannot be compared: {first.name} {why}: {advice}")
+
+
+def _same_photographs(first: Finished, run: Finished) -> bool:
+    """Return False if runs learned from other photographs, as far as their hashes can tell."""
+    # Of photographs that are reduced to other sizes the hashes differ anyway.
+    alike = first.results["resolution"] == run.results["resolution"]
+    return not alike or first.photographs == run.photographs
 
 
 def _views(run: Finished) -> dict[str, list[str]]:

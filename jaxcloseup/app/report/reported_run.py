@@ -14,6 +14,7 @@ from jaxcloseup.app.methods.settings import plain_config
 from jaxcloseup.app.report.run_report import report_run
 from jaxcloseup.app.run.logs import TrainLog
 from jaxcloseup.app.run.loop import Training
+from jaxcloseup.app.run.manifest import NAME as MANIFEST
 from jaxcloseup.app.run.manifest import (
     about_scene,
     identity_of,
@@ -73,7 +74,8 @@ def run(
     )
     about = {**names, "seed": seed, "config": plain_config(preset), "versions": versions()}
     manifest = about | about_scene(scene, load_options or {})
-    write_manifest(output_dir, manifest)
+    resumed = (output_dir / MANIFEST).exists()
+    write_manifest(output_dir, manifest, resumed=resumed)
     write_dataparser_transforms(output_dir, scene)
     with progress.showing(
         plan_run(preset, scene, to_run),
@@ -85,7 +87,7 @@ def run(
         dolly = _dolly(training, outcome)
         results = report_run(output_dir, training, outcome, about, dolly=dolly)
     print(f"compiling took {training.seconds['compile']:.0f} s of the run")
-    write_manifest(output_dir, manifest, training.seconds)
+    write_manifest(output_dir, manifest, training.seconds, resumed=resumed)
     return results
 
 

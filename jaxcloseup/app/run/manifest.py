@@ -29,14 +29,19 @@ _HASHED = (
 
 
 def write_manifest(
-    folder: pathlib.Path, about: Mapping[str, Any], seconds: Mapping[str, Any] | None = None
+    folder: pathlib.Path,
+    about: Mapping[str, Any],
+    seconds: Mapping[str, Any] | None = None,
+    *,
+    resumed: bool = False,
 ) -> None:
     """Write `manifest.json` atomically; at the end, also the core-seconds and the peak of memory.
 
     A run that another commit continues prints a warning.
 
     `seconds` has the wall time of each stage since the run started or resumed, by scene for a
-    sweep; None while the run is not finished.
+    sweep; None while the run is not finished. With `resumed`, core-seconds and memory are None,
+    because those of earlier processes are not known.
     """
     commit, changed = git_commit(pathlib.Path(jaxcloseup.__file__).parent)
     before = None
@@ -49,8 +54,8 @@ def write_manifest(
             stacklevel=2,
         )
     git = {"git_commit": commit, "git_changed": changed}
-    used = {} if seconds is None else _resources_used()
-    ended = {"finished": seconds is not None, "seconds": seconds, **used}
+    used = {} if seconds is None else _resources_used(resumed)
+    ended = {"finished": seconds is not None, "resumed": resumed, "seconds": seconds, **used}
     write_json(folder / NAME, {**about, **git, **ended})
 
 
@@ -142,8 +147,10 @@ def _hash(arrays: Mapping[str, Any]) -> str:
     return digest.hexdigest()
 
 
-def _resources_used() -> dict[str, float | None]:
+def _resources_used(resumed: bool) -> dict[str, float | None]:
     """Return the core-seconds and the largest resident memory in bytes of this process so far."""
+    if resumed:
+        return {"core_seconds": None, "peak_bytes": None}
     return {"core_seconds": time.process_time(), "peak_bytes": peak_memory()}
 
 

@@ -68,5 +68,5 @@ def sweep_scenes(
             ]
             write_sweep(output_dir, found, about, pictures)
     if first:
-        write_manifest(output_dir, manifest, seconds)
+        write_manifest(output_dir, manifest, seconds, resumed=resume)
     return found

@@ -17,6 +17,7 @@ from jaxcloseup.artifacts.capture_files import (
     POINTS,
     FileView,
     write_colmap,
+    write_mask,
     write_transforms,
 )
 from jaxcloseup.artifacts.compressed_ply import pack_compressed_ply
@@ -68,9 +69,12 @@ def export_splats(
     surfels, alive = programs.method.splats(state.params, state.buffers)
     for name in files:
         path = output_dir / name
-        if name in PACKED:
-            kept = _shown(programs, state, alive) if name == "splats.spz" else alive
-            write_file(path, PACKED[name](surfels, kept, placement=scene.placement)[0])
+        if name == "splats.spz":
+            kept, antialiased = _shown(programs, state, alive), record.preset.field.raster.antialias
+            packed = pack_spz(surfels, kept, placement=scene.placement, antialiased=antialiased)
+            write_file(path, packed[0])
+        elif name in PACKED:
+            write_file(path, PACKED[name](surfels, alive, placement=scene.placement)[0])
         else:
             write_surfels(path, surfels, alive, placement=scene.placement)
         print(f"wrote {path}, {path.stat().st_size / 1e6:.1f} MB")
@@ -108,6 +112,8 @@ def export_cameras(output_dir: pathlib.Path, scene: Scene) -> None:
             photographs = _photographs(scene, split)
         for name, photograph in zip(names, photographs, strict=True):
             views.append(_write_view(output_dir, split, name, photograph, taken, scene.placement))
+    if any(view.masked for view in views):  # nerfstudio reads masks of all photographs, or of none
+        views = [_with_mask(output_dir, view) for view in views]
     points = scene.placement.to_capture(scene.points)
     rgb = to_uint8(scene.rgb[None])[0]
     write_colmap(output_dir / "sparse" / "0", views, points, rgb)
@@ -155,8 +161,7 @@ def _write_view(
     shown = weight >= (128 if weight.dtype == np.uint8 else 0.5)
     write_png(output_dir / IMAGES / f"{stem}.png", photograph.rgb)
     if not shown.all():
-        mask = np.where(shown[..., None], np.uint8(255), np.uint8(0))
-        write_png(output_dir / MASKS / f"{stem}.png", np.repeat(mask, 3, axis=-1))
+        write_mask(output_dir / MASKS / f"{stem}.png", shown)
     return FileView(
         name=f"{stem}.png",
         split=split,
@@ -166,3 +171,10 @@ def _write_view(
         width=photograph.rgb.shape[1],
         masked=not shown.all(),
     )
+
+
+def _with_mask(output_dir: pathlib.Path, view: FileView) -> FileView:
+    """Write a white mask for a photograph that has none."""
+    if not view.masked:
+        write_mask(output_dir / MASKS / view.name, np.ones((view.height, view.width), bool))
+    return view._replace(masked=True)

@@ -12,7 +12,7 @@ from jaxcloseup.app.run.kept_detail import detail_path, find_detail
 from jaxcloseup.app.score.mesh_error import CLOSE, mesh_error
 from jaxcloseup.app.store.stored_run import StoredRun, restore
 from jaxcloseup.app.view import surface
-from jaxcloseup.app.view.texturing import texture_mesh
+from jaxcloseup.app.view.texturing import lay_out, texture_mesh
 from jaxcloseup.artifacts.glb import pack_mesh_glb
 from jaxcloseup.artifacts.mesh_files import write_mesh
 from jaxcloseup.io.files import write_file, write_json
@@ -66,10 +66,13 @@ def write_run_mesh(
     maps = surface.see_training_views(scene, see, finer=finer, support=min_views)
     region = _seen_region(maps, min_views) if region is None else scene.placement.to_scene(region)
     side = scene.placement.scale * voxel if voxel else np.ptp(region, axis=0).max() / resolution
+    if not side > 0:
+        raise MeshError("all that views see is one point: choose a smaller --min_views")
     mesh = _fuse(maps, surface.make_grid(region, side), scene.placement.scale)
     if texture is not None and stage is not None:
+        atlas = lay_out(mesh, texture)  # before minutes of detail, because it may not fit
         detail, _ = find_detail(programs, state, detail_path(record.folder, stage))
-        textured = texture_mesh(mesh, detail, texture)
+        textured = texture_mesh(mesh, atlas, detail)
         write_file(output_dir / "mesh.glb", pack_mesh_glb(textured, placement=scene.placement))
     write_mesh(output_dir / "mesh.ply", mesh, scene.placement)
     about = {

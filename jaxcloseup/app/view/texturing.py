@@ -52,22 +52,20 @@ class Atlas(NamedTuple):
     facing: np.ndarray
 
 
-def texture_mesh(mesh: Mesh, detail: Detail, size: int) -> TexturedMesh:
+def texture_mesh(mesh: Mesh, atlas: Atlas, detail: Detail) -> TexturedMesh:
     """Return a mesh with a texture of the photographs' colors.
 
     What no photograph shows has the colors of the mesh's vertices.
 
     Args:
       mesh: `F` triangles in world units.
+      atlas: where they are in the texture; its cells are made no larger than photographs need.
       detail: photographs of the scene, with their depth.
-      size: largest side of the texture in texels.
-
-    Raises:
-      TextureError: the mesh has too many triangles.
     """
     corners, colors = mesh.vertices[mesh.faces].astype(np.float64), mesh.rgb[mesh.faces] / 255
     edge = float(np.median(np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)))
-    atlas = lay_out(mesh, size, finest=_SMALLEST + math.ceil(edge / _finest_pixel(detail)))
+    finest = _SMALLEST + math.ceil(edge / _finest_pixel(detail))
+    atlas = atlas._replace(side=min(finest, atlas.side))
     shares, half = texel_shares(atlas.side)
     together = max(1, _TEXELS // atlas.side**2)
     texture = np.zeros((len(atlas.triangles), atlas.side, atlas.side, 3), np.uint8)
@@ -103,8 +101,12 @@ def _known(inverse_depth: jax.Array) -> jax.Array:
     return jnp.where(inverse_depth > 0, inverse_depth, jnp.nan)
 
 
-def lay_out(mesh: Mesh, size: int, *, finest: int) -> Atlas:
-    """Return an atlas for a texture of at most `size` texels a side, and cells of `finest`."""
+def lay_out(mesh: Mesh, size: int) -> Atlas:
+    """Return an atlas for a texture of at most `size` texels a side.
+
+    Raises:
+      TextureError: the mesh has too many triangles.
+    """
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     facing = np.rint(normals / np.maximum(np.abs(normals).max(axis=1, keepdims=True), 1e-30))
@@ -122,7 +124,7 @@ def lay_out(mesh: Mesh, size: int, *, finest: int) -> Atlas:
             f"--texture={size} has no room for {len(corners)} triangles: choose at least "
             f"{_SMALLEST * columns}, or a smaller --resolution"
         )
-    return Atlas(min(finest, size // columns), columns, triangles, facing[triangles[:, 0]])
+    return Atlas(size // columns, columns, triangles, facing[triangles[:, 0]])
 
 
 def texel_shares(side: int) -> tuple[np.ndarray, np.ndarray]:
