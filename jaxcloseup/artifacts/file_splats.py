@@ -39,7 +39,7 @@ class FileSplats(NamedTuple):
 
 
 def file_splats(
-    surfels: Surfels, alive: jax.Array, *, placement: Placement = UNMOVED
+    surfels: Surfels, alive: jax.Array | np.ndarray, *, placement: Placement = UNMOVED
 ) -> tuple[FileSplats, int]:
     """Return the splats that are alive and finite as files hold them.
 

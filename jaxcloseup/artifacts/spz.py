@@ -32,7 +32,11 @@ _FIRST_BUCKET, _BUCKET = 8, 16  # of degree 1, and of the higher ones: 5 and 4 o
 
 
 def pack_spz(
-    surfels: Surfels, alive: jax.Array, *, placement: Placement = UNMOVED, antialiased: bool = False
+    surfels: Surfels,
+    alive: jax.Array | np.ndarray,
+    *,
+    placement: Placement = UNMOVED,
+    antialiased: bool = False,
 ) -> tuple[bytes, int]:
     """Return the surfels that are alive as the bytes of a file.
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import itertools
+import math
 import os
 import pathlib
 import threading
@@ -14,7 +15,9 @@ import numpy as np
 from jaxcloseup.artifacts.images import Image, to_uint8
 
 
+ENDINGS = _MP4, _WEBM = ".mp4", ".webm"
 _CODEC = "VP80"  # VP8, which OpenCV's wheels can write and browsers play
+_LEAST_FPS = 1.0  # of files; slower videos repeat their frames, because WebM counts milliseconds
 
 
 def write_video(stem: str | pathlib.Path, frames: Iterable[Image], *, fps: float) -> pathlib.Path:
@@ -34,17 +37,18 @@ def write_video(stem: str | pathlib.Path, frames: Iterable[Image], *, fps: float
       ValueError: the frames differ in size, or there are none.
     """
     stem = pathlib.Path(stem)
-    frames = _even(frames)
-    first = next(frames)
-    ending = ".mp4" if _has_ffmpeg() else ".webm"
+    repeated = max(1, math.ceil(_LEAST_FPS / fps))
+    shown = (frame for frame in _even(frames) for _ in range(repeated))
+    first = next(shown)
+    ending = _MP4 if _has_ffmpeg() else _WEBM
     path = stem.with_name(stem.name + ending)
     part = stem.with_name(f".{stem.name}.{os.getpid()}.part{ending}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        writer = (_Mp4 if ending == ".mp4" else _WebM)(part, first.shape, fps)
+        writer = (_Mp4 if ending == _MP4 else _WebM)(part, first.shape, repeated * fps)
         count = 0
         try:
-            for frame in itertools.chain([first], frames):
+            for frame in itertools.chain([first], shown):
                 writer.add(frame)
                 count += 1
         finally:

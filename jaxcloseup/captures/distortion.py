@@ -5,6 +5,7 @@ convention (the center of the top-left pixel is (0.5, 0.5)); OpenCV puts pixel c
 so `undistortion_map` subtracts half a pixel from the principal point.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import cv2
@@ -23,6 +24,7 @@ _PERSPECTIVE = {
 }
 _FISHEYE = {"FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 _FISHEYE |= {"OPENCV_FISHEYE"}
+_STOP = cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-9  # of solving for a direction
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
@@ -91,8 +93,7 @@ def undistortion_map(
       height: image height in pixels.
     """
     fx, fy, cx, cy = intrinsics
-    matrix = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
-    coefficients = np.array(distortion.coefficients)
+    matrix, coefficients = _matrix(np.array(intrinsics)), np.array(distortion.coefficients)
     fisheye, perspective = cv2.fisheye.initUndistortRectifyMap, cv2.initUndistortRectifyMap
     make = fisheye if distortion.fisheye else perspective
     x, y = make(matrix, coefficients, np.eye(3), matrix, (width, height), cv2.CV_32FC1)
@@ -101,6 +102,47 @@ def undistortion_map(
     down = (np.arange(height) + 0.5 - cy) / fy
     radius = np.hypot(across[None, :], down[:, None])
     return Remap(x, y, inside & (radius < _fold(distortion, float(radius.max()))))
+
+
+def to_pinhole(
+    distortion: Distortion, intrinsics: np.ndarray, pixel: tuple[float, float]
+) -> tuple[float, float]:
+    """Return where a pinhole photograph shows what the distorted one has at a pixel (x, y).
+
+    Both photographs have the same intrinsics (fx, fy, cx, cy). What no pinhole camera sees gives
+    NaN, or a pixel far outside.
+    """
+    matrix, coefficients = _matrix(intrinsics), np.array(distortion.coefficients)
+    given = np.array([[pixel]]) - 0.5
+    if distortion.fisheye:
+        found = cv2.fisheye.undistortPoints(given, matrix, coefficients, P=matrix)
+    else:
+        found = cv2.undistortImagePoints(given, matrix, coefficients, None, _STOP)
+    x, y = (found.ravel() + 0.5).tolist()
+    fx, fy, cx, cy = intrinsics
+    radius = math.hypot((x - cx) / fx, (y - cy) / fy)
+    return (x, y) if radius < _fold(distortion, max(2 * radius, 1.0)) else (math.nan, math.nan)
+
+
+def from_pinhole(
+    distortion: Distortion, intrinsics: np.ndarray, pixel: tuple[float, float]
+) -> tuple[float, float]:
+    """Return where the distorted photograph shows what a pinhole one has at a pixel (x, y)."""
+    fx, fy, cx, cy = intrinsics
+    matrix, coefficients = _matrix(intrinsics), np.array(distortion.coefficients)
+    flat = (pixel[0] - cx) / fx, (pixel[1] - cy) / fy
+    if distortion.fisheye:
+        found = cv2.fisheye.distortPoints(np.array([[flat]]), matrix, coefficients)
+    else:
+        still = np.zeros(3)
+        found, _ = cv2.projectPoints(np.array([[[*flat, 1]]]), still, still, matrix, coefficients)
+    return float(found[0, 0, 0]) + 0.5, float(found[0, 0, 1]) + 0.5
+
+
+def _matrix(intrinsics: np.ndarray) -> np.ndarray:
+    """Return OpenCV's matrix of intrinsics, in which centers of pixels are integers."""
+    fx, fy, cx, cy = map(float, intrinsics)
+    return np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
 
 
 def undistort(image: np.ndarray, mask: np.ndarray, remap: Remap) -> tuple[np.ndarray, np.ndarray]:

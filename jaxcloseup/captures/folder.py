@@ -123,6 +123,9 @@ def _load(listing: Listing, reading: Reading) -> Scene:
         metadata["own_sizes"] = {
             split: [photo.own_size for photo in part] for split, part in parts.items()
         }
+        metadata["distortions"] = {
+            split: [photo.frame.distortion for photo in part] for split, part in parts.items()
+        }
     if all(frame.seen is not None for frame in listing.frames["train"]):
         metadata["seen"] = [frame.seen for frame in listing.frames["train"]]
     if listing.times_nearer is not None:

@@ -88,7 +88,8 @@ class Scene:
       far: upper bound of z-depth in the scene, in world units.
       names: for each split present, the names of its photographs in order.
       metadata: extra facts from the loader, such as source paths and downscale; `own_sizes`, width
-        and height of each photograph of a split before it was reduced; `seen`, for each training
+        and height of each photograph of a split before it was reduced; `distortions`, what of its
+        lens was undone in reading, or None; `seen`, for each training
         photograph the indices of the points that it shows, and `point_errors`, their mean
         reprojection errors `[P]` in pixels of the photographs' own size, where the files list them.
       surface: renders a `Camera` to its exact `Surface`; None for photographed scenes.
@@ -167,8 +168,9 @@ def keep_photographs(scene: Scene, chosen: Sequence[int]) -> Scene:
             depths = np.asarray(exact(camera))
         times_seen += _see(camera, scene.points, depths)
     metadata = dict(scene.metadata)
-    if own := metadata.get("own_sizes"):
-        metadata["own_sizes"] = own | {"train": [own["train"][i] for i in chosen]}
+    for name in ("own_sizes", "distortions"):
+        if own := metadata.get(name):
+            metadata[name] = own | {"train": [own["train"][i] for i in chosen]}
     return dataclasses.replace(
         scene,
         metadata=metadata,

@@ -83,7 +83,7 @@ def test_captures_and_videos_are_told_from_photographs(closeup, started, capture
     closeup(capture_folder, fix=True, check=False)
     assert started[0][:2] == ["run", f"--scene={capture_folder}"]
     assert started[0][-2:] == ["--nocheck", "--fix"] and "--split=listed" in started[0]
-    closeup("table")
+    closeup("table", output_dir=str(tmp_path / "drawn"))
     assert "--split=listed" not in started[2]  # a drawn scene has no lists
     video = tmp_path / "walk.mp4"
     video.write_bytes(b"")
@@ -92,10 +92,40 @@ def test_captures_and_videos_are_told_from_photographs(closeup, started, capture
     assert started[6] == program.pathlib.Path("outputs/walk/closeup/run")
 
 
+def test_a_folder_holds_closeups_of_one_source(closeup, started, tmp_path, capsys):
+    photographs = write_photographs(tmp_path / "monday")
+    out = closeup(photographs)
+    other = write_photographs(tmp_path / "tuesday")
+    cv2.imwrite(str(other / "c.png"), np.zeros((4, 4, 3), np.uint8))
+    with pytest.raises(
+        SystemExit, match=r"out holds close-ups of .*monday, not of .*tuesday: name"
+    ):
+        closeup(other)
+    closeup(shutil.move(photographs, tmp_path / "moved"))  # the same photographs
+    with pytest.raises(SystemExit, match=r"holds close-ups of .*monday, not of table"):
+        closeup("table")
+    assert "other files" not in capsys.readouterr().out
+    cv2.imwrite(str(tmp_path / "moved" / "c.png"), np.zeros((4, 4, 3), np.uint8))
+    shutil.move(tmp_path / "moved", photographs)
+    (out / "run").mkdir()
+    (out / "run" / "results.json").write_text("{}")
+    closeup(photographs)
+    assert "monday has other files than those that" in capsys.readouterr().out
+
+
+def test_folders_are_called_by_their_whole_name(tmp_path):
+    """A date is no file ending."""
+    (tmp_path / "2024.05.01").mkdir()
+    assert program._name(str(tmp_path / "2024.05.01")) == "2024.05.01"
+    assert program._name(str(tmp_path / "walk.mp4")) == "walk"
+    assert program._name(str(tmp_path / "walk" / "photos")) == "walk"
+
+
 @pytest.mark.parametrize(
     ("source", "given", "said"),
     [
         ("nothing", {}, "nothing does not exist"),
+        ("table", {"data": "."}, r"--data=\. is for a run whose capture was moved"),
         ("table", {"at": ["train_001"]}, "--at=train_001 must be PHOTOGRAPH:x,y"),
     ],
 )
@@ -111,6 +141,7 @@ def test_a_mistake_is_one_sentence_before_anything_is_written(
 def presented(kept, tmp_path_factory):
     """The output of two calls for one run: a pixel of a photograph, then another."""
     run = shutil.copytree(kept, tmp_path_factory.mktemp("run") / "kept")
+    (run / "dolly.webp").touch()
     flags.FLAGS(["closeup"])
     with jax.numpy_dtype_promotion("standard"), pytest.MonkeyPatch.context() as patch:
         patch.setattr("jaxcloseup.app.share.present._FRAMES", 2)
@@ -122,9 +153,11 @@ def presented(kept, tmp_path_factory):
 
 def test_closeups_are_nearer_and_the_page_keeps_earlier_ones(presented, capture_folder):
     data = data_of(presented / "share")
-    assert [one["name"] for one in data["closeups"]] == ["2_16_12", "0_20_10", "1_18_12"]
-    assert len(list(presented.glob("dolly.*"))) == 1
-    picture = cv2.imread(str(presented / "closeups" / "2_16_12.png")).astype(float)
+    assert [one["name"] for one in data["closeups"]] == ["2_16_12_2x", "0_20_10_2x", "1_18_12_2x"]
+    # A run's report has one of its own.
+    endings = {path.suffix for path in presented.glob("dolly.*")}
+    assert endings & {".mp4", ".webm"} and ".webp" in endings
+    picture = cv2.imread(str(presented / "closeups" / "2_16_12_2x.png")).astype(float)
     photograph = cv2.imread(str(capture_folder / "train" / "2.png")).astype(float)
     assert picture.shape == photograph.shape
     # The middle of the close-up is the pixel of the photograph, which is half as large.
@@ -197,7 +230,29 @@ def test_the_page_flies_to_a_closeup_and_shows_it_without_a_network(presented):
             off.append(differ(screenshot(driver)[middle], shown[middle]))
         assert off[-1] < 25
         assert differ(shown[middle], shown[middle].mean(axis=(0, 1))) > 10
+        driver.find_element("id", "error").click()
+        legend = "return document.getElementById('legend').hidden"
+        assert not driver.execute_script(legend)
         driver.find_element("id", "back").click()
         wait(driver, STATE, "free")
+        assert driver.execute_script(legend)
         logs = [entry["message"] for entry in driver.get_log("browser")]
     assert not [message for message in logs if "Error" in message]
+
+
+def test_a_picture_within_the_page_is_saved(closeup, presented):
+    """Browsers refuse to open addresses that hold a picture. Without WebGL there are no pins."""
+    out = closeup(presented, at=["0:20,10"], near=2.0, single_file=True)
+    with open_browser() as driver:
+        driver.execute_cdp_cmd(
+            "Page.addScriptToEvaluateOnNewDocument",
+            {"source": "HTMLCanvasElement.prototype.getContext = () => null"},
+        )
+        driver.get((out / "share" / "index.html").as_uri())
+        wait(driver, STATE, "free")
+        assert not driver.find_elements("css selector", ".pin")
+        driver.find_element("css selector", "#strip button").click()
+        wait(driver, STATE, "shown")
+        link = driver.find_element("id", "full")
+        assert link.get_attribute("download").endswith("x.webp")
+        assert link.text == "Save the picture"

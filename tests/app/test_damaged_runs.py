@@ -106,7 +106,7 @@ def test_the_program_says_so(kept, tmp_path):
     broken = copy_of(kept, tmp_path / "broken", RUN, with_setting("capacity", 0))
     with (
         flagsaver.flagsaver(compilation_cache="", run=broken, views="test"),
-        pytest.raises(SystemExit, match=r"^jaxcloseup render: --run=.*capacity must be"),
+        pytest.raises(SystemExit, match=r"^jaxcloseup render: .*capacity must be"),
     ):
         render.main(["render"])
 

@@ -40,7 +40,7 @@ def serve(viser):
     """Return a function that serves a state at a free port; it returns the page and its address."""
     from jaxcloseup.app.view.server import serve
     from jaxcloseup.app.view.viewer import Viewer
-    from jaxcloseup.app.view.visitor import welcome_visitors
+    from jaxcloseup.app.view.welcome import welcome_visitors
 
     servers = []
 

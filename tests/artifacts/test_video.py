@@ -82,3 +82,11 @@ def test_an_unwritable_folder_is_an_os_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match=r"cannot be written .*: choose another output folder"):
         write_video(tmp_path / "file" / "a", frames(32, 32), fps=12)
+
+
+def test_slow_videos_repeat_their_frames(tmp_path, opencv_only):
+    """WebM counts milliseconds, and loses frames that last longer than some seconds."""
+    images = frames(64, 96)
+    found, fps = read(write_video(tmp_path / "a", images, fps=0.1))
+    assert len(found) == 10 * len(images) and fps == pytest.approx(1, abs=0.01)
+    assert np.abs(found[-1] - images[-1]).mean() < 0.02

@@ -3,7 +3,15 @@ import numpy as np
 import pytest
 from tiny_capture import POSE, write_image, write_json
 
-from jaxcloseup.captures.distortion import read_distortion, undistort, undistortion_map
+from jaxcloseup.app.view.camera_paths import CameraError
+from jaxcloseup.app.view.photograph_pixels import file_pixel, pinhole_pixel
+from jaxcloseup.captures.distortion import (
+    from_pinhole,
+    read_distortion,
+    to_pinhole,
+    undistort,
+    undistortion_map,
+)
 from jaxcloseup.captures.load import load_scene
 
 
@@ -91,6 +99,27 @@ def test_rays_keep_their_colors(model):
     assert abs(photograph.astype(int) - colors(*grid())).max() > 10
 
 
+@pytest.mark.parametrize("model", LENSES)
+def test_pixels_of_a_file_are_found_in_the_pinhole_photograph(model):
+    lens, (fx, fy, cx, cy) = LENSES[model], INTRINSICS
+    distortion = read_distortion("lens", {"camera_model": model, **lens})
+    for pixel in ((3.0, 5.5), (30.2, 20.0), (55.5, 40.0)):
+        bent = (np.array(pixel) - (cx, cy)) / (fx, fy)
+        x, y = straighten(*(bent[:, None]), model, lens)
+        expected = np.array([fx * x[0] + cx, fy * y[0] + cy])
+        found = to_pinhole(distortion, np.array(INTRINSICS), pixel)
+        np.testing.assert_allclose(found, expected, atol=1e-3)
+        back = from_pinhole(distortion, np.array(INTRINSICS), tuple(expected))
+        np.testing.assert_allclose(back, pixel, atol=1e-3)
+
+
+def test_pixels_beyond_the_fold_have_no_direction():
+    distortion = read_distortion("lens", {"k1": -0.5})
+    intrinsics = np.array([20.0, 20.0, 30.0, 22.0])
+    assert np.isnan(to_pinhole(distortion, intrinsics, (55.0, 22.0))).all()  # 2/3 sqrt(2/3) is 0.54
+    np.testing.assert_allclose(to_pinhole(distortion, intrinsics, (30.0, 22.0)), (30.0, 22.0))
+
+
 def test_directions_beyond_the_fold_are_not_shown():
     """r (1 - 0.5 r^2) peaks at r = sqrt(2/3); beyond it, the photograph would repeat."""
     distortion = read_distortion("lens", {"k1": -0.5})
@@ -139,3 +168,26 @@ def test_transforms_with_a_distorted_lens(tmp_path):
     # instant-ngp's files mark a fisheye with a flag.
     write_json(tmp_path / "transforms.json", [{**pose, **about, "is_fisheye": True}])
     assert not np.array_equal(load_scene(tmp_path).train.rgb[0], rgb)
+
+
+@pytest.mark.parametrize("downscale", [1, 2])
+def test_pixels_count_in_the_photograph_as_it_is(tmp_path, downscale):
+    """Also where training reads it smaller."""
+    fx, fy, cx, cy = INTRINSICS
+    lens = {"k1": -0.15, "k2": 0.02}
+    write_image(tmp_path / "a.png", colors(*straighten(*grid(), "RADIAL", lens)))
+    pose = {"file_path": "a.png", "transform_matrix": POSE.tolist()}
+    about = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": WIDTH, "h": HEIGHT}
+    write_json(tmp_path / "transforms.json", [{**pose, **about, **lens}])
+    scene = load_scene(tmp_path, downscale=downscale)
+    asked = np.array([52.0, 36.0])
+    x, y = straighten(*((asked - (cx, cy)) / (fx, fy))[:, None], "RADIAL", lens)
+    expected = fx * x[0] + cx, fy * y[0] + cy
+    assert np.abs(np.array(expected) - asked).max() > 0.7
+    found = pinhole_pixel(scene, 0, tuple(asked))
+    np.testing.assert_allclose(found, expected, atol=0.01)
+    assert file_pixel(scene, 0, found) == (52, 36)
+    with pytest.raises(CameraError, match=r"--at=a:59.5,43.5 is cut off where the distortion"):
+        pinhole_pixel(scene, 0, (59.5, 43.5), given="--at=a:")
+    with pytest.raises(CameraError, match="60 x 44 pixels of the photograph"):
+        pinhole_pixel(scene, 0, (60, 43.5))

@@ -258,6 +258,10 @@ def test_a_mistake_is_one_sentence(run, monkeypatch):
     ):
         with pytest.raises(SystemExit, match=f"jaxcloseup mesh: .*{sentence}"):
             run(**flags_)
+    with monkeypatch.context() as patch:
+        patch.setattr(surface, "seen_points", lambda *_: np.tile([1.0, 2, 3], (5, 1)))
+        with pytest.raises(SystemExit, match="all that views see is one point"):
+            run()
     monkeypatch.setattr(meshing, "find_detail", None)  # refused before that
     with pytest.raises(SystemExit, match=r"--texture=256 has no room for .* triangles"):
         run(texture=256, resolution=80)

@@ -11,9 +11,11 @@ The same command goes on where it was stopped; with another --at it adds a close
 import pathlib
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import time
+from typing import Any
 
 from absl import flags
 
@@ -27,8 +29,9 @@ from jaxcloseup.app.cli.topics import share
 
 FLAGS = flags.FLAGS
 _PLAIN = "images", "photographs", "photos", "pictures"  # names of folders that say nothing
+_SOURCE = "source.json"  # in the output folder: what its close-ups are of
 OPERANDS = 1  # what to look at
-share(TIME, CHECK, OUTPUT)
+share(TIME, CHECK, OUTPUT, ["data"])
 flags.DEFINE_multi_string(
     "at",
     [],
@@ -50,16 +53,23 @@ def main(arguments: list[str]) -> None:
     with in_one_sentence("closeup", ValueError, OSError):
         asked = [] if FLAGS.at == ["best"] else [_parse_place(text) for text in FLAGS.at]
         source, kind = arguments[1], _kind(arguments[1])
+        if FLAGS.data is not None and kind != "run":
+            raise ValueError(f"--data={FLAGS.data} is for a run whose capture was moved")
         folder = _folder(source, kind)
     when_stopped(lambda: _say_stopped(folder))
     with in_one_sentence("closeup", OSError):
         lock = lock_output_dir(folder)
     with lock:
         began = time.perf_counter()
+        with in_one_sentence("closeup", ValueError, OSError):
+            _check_source(source, kind, folder)
         run = _trained(source, kind, folder)
         _present(folder, run, asked, _name(source) if kind in ("photographs", "video") else None)
-        if FLAGS.mesh and not (folder / "mesh").exists():
-            _start("mesh", f"--run={run}", f"--output_dir={folder / 'mesh'}", "--texture=4096")
+        if FLAGS.mesh and not (folder / "mesh" / "mesh.json").exists():
+            shutil.rmtree(folder / "mesh", ignore_errors=True)  # of one that was cut off
+            given = [f"--data={FLAGS.data}"] if FLAGS.data is not None else []
+            given += [f"--output_dir={folder / 'mesh'}", "--texture=4096"]
+            _start("mesh", f"--run={run}", *given)
     minutes, seconds = divmod(round(time.perf_counter() - began), 60)
     print(f"took {minutes}:{seconds:02} minutes")
     print(f"open {folder / 'share' / 'index.html'} in a browser, or send the folder it lies in")
@@ -85,8 +95,50 @@ def _present(
         record = read_run(run)
         stage = choose_stage(record, None)
         looks = {"near": FLAGS.near, "single_file": FLAGS.single_file, "title": title}
-        paths = present(folder, record, stage, asked, **looks)
+        paths = present(folder, record, stage, asked, moved_to=FLAGS.data, **looks)
     print("\n".join(f"wrote {path}" for path in paths[:-1]))
+
+
+def _check_source(source: str, kind: str, folder: pathlib.Path) -> None:
+    """Refuse a folder with close-ups of another source; say if the source has other files now.
+
+    Raises:
+      ValueError: one sentence that names the flag.
+      OSError: the source cannot be read, or the folder not written.
+    """
+    from jaxcloseup.io.files import read_object, write_json
+
+    if kind == "run" and FLAGS.output_dir is None:
+        return
+    place = source if kind == "scene" else str(pathlib.Path(source).resolve())
+    known = {"source": place, "files": _files(pathlib.Path(source), kind, folder)}
+    kept = folder / _SOURCE
+    before = read_object(kept) if kept.exists() else known
+    moved = kind in ("photographs", "video") and before.get("files") == known["files"]
+    if before.get("source") != place and not moved:
+        raise ValueError(
+            f"{folder} holds close-ups of {before.get('source')}, not of {source}: name another "
+            "folder with --output_dir"
+        )
+    if before.get("files") != known["files"] and (folder / "run" / "results.json").exists():
+        print(
+            f"{source} has other files than those that {folder} was made of, which stays as it is: "
+            "to use them, name another folder with --output_dir"
+        )
+    if not kept.exists():
+        write_json(kept, known)
+
+
+def _files(source: pathlib.Path, kind: str, folder: pathlib.Path) -> list[list[Any]]:
+    """Return names and bytes of the photographs or the video; nothing of what has poses."""
+    from jaxcloseup.captures.photo_files import ENDINGS
+
+    found = [source] if kind == "video" else []
+    if kind == "photographs":
+        paths = (path for path in source.rglob("*") if path.suffix.lower() in ENDINGS)
+        made = folder.resolve()  # perhaps within the photographs
+        found = [path for path in paths if made not in path.resolve().parents]
+    return sorted([path.name, path.stat().st_size] for path in found)
 
 
 def _trained(source: str, kind: str, folder: pathlib.Path) -> pathlib.Path:
@@ -165,7 +217,9 @@ def _folder(source: str, kind: str) -> pathlib.Path:
 def _name(source: str) -> str:
     """Return what to call a path of photographs, a video or a capture."""
     path = pathlib.Path(source).resolve()
-    return path.parent.name if path.name.lower() in _PLAIN else path.stem
+    if path.name.lower() in _PLAIN:
+        return path.parent.name
+    return path.name if path.is_dir() else path.stem
 
 
 def _parse_place(text: str) -> tuple[str, tuple[float, float]]:

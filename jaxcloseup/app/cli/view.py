@@ -36,7 +36,7 @@ def main(_: list[str]) -> None:
         from jaxcloseup.photos.scene import SceneError
     set_up()
     try:
-        from jaxcloseup.app.view import server, visitor
+        from jaxcloseup.app.view import server, welcome
         from jaxcloseup.app.view.viewer import Viewer
     except ModuleNotFoundError as error:
         if error.name != "viser":
@@ -58,7 +58,7 @@ def main(_: list[str]) -> None:
             seed=record.identity["seed"],
             kept=detail_path(record.folder, stage),
         )
-        visitor.welcome_visitors(viser_server, viewer)
+        welcome.welcome_visitors(viser_server, viewer)
     print(f"open http://{FLAGS.host}:{FLAGS.port} in a browser; press Ctrl-C to stop", flush=True)
     while True:
         viewer.work()

@@ -14,6 +14,7 @@ from jaxcloseup.app.run.kept_detail import detailed
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.share.places import Place
 from jaxcloseup.app.view.camera_paths import CameraError, resized
+from jaxcloseup.app.view.photograph_pixels import file_pixel
 from jaxcloseup.app.view.picking import closeup_camera, surface_depth
 from jaxcloseup.artifacts.images import color_errors, to_uint8
 from jaxcloseup.detail.add import Detail
@@ -29,7 +30,7 @@ _DOUBT = 0.05  # least trust of what is compared, so that something is chosen
 class CloseUp(NamedTuple):
     """A finished close-up."""
 
-    name: str  # of its files: the photograph and the pixel
+    name: str  # of its files: the photograph, the pixel and how many times nearer
     camera: Camera
     point: np.ndarray  # `[3]` surface at the pixel, which is in the middle
     picture: np.ndarray  # uint8 `[H, W, 3]`
@@ -102,7 +103,8 @@ def _closeup(
 ) -> CloseUp:
     scene = programs.scene
     photograph, name = scene.own_camera("train", place.view), scene.names["train"][place.view]
-    x, y = int(place.x * photograph.width), int(place.y * photograph.height)
+    at = place.x * photograph.width, place.y * photograph.height
+    x, y = file_pixel(scene, place.view, at)
     try:
         camera, point = _look(programs, state, photograph, place, near)
     except CameraError:
@@ -116,7 +118,7 @@ def _closeup(
     said = f"{near:g} times nearer than {name}, at its pixel {x}, {y}"
     off = f"{np.mean(error[shown]):.3f}" if shown.any() else "unknown"
     return CloseUp(
-        f"{name}_{x}_{y}".replace("/", "_"),
+        f"{name}_{x}_{y}_{near:g}x".replace("/", "_"),
         camera,
         point,
         to_uint8(expose(programs, sharper.rgb, seen)),

@@ -17,7 +17,6 @@ from jaxcloseup.app.share.places import Place, best_places
 from jaxcloseup.app.share.scene_page import write_page
 from jaxcloseup.app.store.stored_run import RunError, StoredRun, load_run_scene, restore
 from jaxcloseup.app.view.camera_paths import (
-    check_pixel,
     dolly,
     find_view,
     named_cameras,
@@ -25,9 +24,10 @@ from jaxcloseup.app.view.camera_paths import (
     training_focus,
 )
 from jaxcloseup.app.view.orientation import up_direction
+from jaxcloseup.app.view.photograph_pixels import pinhole_pixel
 from jaxcloseup.artifacts.images import to_uint8
 from jaxcloseup.artifacts.spz import pack_spz
-from jaxcloseup.artifacts.video import write_video
+from jaxcloseup.artifacts.video import ENDINGS, write_video
 from jaxcloseup.detail.add import Detail
 from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.photos.scene import Scene
@@ -48,17 +48,19 @@ def present(
     near: float,
     single_file: bool,
     title: str | None = None,
+    moved_to: str | None = None,
 ) -> list[pathlib.Path]:
     """Make close-ups of a stored run, and a page of these and of earlier ones in the folder.
 
     Args:
-      folder: gets `closeups/`, `dolly.*` unless it has one, and `share/`.
+      folder: gets `closeups/`, a video `dolly` unless it has one, and `share/`.
       record: the run, of a field of splats.
       stage: whose state is shown.
       asked: names of photographs and pixels (x, y) at their own size; none: the best places.
       near: how many times nearer than the photograph.
       single_file: whether the page is one file.
       title: of the page; None: the scene's name.
+      moved_to: folder of the run's capture, if that was moved.
 
     Returns:
       The pictures of the new close-ups, the dolly if it is new, and the page.
@@ -73,7 +75,7 @@ def present(
             f"{record.folder} was trained with --method={record.preset.method}, which has no "
             "splats for a page: make its close-ups with the program render"
         )
-    scene = load_run_scene(record)
+    scene = load_run_scene(record, moved_to)
     places = [_place(scene, *one) for one in asked]
     programs, state = restore(record, scene, stage)
     detail, _ = detail_getter(programs, state, detail_path(record.folder, stage))()
@@ -85,7 +87,8 @@ def present(
     for closeup in made:
         keep_closeup(folder / "closeups", closeup)
     paths = [folder / "closeups" / f"{closeup.name}.png" for closeup in made]
-    if places and not list(folder.glob("dolly.*")):
+    # A run's own report has one too, as dolly.webp.
+    if places and not any((folder / f"dolly{ending}").exists() for ending in ENDINGS):
         frames = _dolly(programs, state, detail, made[0], near)
         paths.append(write_video(folder / "dolly", frames, fps=_FPS))
     with progress.saying("writing the page"):
@@ -96,8 +99,8 @@ def present(
 def _place(scene: Scene, name: str, pixel: tuple[float, float]) -> Place:
     view = find_view(scene, name, flag="at")
     camera = scene.own_camera("train", view)
-    check_pixel(camera, pixel, given=f"--at={name}:")
-    return Place(view, pixel[0] / camera.width, pixel[1] / camera.height)
+    x, y = pinhole_pixel(scene, view, pixel, given=f"--at={name}:")
+    return Place(view, x / camera.width, y / camera.height)
 
 
 def _write_page(

@@ -68,7 +68,7 @@ def read_run(folder: pathlib.Path) -> StoredRun:
         raise RunError(f"--run={folder} is not a folder: name the folder of a run")
     about, identity = (_read_json(folder, name) for name in _FIELDS)
     if "scene" not in about or "config" not in identity:
-        raise RunError(f"--run={folder} is of a sweep or unknown: name the folder of a run")
+        raise RunError(f"{folder} is of a sweep or unknown: name the folder of a run")
     for fields, (name, kinds) in zip((about, identity), _FIELDS.items(), strict=True):
         _check_fields(folder / name, fields, kinds)
     if len(identity["resolution"]) != 2:
@@ -81,7 +81,7 @@ def read_run(folder: pathlib.Path) -> StoredRun:
         preset, absent = preset_from_config(identity["config"])
     except ValueError as error:
         raise RunError(
-            f"--run={folder} was trained by version {version}, whose configuration this version "
+            f"{folder} was trained by version {version}, whose configuration this version "
             f"cannot read ({error}): render it with version {version}, or restore "
             "checkpoints/run.json from a copy of the run"
         ) from None
@@ -95,7 +95,7 @@ def read_run(folder: pathlib.Path) -> StoredRun:
         if path.is_dir() and any(step.name.isdecimal() for step in path.iterdir())
     )
     if not stages:
-        raise RunError(f"--run={folder} has no checkpoint yet: resume its training with --resume")
+        raise RunError(f"{folder} has no checkpoint yet: resume its training with --resume")
     return StoredRun(folder, about, identity, preset, preset, stages)
 
 
@@ -134,20 +134,20 @@ def load_run_scene(run: StoredRun, moved_to: str | None = None) -> Scene:
     name = about["scene"] if moved_to is None else moved_to
     if "placement" not in about and name not in DRAWN_SCENES:
         raise RunError(
-            f"--run={run.folder} was trained in the coordinates of its capture's files, which this "
+            f"{run.folder} was trained in the coordinates of its capture's files, which this "
             "version moves and scales: render it with the version that trained it, or train again"
         )
     try:
         scene = load_scene(name, **about["load_options"])
     except TypeError as error:
         raise RunError(
-            f"--run={run.folder} was loaded with options that this version lacks ({error}): "
+            f"{run.folder} was loaded with options that this version lacks ({error}): "
             "render it with the version that trained it"
         ) from None
     size = [scene.train.cameras.width, scene.train.cameras.height]
     if size != run.identity["resolution"]:
         raise RunError(
-            f"--run={run.folder} was trained with photographs of "
+            f"{run.folder} was trained with photographs of "
             f"{' x '.join(map(str, run.identity['resolution']))} pixels, and {name} has "
             f"{size[0]} x {size[1]}: name its own capture with --data"
         )
@@ -159,7 +159,7 @@ def load_run_scene(run: StoredRun, moved_to: str | None = None) -> Scene:
     try:
         poses = read_poses(run.folder, scene.names["train"])
     except (OSError, ValueError) as error:
-        raise RunError(f"--run={run.folder}: {error}") from None
+        raise RunError(f"{run.folder}: {error}") from None
     return scene if poses is None else move_photographs(scene, poses)
 
 
@@ -174,14 +174,14 @@ def restore(run: StoredRun, scene: Scene, stage: str) -> tuple[Programs, TrainSt
     try:
         programs.read.keep_exposures(read_exposures(run.folder, scene.names["train"]))
     except (OSError, ValueError) as error:
-        raise RunError(f"--run={run.folder}: {error}") from None
+        raise RunError(f"{run.folder}: {error}") from None
     try:
         shapes = state_shapes(programs)
     except TrainingError as error:
-        raise RunError(f"--run={run.folder}: {error}") from None
+        raise RunError(f"{run.folder}: {error}") from None
     if run.preset != run.trained and shapes != state_shapes(Programs(run.trained, scene)):
         raise RunError(
-            f"--set changes the shape of what was trained: --run={run.folder} was trained with "
+            f"--set changes the shape of what was trained: {run.folder} was trained with "
             "other shapes, so train anew with these settings, or leave them out"
         )
     like = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
@@ -224,5 +224,5 @@ def _check_fields(path: pathlib.Path, fields: Mapping[str, Any], kinds: Mapping[
 
 def _read_json(folder: pathlib.Path, name: str) -> dict[str, Any]:
     if not (folder / name).exists():
-        raise RunError(f"--run={folder} has no {name}: name the folder of a run")
+        raise RunError(f"{folder} has no {name}: name the folder of a run")
     return read_fields(folder / name, {})

@@ -140,12 +140,8 @@ def find_view(scene: Scene, name: str, *, flag: str = "from") -> int:
     raise CameraError(f"--{flag}={name} is no training view of {scene.name}: choose one of {some}")
 
 
-def check_pixel(
-    camera: Camera, pixel: tuple[float, float], *, given: str = "--pixel="
-) -> tuple[int, int]:
-    """Return the row and column of a pixel (x, y) of a camera.
-
-    `given` is how it was given, up to its numbers.
+def check_pixel(camera: Camera, pixel: tuple[float, float], *, given: str = "--pixel=") -> None:
+    """Refuse a pixel (x, y) outside a camera's image; `given` is how it was given, up to that.
 
     Raises:
       CameraError: the pixel is outside the image.
@@ -156,7 +152,6 @@ def check_pixel(
             f"{given}{x:g},{y:g} is outside the view: choose a pixel within the "
             f"{camera.width} x {camera.height} pixels of the photograph"
         )
-    return int(y), int(x)
 
 
 def dolly(

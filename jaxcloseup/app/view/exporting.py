@@ -63,7 +63,7 @@ def export_splats(
     programs, state = restore(record, scene, stage)
     if programs.method.splats is None:
         raise RunError(
-            f"--run={record.folder} was trained with --method={record.preset.method}, which has no "
+            f"{record.folder} was trained with --method={record.preset.method}, which has no "
             "splats: choose --files=cameras"
         )
     surfels, alive = programs.method.splats(state.params, state.buffers)

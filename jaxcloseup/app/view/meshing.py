@@ -66,8 +66,6 @@ def write_run_mesh(
     maps = surface.see_training_views(scene, see, finer=finer, support=min_views)
     region = _seen_region(maps, min_views) if region is None else scene.placement.to_scene(region)
     side = scene.placement.scale * voxel if voxel else np.ptp(region, axis=0).max() / resolution
-    if not side > 0:
-        raise MeshError("all that views see is one point: choose a smaller --min_views")
     mesh = _fuse(maps, surface.make_grid(region, side), scene.placement.scale)
     if texture is not None and stage is not None:
         atlas = lay_out(mesh, texture)  # before minutes of detail, because it may not fit
@@ -96,7 +94,10 @@ def _seen_region(maps: surface.Maps, min_views: int) -> np.ndarray:
             f"no pixel shows a surface that {min_views} training views see: choose a smaller "
             "--min_views"
         )
-    return surface.box_around(points)
+    box = surface.box_around(points)
+    if not np.ptp(box, axis=0).max() > 0:
+        raise MeshError("all that views see is one point: choose a smaller --min_views")
+    return box
 
 
 def _in_capture(voxel: float, region: np.ndarray, placement: Placement) -> dict[str, Any]:

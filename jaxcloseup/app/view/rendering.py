@@ -17,8 +17,9 @@ from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.labels import start_labels
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.store.stored_run import StoredRun, restore
-from jaxcloseup.app.view.camera_paths import CameraError, Shots, check_pixel, dolly, find_view
+from jaxcloseup.app.view.camera_paths import CameraError, Shots, dolly, find_view
 from jaxcloseup.app.view.frames import render_shots
+from jaxcloseup.app.view.photograph_pixels import pinhole_pixel
 from jaxcloseup.app.view.picking import surface_depth
 from jaxcloseup.artifacts.video import write_video
 from jaxcloseup.photos.scene import Scene
@@ -51,8 +52,9 @@ def dolly_towards(
       CameraError: there is no such view or pixel, frames are too large, and, from the function, the
         state shows no surface at the pixel.
     """
-    camera = scene.own_camera("train", find_view(scene, view))
-    check_pixel(camera, pixel)
+    index = find_view(scene, view)
+    camera, asked = scene.own_camera("train", index), pixel
+    pixel = pinhole_pixel(scene, index, pixel)
     # Refuses what is too large.
     resize(Shots(jax.tree.map(lambda leaf: leaf[None], camera), [view]))
 
@@ -60,7 +62,7 @@ def dolly_towards(
         render = functools.partial(programs.render, state)
         depth = surface_depth(render, camera, pixel, far=scene.far)
         if depth <= 0:
-            x, y = pixel
+            x, y = asked
             raise CameraError(
                 f"--pixel={x:g},{y:g}: the stage renders no surface at this pixel of {view}: "
                 "choose another pixel"

@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from viser.transforms import SO3
 
+from jaxcloseup.app.view.camera_paths import CameraError
 from jaxcloseup.app.view.drawn_scene import add_frustum, add_scene, quaternion, same
+from jaxcloseup.app.view.photograph_pixels import pinhole_pixel
 from jaxcloseup.app.view.picking import closeup_camera, vertical_fov, viewer_camera, window_size
-from jaxcloseup.app.view.server import Server
 from jaxcloseup.app.view.viewer import PICTURE, SHOWN, Prepared, Viewer
 from jaxcloseup.artifacts.images import encode_png
 from jaxcloseup.geometry.cameras import Camera, pixels_to_points
@@ -23,28 +24,6 @@ When you rest, the window shows the scene as the run renders it, with detail."""
 _REST = 0.3  # seconds without a move before the window is rendered
 _SAME = 1e-4  # of the distance from the scene, up to which positions are one
 _TINT = 0.7  # share of the colors of support, if these are shown
-
-
-def welcome_visitors(server: Server, viewer: Viewer) -> "dict[int, Visitor]":
-    """Fill the page of each client that connects to a server; return the present visitors.
-
-    Args:
-      server: Viser's server.
-      viewer: the run that all of them see.
-    """
-    visitors: dict[int, Visitor] = {}
-
-    def welcome(client: Any) -> None:
-        visitors[client.client_id] = Visitor(viewer, client)
-
-    def forget(client: Any) -> None:
-        visitor = visitors.pop(client.client_id, None)
-        if visitor is not None:
-            visitor.leave()
-
-    server.on_client_connect(welcome)
-    server.on_client_disconnect(forget)
-    return visitors
 
 
 class Visitor:
@@ -60,7 +39,7 @@ class Visitor:
         self._size = (0, 0)  # of the rendered window
         self._visited = -np.inf  # time of the last visit to a camera, seconds
         self._rest: threading.Timer | None = None
-        self._drawing = threading.Lock()
+        self._drawing, self._showing = threading.Lock(), threading.Lock()
         self._gone = False
         self._drawn = add_scene(client.scene, viewer)
         self._cameras = client.scene.add_frame("/cameras", show_axes=False)
@@ -113,13 +92,18 @@ class Visitor:
             )
 
     def _hide_render(self) -> None:
-        if self._rendered is None:
-            return
-        self._rendered = self._prepared = None
+        with self._showing:
+            if self._rendered is None:
+                return
+            self._rendered = self._prepared = None
+            self._set_window(self._viewer.background(), drawn=True)
+
+    def _set_window(self, picture: np.ndarray | None, *, drawn: bool, **how: Any) -> None:
+        """Show a picture behind the drawn scene, or in its place."""
         with self._client.atomic():
-            self._client.scene.set_background_image(self._viewer.background())
+            self._client.scene.set_background_image(picture, **how)
             if self._drawn is not None:
-                self._drawn.visible = True
+                self._drawn.visible = drawn
 
     def _render_window(self, *, tuned: bool = False) -> str:
         """Render what the window shows, and show it until the camera moves."""
@@ -134,11 +118,9 @@ class Visitor:
         picture, legend = self._viewer.look(
             prepared, camera, detail=self._sharpen.value, shown=self._shown.value
         )
-        self._prepared, self._rendered = prepared, camera
-        with self._client.atomic():
-            self._client.scene.set_background_image(picture, format="jpeg", jpeg_quality=95)
-            if self._drawn is not None:
-                self._drawn.visible = False
+        with self._showing:  # a move meanwhile hides this picture, not what was there before
+            self._prepared, self._rendered = prepared, camera
+            self._set_window(picture, drawn=False, format="jpeg", jpeg_quality=95)
         self._legend.visible = legend is not None
         if legend is not None:
             self._legend.image = legend
@@ -219,13 +201,15 @@ class Visitor:
 
     def _on_pixel(self, _: Any) -> None:
         scene = self._viewer.scene
-        camera = scene.own_camera("train", scene.names["train"].index(self._photograph.value))
-        pixel = jnp.asarray(self._pixel.value, jnp.float32)
-        if not (0 <= pixel[0] < camera.width and 0 <= pixel[1] < camera.height):
-            self._say(f"The photograph has {camera.width} x {camera.height} pixels: choose one.")
+        view = scene.names["train"].index(self._photograph.value)
+        try:
+            pixel = pinhole_pixel(scene, view, self._pixel.value, given="")
+        except CameraError as error:
+            self._say(f"The pixel {error}.")
             return
+        camera, at = scene.own_camera("train", view), jnp.asarray(pixel, jnp.float32)
         start = np.asarray(camera.position)
-        ray = start, np.asarray(pixels_to_points(camera, pixel, jnp.float32(1))) - start
+        ray = start, np.asarray(pixels_to_points(camera, at, jnp.float32(1))) - start
         self._viewer.later("finding that surface", lambda: self._aim_at(*ray), self._say)
 
     def _on_back(self, _: Any) -> None:

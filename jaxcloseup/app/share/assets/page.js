@@ -99,7 +99,12 @@
     const closeup = closeups[shown];
     element("picture").src = error ? closeup.error : closeup.picture;
     element("picture").alt = closeup.name;
-    element("full").href = element("picture").src;
+    const full = element("full");
+    full.href = element("picture").src;
+    if (full.href.startsWith("data:")) { // browsers open no such address, but they save it
+      full.download = `${closeup.name}${error ? "_error" : ""}.webp`;
+      full.textContent = "Save the picture";
+    }
     element("error").setAttribute("aria-pressed", String(error));
     element("legend").hidden = !error;
     say(error ? closeup.said_of_error : closeup.said);
@@ -117,6 +122,7 @@
     if (document.body.dataset.state !== "shown") return;
     shown = -1;
     mark();
+    element("legend").hidden = true;
     state("free");
     say(DATA.said);
   }
@@ -160,6 +166,7 @@
   }
 
   function resize() {
+    if (view === null) return;
     view.renderer.setSize(innerWidth, innerHeight, false);
     view.camera.aspect = innerWidth / innerHeight;
     view.camera.fov = fieldOfView(shown < 0 ? overview : closeups[shown]);
@@ -194,6 +201,7 @@
   } catch (error) {
     console.error(error);
     view = null;
+    element("pins").replaceChildren(); // they would lie anywhere
     state("free");
     say("This browser cannot draw the scene (it needs WebGL 2); its close-ups are below.");
   }
