@@ -122,7 +122,9 @@ def add_detail(
     sharper = _add(detail.weights, detail.finer, detail.confirmed, gathered, rgb, alpha, depth)
     seen = gathered[0].weight > 0
     del gathered  # 70 bytes for each pixel
-    filled = _fill(camera, pixels, sharper.rgb, alpha, seen, detail.sources)
+    level = detail.shown.sizes.index(detail.sources.trust.shape[1:])
+    sizes = detail.shown.extents[:, level]
+    filled = _fill(camera, pixels, sharper.rgb, alpha, seen, detail.sources, sizes)
     return sharper._replace(rgb=filled)
 
 
@@ -220,9 +222,11 @@ def _fill(
     alpha: jax.Array,
     seen: jax.Array,
     sources: GatherSources,
+    sizes: jax.Array,
 ) -> jax.Array:
     def fill() -> jax.Array:
-        filled = fill_holes(rgb, alpha, seen, find_empty(camera, pixels, sources, ~seen))
+        empty = find_empty(camera, pixels, sources, ~seen, sizes=sizes)
+        filled = fill_holes(rgb, alpha, seen, empty)
         return rgb + _FILLED * (filled - rgb)
 
     # Most views have no holes.

@@ -28,7 +28,12 @@ _ACROSS = 20  # width in pixels of the small image whose enlargement blurs the r
 
 
 def find_empty(
-    camera: Camera, pixels: jax.Array, sources: GatherSources, wanted: jax.Array | None = None
+    camera: Camera,
+    pixels: jax.Array,
+    sources: GatherSources,
+    wanted: jax.Array | None = None,
+    *,
+    sizes: jax.Array | None = None,
 ) -> jax.Array:
     """Return how surely rays pass a place behind which photographs see nothing, `[H, W]` in [0, 1].
 
@@ -40,7 +45,11 @@ def find_empty(
       pixels: `[H, W, 2]` its pixel centers, neighbors in the image.
       sources: depth maps of the photographs; an inverse depth of 0 means that nothing was seen.
       wanted: `[H, W]` bool, where the answer is needed; elsewhere it may be 0. None is everywhere.
+      sizes: `[V, 2]` height and width of each depth map without its padding; None is without any.
     """
+    count, *size = sources.inverse_depth.shape
+    sizes = jnp.tile(jnp.array(size), (count, 1)) if sizes is None else sizes
+    sizes = sizes.astype(pixels.dtype)
     (height, width), step = pixels.shape[:2], max(1, round(pixels.shape[1] / _RAYS))
     middles = [
         np.minimum(np.arange(step // 2, size + step // 2, step), size - 1)
@@ -63,7 +72,7 @@ def find_empty(
         pixels, wanted = band
         return jax.lax.cond(
             jnp.any(wanted),
-            lambda: _pass_emptiness(camera, pixels, sources),
+            lambda: _pass_emptiness(camera, pixels, sources, sizes),
             lambda: jnp.zeros(wanted.shape, jnp.float32),
         )
 
@@ -75,17 +84,20 @@ def find_empty(
     return large[:height, :width]
 
 
-def _pass_emptiness(camera: Camera, pixels: jax.Array, sources: GatherSources) -> jax.Array:
+def _pass_emptiness(
+    camera: Camera, pixels: jax.Array, sources: GatherSources, sizes: jax.Array
+) -> jax.Array:
     """Return how surely rays of pixels `[N, 2]` pass an empty place, `[N]` in [0, 1]."""
     known = sources.inverse_depth > 0
     log_depth = -jnp.log2(jnp.where(known, sources.inverse_depth, 1))
     typical = safe_divide(jnp.sum(log_depth), jnp.sum(known, dtype=log_depth.dtype))
     depths = 2 ** (typical + jnp.linspace(-_REACH, _REACH, _DEPTHS))[None, :, None]
     _, directions = pixels_to_rays(camera, pixels)
-    height, width = known.shape[1:]
 
-    def add(through: jax.Array, photograph: tuple[Camera, jax.Array]) -> tuple[jax.Array, None]:
-        view, known = photograph
+    def add(
+        through: jax.Array, photograph: tuple[Camera, jax.Array, jax.Array]
+    ) -> tuple[jax.Array, None]:
+        view, known, size = photograph
         # Places on a ray are linear in depth, in any camera.
         start = matmul(camera.position - view.position, view.rotation)
         x, y, z = start[:, None, None] + depths * matmul(directions, view.rotation).T[:, None, :]
@@ -93,13 +105,13 @@ def _pass_emptiness(camera: Camera, pixels: jax.Array, sources: GatherSources) -
         in_front = z > jnp.finfo(z.dtype).eps
         z = jnp.where(in_front, z, 1)
         landed = jnp.stack([fx * x / z + cx, fy * y / z + cy], axis=-1)
-        inside = in_bounds(landed, height, width)
+        inside = in_bounds(landed, *size)
         column, row = jnp.moveaxis(jnp.where(inside[..., None], landed, 0).astype(jnp.int32), -1, 0)
         sees_nothing = in_front & inside & ~known[row, column]
         return through + sees_nothing.astype(jnp.int32), None
 
     none = jnp.zeros((_DEPTHS, len(pixels)), jnp.int32)
-    through, _ = jax.lax.scan(add, none, (sources.cameras, known))
+    through, _ = jax.lax.scan(add, none, (sources.cameras, known, sizes))
     most = jnp.max(through, axis=0).astype(jnp.float32)
     return jnp.minimum(most / _PHOTOGRAPHS, 1)
 

@@ -132,8 +132,8 @@ def render_residuals(
         residual[:] = found
         depths.append(depth)
     shown = Pyramid(jax.device_put(values), pyramid.intrinsics[rows], jnp.asarray(extents))
-    own = pyramid.cameras(jax.tree.map(lambda leaf: leaf[rows], cameras), depth_level)
-    return Residuals(shown, own, jnp.asarray(pad_images(depths, *pyramid.sizes[depth_level])))
+    own = shown.cameras(jax.tree.map(lambda leaf: leaf[rows], cameras), depth_level)
+    return Residuals(shown, own, jnp.asarray(pad_images(depths, *shown.sizes[depth_level])))
 
 
 def reproduced(shown: Pyramid, *, blur: Callable[[Any, float], Any] = blur_images) -> jax.Array:
@@ -146,11 +146,23 @@ def reproduced(shown: Pyramid, *, blur: Callable[[Any, float], Any] = blur_image
       shown: residuals of V photographs.
       blur: `(images[V, H, W], deviation) -> [V, H, W]`, a Gaussian blur.
     """
-    last, errors = len(shown.sizes) - 1, []
+    last, errors, counted = len(shown.sizes) - 1, [], []
+
+    def blurred(image: np.ndarray) -> np.ndarray:
+        return np.asarray(blur(image[None], _BLUR))[0]
+
     for view in range(len(shown)):
-        residual = np.asarray(shown.image(view, last)[..., :3], np.float32)
-        errors.append(np.asarray(blur(np.abs(residual).mean(-1)[None], _BLUR))[0])
-    typical = max(float(np.median(np.concatenate([error.ravel() for error in errors]))), 1e-6)
+        values = np.asarray(shown.image(view, last), np.float32)
+        error = blurred(np.abs(values[..., :3]).mean(-1))
+        counts = np.any(values, axis=-1)  # masked pixels are 0, which no others are but by chance
+        if not counts.all():
+            error = np.where(
+                counts, error / np.maximum(blurred(counts.astype(np.float32)), 1e-6), 0
+            )
+        errors.append(error)
+        counted.append(error[counts])
+    known = np.concatenate(counted)
+    typical = max(float(np.median(known)) if len(known) else 0.0, 1e-6)
     trust = [1 / (1 + (error / (MISFIT * typical)) ** 4) ** 2 for error in errors]
     return jnp.asarray(pad_images(trust, *shown.sizes[last]))
 
@@ -167,7 +179,8 @@ def _match(photograph: jax.Array, rgb: jax.Array, alpha: jax.Array) -> tuple[jax
     # Pixels that the model misses or invents do not inform about exposure.
     error = jnp.mean(jnp.abs(values[..., :3] - rgb), axis=-1)
     # A sixteenth of them says it as well, and XLA sorts slowly.
-    typical = jnp.maximum(jnp.median(error[::4, ::4]), 1e-3)
+    known = jnp.where(values[..., 3] > 0, error, jnp.nan)
+    typical = jnp.maximum(jnp.nan_to_num(jnp.nanmedian(known[::4, ::4])), 1e-3)
     weight = values[..., 3] * alpha**2 / (1 + (error / (2 * typical)) ** 2) ** 2
     matrix, offset = fit_colors(rgb, values[..., :3], weight, ridge=COLOR_RIDGE)
     inverse = jnp.linalg.inv(matrix)

@@ -33,6 +33,7 @@ from jaxcloseup.photos.views import Views, camera_at, to_float
 _RANKING_PIXELS = 256  # at least so many virtual pixels, and fewer than twice, rank photographs
 _RANKING_TOLERANCE = 0.05  # largest relative depth error of a pixel that a photograph sees
 SOURCE_TOLERANCE = 0.05
+_WHOLE = 0.999  # share of a color that may be read, from which it is not mixed with others
 _ROUNDING = 1e-6  # of a cosine in float32
 
 
@@ -193,7 +194,7 @@ def label_pixels(
 
     def add_source(rank: jax.Array, sums: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         color, weight = _read_source(camera, points, ranked[rank], sources, settings)
-        weight = jnp.where(defined, weight, 0)
+        weight = jnp.where(defined, weight, 0).astype(points.dtype)
         known = (weight > 0).astype(color.dtype)
         new = known[..., None] * color, weight, known
         return jax.tree.map(jnp.add, sums, new)
@@ -234,6 +235,9 @@ def _read_source(
     near_enough = _cosine_between(camera, source, points) >= _least_cosine(settings)
     known = (seen.weight > 0) & near_enough
     color = backward_warp(to_float(views.rgb[index]), seen.pixels)
+    # Colors between pixels must not mix with those that a mask or padding leaves out.
+    counts = (views.weight[index] > 0).astype(color.dtype)[..., None]
+    known &= backward_warp(counts, seen.pixels)[..., 0] > _WHOLE
     return jnp.where(known[..., None], color, 0), jnp.where(known, seen.weight, 0)
 
 

@@ -39,6 +39,7 @@ def estimate_motion(
     chex.assert_equal_shape([photograph, shown])
     chex.assert_equal_shape([depth, weight])
     seen, gray = photograph.mean(-1), shown.mean(-1)
+    weight = weight.astype(gray.dtype)
     down, across = jnp.gradient(gray)
     moved = _flow(camera, depth)
     moved = -(across[None] * moved[..., 0] + down[None] * moved[..., 1])

@@ -28,6 +28,7 @@ from jaxcloseup.photos.views import Views, to_float
 
 
 USABLE = 0.03, 0.97  # colors beyond are noise, or clipped
+_WHOLE = 0.999  # share of a color that may be read, from which it is not mixed with others
 _LEAST = 0.05  # residual of log light below which all count alike
 _ROUNDS = 10  # of reweighting
 _HELD = 1.0  # weight of what is expected in each gain, in points
@@ -118,8 +119,9 @@ def look_at_points(
     """
     pixels, expected = points_to_pixels(camera, points)
     observed = backward_warp(jnp.stack([depth, weight], -1), pixels, order=0)
-    colors = backward_warp(rgb, pixels)
-    seen = in_bounds(pixels, *depth.shape) & (observed[:, 1] > 0)
+    counts = (weight > 0).astype(rgb.dtype)[..., None]
+    colors, counts = jnp.split(backward_warp(jnp.concatenate([rgb, counts], -1), pixels), [3], -1)
+    seen = (counts[:, 0] > _WHOLE) & in_bounds(pixels, *depth.shape) & (observed[:, 1] > 0)
     seen &= depth_consistent(observed[:, 0], expected, tolerance)
     seen &= (jnp.min(colors, -1) > USABLE[0]) & (jnp.max(colors, -1) < USABLE[1])
     return jnp.where(seen[:, None], jnp.log(to_light(jnp.maximum(colors, USABLE[0]))), jnp.nan)
@@ -199,6 +201,8 @@ def fit_metering(
 def _fit(content: np.ndarray, log_gains: np.ndarray) -> _Fit:
     """Return slopes and their error for gains `[V, 3]` and metered content `[V, 3]`."""
     slopes, total = [], 0.0
+    if len(content) < 2:
+        return _Fit([0.0, 0.0], 0.0)  # nothing to compare with
     for x, y in zip(_parts(content), _parts(log_gains), strict=True):
         x, y = x - x.mean(axis=0), y - y.mean(axis=0)
         squares, count = (x**2).sum(), len(x)

@@ -103,7 +103,7 @@ def fuse(
     """
     chex.assert_shape(points, (None, 3))
     count = len(points)
-    chunk = min(_BLOCK**3, count)
+    chunk = max(1, min(_BLOCK**3, count))
     padded = jnp.pad(points, ((0, -count % chunk), (0, 0)), mode="edge").reshape(-1, chunk, 3)
     found = jax.lax.map(lambda some: _fuse_block(some, maps, truncation, values), padded)
     return jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:])[:count], found)

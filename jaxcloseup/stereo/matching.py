@@ -36,8 +36,9 @@ class Photographs(NamedTuple):
 
 
 def pack_photographs(cameras: Camera, gray: jax.Array, weight: jax.Array) -> Photographs:
-    """Round grays `[V, H, W]` in [0, 255] to bytes and pack four neighbors into one number."""
-    padded = jnp.pad(jnp.round(gray).astype(jnp.uint32), ((0, 0), (0, 1), (0, 1)), mode="edge")
+    """Round and clip grays `[V, H, W]` to bytes, and pack four neighbors into one number."""
+    rounded = jnp.clip(jnp.round(gray), 0, 255).astype(jnp.uint32)
+    padded = jnp.pad(rounded, ((0, 0), (0, 1), (0, 1)), mode="edge")
     _, height, width = gray.shape
     corners = [padded[:, y : y + height, x : x + width] for y in (0, 1) for x in (0, 1)]
     shifted = [corner << jnp.uint32(8 * i) for i, corner in enumerate(corners)]

@@ -123,7 +123,7 @@ def test_help_shows_each_shared_flag_under_one_topic():
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("run --seed=-1", "--seed=-1 must be a whole number between 0 and 9223372036854775807"),
+        ("run --seed=-1", "--seed=-1 must be a whole number between 0 and 4294967295"),
         ("run --zoom=1", "--zoom=1 must be a whole number of at least 2"),
         ("run --resume=si", "--resume=si must be true or false"),
         (

@@ -1,14 +1,18 @@
 """Where a stage reports and saves, with steps that only count."""
 
+import pathlib
 from types import SimpleNamespace
 
 import pytest
 
 from jaxcloseup.app.run.loop import Paused, Training, train_stage
+from jaxcloseup.artifacts.checkpoints import CheckpointError
 
 
 class Kept:
     """Checkpoints in memory."""
+
+    folder = pathlib.Path("checkpoints")
 
     def __init__(self):
         self.saved = []
@@ -43,6 +47,22 @@ def test_a_resumed_stage_reports_at_the_same_steps():
     train(kept, 1000, 40)
     del kept.saved[3:]
     assert train(kept, 1000, 40) == whole
+
+
+def test_a_stage_is_not_resumed_from_another_start():
+    """Stages that were asked for anew may come before it."""
+    programs = SimpleNamespace(
+        run=lambda state, data, *, count: (state + count, {"skipped": 0}),
+        growth=1,
+        make_room=lambda growth: None,
+    )
+    kept = Kept()
+    training = Training(programs, kept)
+    stage = {"steps": 5, "begins_at": "control"}
+    assert train_stage(training, "test_time", 0, None, **stage) == 5
+    assert train_stage(training, "test_time", 9, None, **stage) == 5
+    with pytest.raises(CheckpointError, match="test_time began at control, and would begin at clo"):
+        train_stage(training, "test_time", 9, None, steps=5, begins_at="closeup")
 
 
 def test_a_paused_stage_keeps_its_state_and_goes_on():

@@ -104,8 +104,11 @@ def test_the_smoothing_filter_is_that_of_the_finest_photographs(capture_folder, 
 def test_refinement_and_exports_keep_the_shapes_that_the_filter_made(capture_folder, tmp_path):
     """Splats of a coarse model have its filter in their scales, and beside them the finer one."""
     scene = load_scene(str(capture_folder), downscale=2)
-    config = dataclasses.replace(TINY_MIP.field, smoothed_at=1, capacity=420)
-    coarse = dataclasses.replace(config, smoothed_at=2, capacity=100)
+    config = dataclasses.replace(TINY_MIP.field, smoothed_at=1, capacity=420, sh_degree=2)
+    config = dataclasses.replace(config, depth="expected")
+    # The coarse model may have other harmonics, and another depth.
+    degrees = {"sh_degree": 1, "depth": "median"}
+    coarse = dataclasses.replace(config, smoothed_at=2, capacity=100, **degrees)
     points = np.random.default_rng(0).uniform([-1, -1, -0.1], [1, 1, 0.1], (100, 3))
     points = jnp.asarray(scene.placement.to_scene(points), jnp.float32)
     params, buffers = make_field(coarse, scene, 1).init(jax.random.key(0), points, points)
@@ -125,7 +128,9 @@ def test_refinement_and_exports_keep_the_shapes_that_the_filter_made(capture_fol
     before, after = variances
     np.testing.assert_allclose(after[:100], before + added, rtol=1e-4)
     np.testing.assert_allclose(kept.interval[:100], buffers.interval / 2, rtol=1e-5)
-    assert kept.alive.all() and finer.log_scales.shape == (420, 3)
+    assert kept.alive.all() and finer.log_scales.shape == (420, 3) and kept.expected == 1
+    np.testing.assert_array_equal(finer.sh[:100, :4], params.sh)
+    assert finer.sh.shape == (420, 9, 3) and not finer.sh[:100, 4:].any()
     write_surfels(tmp_path / "finer.ply", *METHODS["mip_gaussians"].splats(finer, kept))
     found = read_surfels(tmp_path / "finer.ply", num_scales=3)
     expected = smoothed(finer, kept.interval)

@@ -40,6 +40,13 @@ def test_steps_and_schedules_follow_from_the_time_of_a_step(monkeypatch, wanted)
     assert fitted.field.means_lr_steps == pytest.approx(0.9 * fitted.baseline_steps, abs=10)
     assert fitted.field.capacity == pytest.approx(20_000 * (wanted / 5) ** 0.5, abs=500)
     assert with_settings(preset, given) == fitted
+    # What the user has set stays.
+    fixed = {"capacity", "means_lr_steps"}
+    fitted, given, _ = minutes.fit_minutes(preset, None, wanted, fixed=fixed)
+    assert given == [f"baseline_steps={fitted.baseline_steps}"]
+    assert (fitted.field.capacity, fitted.field.means_lr_steps) == (20_000, 90)
+    with pytest.raises(ValueError, match="--minutes chooses baseline_steps"):
+        minutes.fit_minutes(preset, None, wanted, fixed={"baseline_steps"})
 
 
 def test_steps_are_timed_on_the_scene(capture_folder, monkeypatch):

@@ -161,6 +161,9 @@ def test_a_tuned_state_has_the_detail_of_photographs_that_see_the_view(rendered,
     assert len(left) == 4
     kept = np.split(np.asarray(detail.shown.values), 5)
     np.testing.assert_array_equal(others.shown.values, np.concatenate([kept[i] for i in left]))
+    without = detailed(programs, others, view, programs.render(state, view))
+    ignored = detailed(programs, blind, view, programs.render(state, view))
+    assert np.abs(np.asarray(without.rgb - ignored.rgb)).mean() < 0.01
 
     # A state that blurs more has its own residuals: with those of the first it stays further away.
     wide = state.params.replace(log_scales=state.params.log_scales + 0.4)

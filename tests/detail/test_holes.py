@@ -44,6 +44,16 @@ def test_a_ray_is_empty_where_two_photographs_look_through_a_gap():
     assert not find_empty(camera(), pixels, photographs(3, np.full((HEIGHT, WIDTH), 2.0))).any()
 
 
+def test_padding_is_no_emptiness():
+    """Photographs of other sizes are padded; what they would have shown there is not known."""
+    depth = np.full((HEIGHT, WIDTH), 2.0)
+    depth[:, 12:] = 0
+    pixels, maps = pixel_grid(HEIGHT, WIDTH), photographs(3, depth)
+    assert find_empty(camera(), pixels, maps).any()
+    sizes = jnp.array([[HEIGHT, 12]] * 3)
+    assert not find_empty(camera(), pixels, maps, sizes=sizes).any()
+
+
 def test_a_ray_is_empty_in_a_moved_camera_too():
     # Photographs look through x / z in [-1/4, 0]. The ray of a pixel k columns left of the middle
     # has x / z = 1 / z - k / 40, and places from z = 1/4 to 16 are tried: k must be 2.5 or more.

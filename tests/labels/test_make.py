@@ -179,6 +179,29 @@ def test_undefined_depth_and_weightless_photographs_give_no_label(capture):
     np.testing.assert_array_equal(result.weight, 0)
 
 
+def test_colors_do_not_mix_with_what_a_mask_leaves_out(capture):
+    views, depths, closeup = capture
+    _, depth, _ = truth(closeup)
+    half = plane.WIDTH // 2
+    gray = views.replace(rgb=jnp.full_like(views.rgb, 0.8))
+    masked = gray.replace(rgb=gray.rgb.at[:, :, half:].set(0))
+    masked = masked.replace(weight=masked.weight.at[:, :, half:].set(0))
+    result = label(closeup, GRID, depth, 1, masked, depths, settings(use_mask=0.0))
+    kept = np.asarray(result.weight) > 0
+    assert 0.2 < kept.mean() < 0.8
+    np.testing.assert_allclose(result.rgb[kept], 0.8, atol=1e-3)
+
+
+def test_weights_of_64_bits_are_taken_beside_cameras_of_32(capture):
+    views, depths, closeup = capture
+    _, depth, _ = truth(closeup)
+    expected = label(closeup, GRID, depth, 1, views, depths, settings())
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
+        double = views.replace(weight=jnp.asarray(np.asarray(views.weight), jnp.float64))
+        found = label(closeup, GRID, depth, 1, double, depths, settings())
+    np.testing.assert_allclose(found.rgb, expected.rgb, atol=1e-6)
+
+
 def test_settings_stack_and_no_gradient_flows(capture):
     views, depths, closeup = capture
     _, depth, _ = truth(closeup)

@@ -49,6 +49,16 @@ def test_a_moved_camera_is_found_whatever_its_exposure(gain, offset):
     assert before > 0.5 and after < 0.03 * before
 
 
+def test_weights_of_64_bits_are_taken_beside_cameras_of_32():
+    given = camera()
+    rgb, depth = shown(given)
+    photograph, weight = shown(move_camera(given, MOTION))[0], np.ones(depth.shape)
+    expected = estimate_motion(photograph, rgb, depth, jnp.asarray(weight, jnp.float32), given)
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
+        found = estimate_motion(photograph, rgb, depth, jnp.asarray(weight), given)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
 def test_a_part_that_does_not_fit_hardly_counts():
     given = camera()
     there = move_camera(given, MOTION)

@@ -130,6 +130,14 @@ def test_what_is_clipped_dark_or_hidden_is_not_compared(plain):
     ):
         assert np.isnan(seen_logs(views.replace(**changed), depths)[0][0]).all()
     assert np.isnan(seen_logs(views, depths * 1.1)[0]).all()
+    # What lies half a pixel from a mask has a part of it.
+    masked = views.replace(
+        rgb=jnp.full_like(views.rgb, 0.5).at[:, :, 20:].set(0.1),
+        weight=views.weight.at[:, :, 20:].set(0),
+    )
+    known = seen_logs(masked, depths)[0][0]
+    known = known[np.isfinite(known)]
+    assert len(known) > 50 and np.ptp(known) < 1e-4
 
 
 def test_metering_is_a_weighted_mean_of_light():
@@ -173,6 +181,12 @@ def test_the_camera_s_choice_is_learned():
     for content, gain in zip(contents[:4], gains, strict=False):
         predicted = predict_gain(metering, jnp.asarray(content, jnp.float32), taken[0][1])
         np.testing.assert_allclose(predicted, np.exp(gain), rtol=0.02)
+
+
+@pytest.mark.filterwarnings("error")
+def test_one_photograph_says_nothing_of_a_choice():
+    gains, taken, _ = camera_that_meters(-0.8)
+    np.testing.assert_array_equal(fit_metering(gains[:1], taken[:1]).slopes, [0, 0])
 
 
 def test_a_choice_that_has_nothing_to_do_with_the_view_is_not_predicted():

@@ -51,6 +51,12 @@ def ray_of(camera, pixels):
     return np.stack([x, y, np.ones_like(x)], -1) @ np.asarray(camera.rotation, np.float64).T
 
 
+def test_no_points_are_no_error(views):
+    shots, depths = views
+    maps = prepare_depth_maps(shots.cameras, depths, shots.weight)
+    assert fuse_points(jnp.zeros((0, 3)), maps, 0.4, shots.rgb).distance.shape == (0,)
+
+
 def test_distances_to_a_plane_are_exact_from_any_angle(views):
     shots, depths = views
     points = np.random.default_rng(0).uniform([-2, -2, -0.6], [2, 2, 0.6], (500, 3))

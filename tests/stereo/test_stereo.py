@@ -148,6 +148,14 @@ def test_costs_are_those_of_a_slow_loop(neighbors, native):
 
 @needs_library
 @pytest.mark.parametrize("platform", ["cpu", "cuda"])
+def test_colors_above_white_are_white():
+    """A bright photograph at the middle exposure has some."""
+    views, _ = corner_views()
+    gray = jnp.full(views.weight.shape, 306.0)
+    quads = pack_photographs(views.cameras, gray, views.weight).quads
+    assert quads.dtype == jnp.uint32 and (np.asarray(quads) == 0xFFFFFFFF).all()
+
+
 def test_only_programs_for_cpus_call_the_library(platform):
     views, _ = corner_views(4)
     match = jax.jit(functools.partial(estimate_depths, config=CONFIG))

@@ -180,13 +180,18 @@ def preset_from_flags() -> Preset:
         )
     preset = presets[FLAGS.preset]
     _help_settings(preset)
+    return with_settings(preset, settings_from_flags())
+
+
+def settings_from_flags() -> list[str]:
+    """Return the settings, `name=value`, that `--set` and flags of their own change."""
     given = {
         "downscale": FLAGS.downscale,
         "score_width": FLAGS.score_width,
         "num_windows": FLAGS.windows,
     }
     flagged = [f"{name}={value}" for name, value in given.items() if value is not None]
-    return with_settings(preset, [*FLAGS.set, *flagged])
+    return [*FLAGS.set, *flagged]
 
 
 def _help_settings(preset: Preset) -> None:

@@ -9,6 +9,7 @@ scored. The scene is a built-in one or a folder.
 """
 
 import pathlib
+import shlex
 from typing import TYPE_CHECKING
 
 from absl import flags
@@ -20,6 +21,7 @@ from jaxcloseup.app.cli.flags import (
     load_options_from_flags,
     names_from_flags,
     preset_from_flags,
+    settings_from_flags,
 )
 from jaxcloseup.app.cli.output_folder import (
     CHECKPOINTS,
@@ -30,6 +32,7 @@ from jaxcloseup.app.cli.output_folder import (
 from jaxcloseup.app.cli.start import in_one_sentence, loading, set_up
 from jaxcloseup.app.cli.topics import share
 from jaxcloseup.app.methods.method import Preset
+from jaxcloseup.app.methods.settings import with_settings
 from jaxcloseup.app.run.stage_names import STAGES
 
 
@@ -47,7 +50,7 @@ flags.DEFINE_integer(
     0,
     "random seed; the same seed gives the same metrics",
     lower_bound=0,
-    upper_bound=2**63 - 1,
+    upper_bound=2**32 - 1,  # of which JAX makes keys
 )
 flags.DEFINE_integer(
     "save_every", 1000, "steps between checkpoints; each stage's end is kept too", lower_bound=1
@@ -95,7 +98,7 @@ def main(_: list[str]) -> None:
             FLAGS.seed,
             output_dir,
             names=names_from_flags(),
-            to_run=FLAGS.stages,
+            to_run=_stages(output_dir),
             save_every=FLAGS.save_every,
             perceptual=perceptual,
             load_options=load_options,
@@ -106,13 +109,24 @@ def main(_: list[str]) -> None:
     print(f"report: {output_dir / 'report.html'}")
 
 
+def _stages(output_dir: pathlib.Path) -> list[str]:
+    """Return the stages to run: those asked for, and those that a resumed run has scored before."""
+    from jaxcloseup.app.store.stored_run import read_fields
+
+    path, scored = output_dir / "results.json", {}
+    if FLAGS.resume and path.exists():
+        scored = read_fields(path, {"stages": dict})["stages"]
+    return [stage for stage in STAGES if stage in FLAGS.stages or stage in scored]
+
+
 def _resumed(output_dir: pathlib.Path) -> "tuple[Preset, ReadPhotographs | None]":
     """Return the preset with the settings that were found when the run began."""
     from jaxcloseup.app.store.stored_config import preset_from_config
     from jaxcloseup.app.store.stored_run import read_fields
 
     identity = read_fields(output_dir / CHECKPOINTS / "run.json", {"config": dict})
-    return preset_from_config(identity["config"])[0], None
+    # Settings that were given when it began change nothing; others are refused as another run's.
+    return with_settings(preset_from_config(identity["config"])[0], settings_from_flags()), None
 
 
 def _fitted(preset: Preset, scene: "Scene") -> "tuple[Preset, ReadPhotographs | None]":
@@ -120,9 +134,11 @@ def _fitted(preset: Preset, scene: "Scene") -> "tuple[Preset, ReadPhotographs | 
     from jaxcloseup.app import progress
     from jaxcloseup.app.run.minutes import fit_minutes
 
+    asked = settings_from_flags()
+    fixed = {text.partition("=")[0] for text in asked}
     with progress.showing(), progress.saying("timing steps"):
-        fitted = fit_minutes(preset, scene, FLAGS.minutes)
-    repeat = " ".join(f"--set={text}" for text in fitted.given)
+        fitted = fit_minutes(preset, scene, FLAGS.minutes, fixed=fixed)
+    repeat = shlex.join(f"--set={text}" for text in [*asked, *fitted.given])
     print(f"{FLAGS.minutes:g} minutes of training, as {repeat} repeats it")
     return fitted.preset, fitted.read
 

@@ -128,7 +128,9 @@ def _grain(programs: Programs, state: TrainState) -> jax.Array:
 
 
 def _sources(views: Views, found: Residuals) -> GatherSources:
-    return jax.jit(trusted_depths)(found, views.weight * reproduced(found.shown))
+    height, width = found.shown.sizes[-1]  # of the largest, perhaps of some photographs alone
+    trust = views.weight[:, :height, :width] * reproduced(found.shown)
+    return jax.jit(trusted_depths)(found, trust)
 
 
 def refresh_detail(

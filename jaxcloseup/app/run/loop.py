@@ -9,7 +9,7 @@ from jaxcloseup.app.run.logs import TrainLog
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.step_data import ArmsData, StepData
 from jaxcloseup.app.run.timers import timed
-from jaxcloseup.artifacts.checkpoints import Checkpoints
+from jaxcloseup.artifacts.checkpoints import CheckpointError, Checkpoints
 from jaxcloseup.training.state import TrainState
 
 
@@ -45,23 +45,31 @@ class Training:
 
 
 def train_stage(
-    training: Training, stage: str, state: TrainState, data: StepData | ArmsData, *, steps: int
+    training: Training,
+    stage: str,
+    state: TrainState,
+    data: StepData | ArmsData,
+    *,
+    steps: int,
+    begins_at: str = "",
 ) -> TrainState:
     """Take `steps` steps of the kind that learns from `data`, and report ten times or more often.
 
     Resumes from the stage's newest checkpoint, if there is one, with the same next steps.
+    `begins_at` names the stage whose state it begins with, where that is not always the same.
 
     Returns:
       The state after the last step.
 
     Raises:
       Paused: `training.pause` says so.
+      CheckpointError: the checkpoint began at another stage, or cannot be read.
       TrainingError: `PERSISTENT` steps in a row, or all steps of the stage, were not finite; the
         last good state is kept.
     """
     with timed(training.seconds, stage):
         chunk = max(1, min(-(-steps // _REPORTS), training.report_every, training.save_every))
-        done, state, history = _resume(training, stage, state, steps)
+        done, state, history = _resume(training, stage, state, steps, begins_at)
         training.history[stage] = history
         saved, failing, good = done, 0, (done, state)
         while done < steps:
@@ -73,7 +81,7 @@ def train_stage(
                 done, state = good
                 history[:] = [entry for entry in history if entry["step"] <= done]
                 if done > saved:
-                    _save(training, stage, done, state)
+                    _save(training, stage, done, state, begins_at)
                 raise TrainingError(_why_stopped(stage, done, failing, training.checkpoints))
             if not failing:
                 good = done, state
@@ -83,7 +91,7 @@ def train_stage(
                 training.log.write(history[-1])
             paused = done < steps and training.pause() and not failing
             if done == steps or paused or (done - saved >= training.save_every and not failing):
-                _save(training, stage, done, state)
+                _save(training, stage, done, state, begins_at)
                 saved = done
             if paused:
                 raise Paused(f"{stage} {done}/{steps}")
@@ -101,13 +109,18 @@ def describe_means(metrics: dict[str, Any]) -> list[str]:
 
 
 def _resume(
-    training: Training, stage: str, state: TrainState, steps: int
+    training: Training, stage: str, state: TrainState, steps: int, begins_at: str
 ) -> tuple[int, TrainState, list[dict[str, Any]]]:
     """Return the steps taken, the state and the history of a stage's newest checkpoint, if any."""
     done, history = 0, []
     kept = training.checkpoints.load(stage, state)
     if kept is not None:
         done, state, stored = kept
+        if (before := stored.get("begins_at", begins_at)) != begins_at:
+            raise CheckpointError(
+                f"{training.checkpoints.folder / stage} began at {before}, and would begin at "
+                f"{begins_at} now: remove it to train it anew, or resume with the same --stages"
+            )
         history = stored["history"]
         training.programs.make_room(stored["growth"])
         print(f"{stage} {done}/{steps}  resumed")
@@ -117,8 +130,9 @@ def _resume(
     return done, state, history
 
 
-def _save(training: Training, stage: str, done: int, state: TrainState) -> None:
-    kept = {"history": training.history[stage], "growth": training.programs.growth}
+def _save(training: Training, stage: str, done: int, state: TrainState, begins_at: str) -> None:
+    kept: dict[str, Any] = {"history": training.history[stage]}
+    kept |= {"growth": training.programs.growth, "begins_at": begins_at}
     training.checkpoints.save(stage, done, state, kept)
 
 

@@ -3,7 +3,7 @@
 import functools
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -37,7 +37,9 @@ class Fitted(NamedTuple):
     read: ReadPhotographs  # what timing it made of the photographs
 
 
-def fit_minutes(preset: Preset, scene: Scene, minutes: float) -> Fitted:
+def fit_minutes(
+    preset: Preset, scene: Scene, minutes: float, *, fixed: Collection[str] = ()
+) -> Fitted:
     """Return the preset whose stage 1 takes so many minutes here, and the settings that make it.
 
     The number of steps follows from their time on this computer, the schedules of learning rates
@@ -49,9 +51,15 @@ def fit_minutes(preset: Preset, scene: Scene, minutes: float) -> Fitted:
       scene: what was photographed.
       minutes: wall time from here to the end of stage 1, without reading photographs. Steps get
         half of it, however long everything else takes.
+      fixed: names of settings that stay as they are.
+
+    Raises:
+      ValueError: the number of steps is fixed.
     """
+    if "baseline_steps" in fixed:
+        raise ValueError("--minutes chooses baseline_steps: leave out one of the two")
     given: list[str] = []
-    if preset.coarse is not None:
+    if preset.coarse is not None and "capacity" not in fixed:
         times = math.sqrt(minutes / _USUAL)
         given.append(f"capacity={max(1000, 1000 * round(preset.field.capacity * times / 1000))}")
         preset = with_settings(preset, given)
@@ -60,20 +68,20 @@ def fit_minutes(preset: Preset, scene: Scene, minutes: float) -> Fitted:
     seconds = _time_steps(programs)
     left = 60 * minutes - (time.perf_counter() - start - seconds.reading) - seconds.before
     steps = max(_FEWEST, 10 * round(max(left, 30 * minutes) / seconds.step / 10))
-    given += [f"baseline_steps={steps}", *_schedules(preset, steps)]
+    given += [f"baseline_steps={steps}", *_schedules(preset, steps, fixed)]
     fitted = with_settings(preset, given)
     # More steps may read finer photographs, and match these: a resumed run would, from the start.
     same = finest_read(fitted, scene) == finest_read(preset, scene)
     return Fitted(fitted, given, programs.read if same else ReadPhotographs(scene))
 
 
-def _schedules(preset: Preset, steps: int) -> list[str]:
+def _schedules(preset: Preset, steps: int, fixed: Collection[str]) -> list[str]:
     """Return the settings that stretch schedules of learning rates to a number of steps."""
     share = steps / preset.baseline_steps
     return [
         f"{name}={max(1, round(share * schedule.value))}"
         for name, schedule in settings_of(preset).items()
-        if name in ("means_lr_steps", "lr_decay_steps")
+        if name in ("means_lr_steps", "lr_decay_steps") and name not in fixed
     ]
 
 
@@ -87,16 +95,22 @@ class _Times(NamedTuple):
 
 def _time_steps(programs: Programs) -> _Times:
     """Time everything that a run does until the end of stage 1."""
-    preset, keys = programs.preset, run_keys(0)
+    preset, keys, reading, before = programs.preset, run_keys(0), 0.0, 0.0
+
+    def read() -> float:
+        return _timed(lambda: programs.pyramid(finest_read(preset, programs.scene)))[1]
+
+    captured = programs.scene.surface is None  # matching reads a capture's finest photographs, too
+    if preset.coarse is not None and captured:
+        reading = read()
     stereo, matching = _timed(lambda: programs.stereo)
-    reading = before = 0.0
     if preset.coarse is None:
         state = initial_state(programs, keys, stereo)
     else:
         coarse = programs.coarse
         state = initial_state(coarse, keys, stereo)
         state, each = _steps(coarse, state, TrainData(with_depths(coarse, stereo)))
-        _, reading = _timed(lambda: programs.pyramid(finest_read(preset, programs.scene)))
+        reading = reading or read()
         state, refining = _timed(functools.partial(refine_state, programs, state))
         before = preset.coarse.steps * each + refining
         if corrects_poses(preset, programs.scene):

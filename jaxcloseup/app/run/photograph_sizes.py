@@ -20,7 +20,8 @@ def finest_read(preset: Preset, scene: Scene) -> int:
     if METHODS[preset.method].renders_pixels:
         return preset.windows.finest
     each = views.cameras.height * views.cameras.width
-    times = math.sqrt(views.weight.size * divisor**2 / (preset.baseline_steps * each))
+    read = preset.baseline_steps * preset.train.num_windows * each
+    times = math.sqrt(views.weight.size * divisor**2 / read)
     return max(preset.windows.finest, math.ceil(times - 0.5))
 
 

@@ -77,11 +77,17 @@ class Run:
         return self.training.programs
 
     def train(
-        self, stage: str, state: TrainState, data: StepData, *, steps: int | None = None
+        self,
+        stage: str,
+        state: TrainState,
+        data: StepData,
+        *,
+        steps: int | None = None,
+        begins_at: str = "",
     ) -> TrainState:
         """Train and score a stage; by default for as many steps as `closeup`."""
         steps = self.programs.preset.closeup_steps if steps is None else steps
-        state = train_stage(self.training, stage, state, data, steps=steps)
+        state = train_stage(self.training, stage, state, data, steps=steps, begins_at=begins_at)
         self.scorer.score(stage, state)
         return state
 
@@ -211,9 +217,9 @@ def train_for_target_views(run: Run, get_detail: GetDetail, *, controlled: bool)
     if scene.test is None:
         print(f"no test_time: {scene.name} holds out no close-ups (--split=closest does)")
         return
-    labels, start = preset.target_labels, run.start
+    labels, start, begins_at = preset.target_labels, run.start, "baseline"
     if labels.label == "residual":  # the detail of the latest state is there, or made anyway
-        start = start._replace(state=run.state)
+        start, begins_at = start._replace(state=run.state), run.stage
     settings = gated(labels, run.gate)
     with timed(run.training.seconds, "test_time_labels"):
         prepared = prepare_target_views(
@@ -225,9 +231,13 @@ def train_for_target_views(run: Run, get_detail: GetDetail, *, controlled: bool)
         if preset.targets is not None:
             rate = jnp.float32(preset.targets.control_lr_scale)
         data = TrainData(prepared.data.views, rate)
-        control = run.train("test_time_control", start.state, data, steps=prepared.steps)
+        control = run.train(
+            "test_time_control", start.state, data, steps=prepared.steps, begins_at=begins_at
+        )
     if labeled:
-        run.train("test_time", prepared.state, prepared.data, steps=prepared.steps)
+        run.train(
+            "test_time", prepared.state, prepared.data, steps=prepared.steps, begins_at=begins_at
+        )
     else:
         run.scorer.score("test_time", control)
 

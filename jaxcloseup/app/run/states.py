@@ -39,8 +39,8 @@ def train_baseline(
     """Train stage 1 on photographs alone, from `coarse` or from what it trains before."""
     programs, preset = training.programs, training.programs.preset
     stereo = match(training)
-    if stereo is None and programs.method.renders_pixels and programs.field.depth_loss is not None:
-        print("depth is learned from colors alone: depth_from=stereo has no matched photographs")
+    if stereo is None and programs.field.depth_loss is not None:
+        print("depth is learned from colors alone: no photographs are matched for depth_weight")
     if preset.coarse is None:
         start = initial_state(programs, keys, stereo)
     else:

@@ -164,7 +164,8 @@ def error_curve(
         "error": errors,
         "oracle": oracle,
         **{name: means(values[by_score]) for name, values in (more or {}).items()},
-        "ause": float(np.trapezoid(gap, shares) / largest) if largest else 0.0,
+        # From no labels on, of which the gap is that of the fewest.
+        "ause": float(np.trapezoid([gap[0], *gap], [0, *shares]) / largest) if largest else 0.0,
     }
 
 

@@ -24,6 +24,7 @@ from jaxcloseup.fields.splats.splat_field import (
     camera_extent,
     depth_hold,
     surfel_field,
+    with_expected_depth,
 )
 from jaxcloseup.fields.splats.splat_optimizer import surfel_optimizer
 from jaxcloseup.fields.splats.surfels import Surfels, pad_rows
@@ -129,6 +130,7 @@ def refine(
     Small photographs fill only as many as they resolve. New surfels lie at the depths that were
     measured, and elsewhere at those that are rendered.
     """
+    surfels = surfels.replace(sh=_of_degree(surfels.sh, config.sh_degree))
     views, cameras = len(pyramid), scene.train.cameras
     level = pyramid.level_near(_REFINED_AT * cameras.width)
     free = config.capacity - int(buffers.alive.sum())
@@ -161,7 +163,14 @@ def refine(
     surfels, alive = _join(old, new, capacity=config.capacity)
     interval = _intervals(config, surfels, scene)
     hold = depth_hold(config, jnp.int32(0))
-    return surfels, buffers.replace(alive=alive, interval=interval, hold=hold)
+    buffers = buffers.replace(alive=alive, interval=interval, hold=hold)
+    return surfels, with_expected_depth(buffers, config.depth == "expected")
+
+
+def _of_degree(sh: jax.Array, degree: int) -> jax.Array:
+    """Return harmonics `[N, (degree + 1)^2, 3]`: too many are cut, and new ones are 0."""
+    count = (degree + 1) ** 2
+    return jnp.pad(sh[:, :count], ((0, 0), (0, max(0, count - sh.shape[1])), (0, 0)))
 
 
 def _intervals(config: SplatTrainingConfig, surfels: Surfels, scene: Scene) -> jax.Array | None:
