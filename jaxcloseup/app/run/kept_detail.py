@@ -35,7 +35,7 @@ from jaxcloseup.photos.views import Views
 from jaxcloseup.training.state import TrainState
 
 
-_RECIPE = 15  # a change of how detail is made raises it, so that kept detail is made again
+_RECIPE = 16  # a change of how detail is made raises it, so that kept detail is made again
 
 
 def detailed(programs: Programs, detail: Detail, camera: Camera, rendering: Rendering) -> Detailed:
