@@ -144,7 +144,7 @@ MISTAKES = {
     "no setting": ({"set": ["sharpness=3"]}, "--set=sharpness=3: .* no setting sharpness"),
     "another shape": (
         {"set": ["capacity=9"]},
-        "--set changes the shape .*--run=.* was trained with other",
+        "--set changes the shape .*: .* was trained with other",
     ),
     "too large": (
         {"views": None, "orbit": True, "width": 100_000, "height": 100_000},

@@ -148,14 +148,6 @@ def test_costs_are_those_of_a_slow_loop(neighbors, native):
 
 @needs_library
 @pytest.mark.parametrize("platform", ["cpu", "cuda"])
-def test_colors_above_white_are_white():
-    """A bright photograph at the middle exposure has some."""
-    views, _ = corner_views()
-    gray = jnp.full(views.weight.shape, 306.0)
-    quads = pack_photographs(views.cameras, gray, views.weight).quads
-    assert quads.dtype == jnp.uint32 and (np.asarray(quads) == 0xFFFFFFFF).all()
-
-
 def test_only_programs_for_cpus_call_the_library(platform):
     views, _ = corner_views(4)
     match = jax.jit(functools.partial(estimate_depths, config=CONFIG))
@@ -244,3 +236,11 @@ def test_a_photograph_without_neighbors_has_no_confidence():
     none = jnp.full((2, 1), -1, jnp.int32)
     maps = estimate_depths(jax.random.key(0), views, none, 1.0, 20.0, config)
     assert not np.asarray(maps.confidence).any() and np.isfinite(np.asarray(maps.depth)).all()
+
+
+def test_colors_above_white_are_white():
+    """A bright photograph at the middle exposure has some."""
+    views, _ = corner_views()
+    gray = jnp.full(views.weight.shape, 306.0)
+    quads = pack_photographs(views.cameras, gray, views.weight).quads
+    assert quads.dtype == jnp.uint32 and (np.asarray(quads) == 0xFFFFFFFF).all()
