@@ -60,6 +60,11 @@ class Detail(struct.PyTreeNode):
     grain: jax.Array
     confirmed: jax.Array | float = 1.0
 
+    @property
+    def map_sizes(self) -> jax.Array:
+        """Return height and width `[V, 2]` of the depth maps, which are padded to one size."""
+        return self.shown.extents[:, self.shown.sizes.index(self.sources.trust.shape[1:])]
+
 
 class Detailed(NamedTuple):
     """An image with detail.
@@ -122,9 +127,7 @@ def add_detail(
     sharper = _add(detail.weights, detail.finer, detail.confirmed, gathered, rgb, alpha, depth)
     seen = gathered[0].weight > 0
     del gathered  # 70 bytes for each pixel
-    level = detail.shown.sizes.index(detail.sources.trust.shape[1:])
-    sizes = detail.shown.extents[:, level]
-    filled = _fill(camera, pixels, sharper.rgb, alpha, seen, detail.sources, sizes)
+    filled = _fill(camera, pixels, sharper.rgb, alpha, seen, detail.sources, detail.map_sizes)
     return sharper._replace(rgb=filled)
 
 

@@ -44,6 +44,7 @@ from jaxcloseup.geometry.warp import (
     backward_warp,
     draw_nearest,
     forward_warp,
+    reads_unmixed,
     warp_forward_to,
     warp_to,
 )
@@ -75,6 +76,7 @@ __all__ = [
     "points_to_pixels",
     "quaternion_rows",
     "quaternion_to_matrix",
+    "reads_unmixed",
     "rgb_consistent",
     "sample_anchor",
     "sample_closeup_camera",

@@ -16,6 +16,7 @@ from jaxcloseup.geometry.cameras import Camera, pixel_grid, pixels_to_points, po
 from jaxcloseup.geometry.masks import depth_consistent, in_bounds
 
 
+_WHOLE = 0.999  # of the four shares of a bilinear read, up to rounding
 NO_SOURCE = 2**31 - 1  # larger than any index, so that a minimum replaces it
 
 
@@ -45,6 +46,19 @@ class ForwardWarp(NamedTuple):
     values: jax.Array
     depth: jax.Array
     hit: jax.Array
+
+
+def reads_unmixed(weight: jax.Array, pixels: jax.Array) -> jax.Array:
+    """Return whether `backward_warp` reads colors at pixels of weight alone, `[...]` bool.
+
+    Beside a mask or padding it would mix them with what these leave out.
+
+    Args:
+      weight: `[H, W]` of the image that is read; 0 does not count.
+      pixels: `[..., 2]` where it is read; False outside the image.
+    """
+    counts = (weight > 0).astype(pixels.dtype)[..., None]
+    return backward_warp(counts, pixels)[..., 0] > _WHOLE
 
 
 def backward_warp(

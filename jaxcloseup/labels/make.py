@@ -26,14 +26,13 @@ from jaxcloseup.geometry.numerics import safe_divide, safe_norm
 from jaxcloseup.geometry.poses import PoseSettings, four_anchors, sample_closeup_camera
 from jaxcloseup.geometry.union_warp import SourceBlocks, block_sources, union_warp
 from jaxcloseup.geometry.visibility import sample_where_visible
-from jaxcloseup.geometry.warp import backward_warp
+from jaxcloseup.geometry.warp import backward_warp, reads_unmixed
 from jaxcloseup.photos.views import Views, camera_at, to_float
 
 
 _RANKING_PIXELS = 256  # at least so many virtual pixels, and fewer than twice, rank photographs
 _RANKING_TOLERANCE = 0.05  # largest relative depth error of a pixel that a photograph sees
 SOURCE_TOLERANCE = 0.05
-_WHOLE = 0.999  # share of a color that may be read, from which it is not mixed with others
 _ROUNDING = 1e-6  # of a cosine in float32
 
 
@@ -233,11 +232,8 @@ def _read_source(
         source, depth, views.weight[index], points, settings.depth_tolerance
     )
     near_enough = _cosine_between(camera, source, points) >= _least_cosine(settings)
-    known = (seen.weight > 0) & near_enough
+    known = (seen.weight > 0) & near_enough & reads_unmixed(views.weight[index], seen.pixels)
     color = backward_warp(to_float(views.rgb[index]), seen.pixels)
-    # Colors between pixels must not mix with those that a mask or padding leaves out.
-    counts = (views.weight[index] > 0).astype(color.dtype)[..., None]
-    known &= backward_warp(counts, seen.pixels)[..., 0] > _WHOLE
     return jnp.where(known[..., None], color, 0), jnp.where(known, seen.weight, 0)
 
 

@@ -16,7 +16,7 @@ from flax import struct
 from jaxcloseup.geometry.cameras import Camera, points_to_pixels
 from jaxcloseup.geometry.masks import depth_consistent, in_bounds
 from jaxcloseup.geometry.numerics import safe_divide
-from jaxcloseup.geometry.warp import backward_warp
+from jaxcloseup.geometry.warp import backward_warp, reads_unmixed
 from jaxcloseup.photos.light import (
     change_exposure,
     colors_by_curve,
@@ -28,7 +28,6 @@ from jaxcloseup.photos.views import Views, to_float
 
 
 USABLE = 0.03, 0.97  # colors beyond are noise, or clipped
-_WHOLE = 0.999  # share of a color that may be read, from which it is not mixed with others
 _LEAST = 0.05  # residual of log light below which all count alike
 _ROUNDS = 10  # of reweighting
 _HELD = 1.0  # weight of what is expected in each gain, in points
@@ -119,9 +118,8 @@ def look_at_points(
     """
     pixels, expected = points_to_pixels(camera, points)
     observed = backward_warp(jnp.stack([depth, weight], -1), pixels, order=0)
-    counts = (weight > 0).astype(rgb.dtype)[..., None]
-    colors, counts = jnp.split(backward_warp(jnp.concatenate([rgb, counts], -1), pixels), [3], -1)
-    seen = (counts[:, 0] > _WHOLE) & in_bounds(pixels, *depth.shape) & (observed[:, 1] > 0)
+    colors = backward_warp(rgb, pixels)
+    seen = in_bounds(pixels, *depth.shape) & (observed[:, 1] > 0) & reads_unmixed(weight, pixels)
     seen &= depth_consistent(observed[:, 0], expected, tolerance)
     seen &= (jnp.min(colors, -1) > USABLE[0]) & (jnp.max(colors, -1) < USABLE[1])
     return jnp.where(seen[:, None], jnp.log(to_light(jnp.maximum(colors, USABLE[0]))), jnp.nan)

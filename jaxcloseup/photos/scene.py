@@ -89,9 +89,9 @@ class Scene:
       names: for each split present, the names of its photographs in order.
       metadata: extra facts from the loader, such as source paths and downscale; `own_sizes`, width
         and height of each photograph of a split before it was reduced; `distortions`, what of its
-        lens was undone in reading, or None; `seen`, for each training
-        photograph the indices of the points that it shows, and `point_errors`, their mean
-        reprojection errors `[P]` in pixels of the photographs' own size, where the files list them.
+        lens was undone in reading, or None; `seen`, for each training photograph the indices of the
+        points that it shows, and `point_errors`, their mean reprojection errors `[P]` in pixels of
+        the photographs' own size, where the files list them.
       surface: renders a `Camera` to its exact `Surface`; None for photographed scenes.
       photographs_at: reads the photographs of a split again at 1 / n of their own size, given n
         and the split, "train" by default; None where they have no finer size to be read at.

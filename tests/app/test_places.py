@@ -22,7 +22,7 @@ def test_the_middle_of_a_photograph_is_that_of_its_own_size():
     )
     detail = SimpleNamespace(
         sources=SimpleNamespace(cameras=cameras, trust=np.zeros((2, 40, 40))),
-        shown=SimpleNamespace(sizes=((40, 40),), extents=extents),
+        map_sizes=extents[:, 0],
     )
     ahead, aside, behind = [0.0, 0.0, 5.0], [4.0, 0.0, 5.0], [0.0, 0.0, -5.0]
     np.testing.assert_array_equal(

@@ -88,6 +88,7 @@ def main(_: list[str]) -> None:
         scene.metadata["check"], read = found, None
         if FLAGS.minutes is not None:
             preset, read = _resumed(output_dir) if FLAGS.resume else _fitted(preset, scene)
+        to_run = _stages(output_dir)
         perceptual = find_perceptual(FLAGS.lpips_weights)
         lock = lock_output_dir(output_dir)
     expected = (TrainingError, CheckpointError, SceneError, OSError)
@@ -98,7 +99,7 @@ def main(_: list[str]) -> None:
             FLAGS.seed,
             output_dir,
             names=names_from_flags(),
-            to_run=_stages(output_dir),
+            to_run=to_run,
             save_every=FLAGS.save_every,
             perceptual=perceptual,
             load_options=load_options,

@@ -133,7 +133,7 @@ def _check_alike(first: Finished, run: Finished) -> None:
 
 def _same_photographs(first: Finished, run: Finished) -> bool:
     """Return False if runs learned from other photographs, as far as their hashes can tell."""
-    # Of photographs that are reduced to other sizes the hashes differ anyway.
+    # Hashes of photographs that were reduced to other sizes differ anyway.
     alike = first.results["resolution"] == run.results["resolution"]
     return not alike or first.photographs == run.photographs
 

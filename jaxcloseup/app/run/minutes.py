@@ -96,13 +96,11 @@ class _Times(NamedTuple):
 def _time_steps(programs: Programs) -> _Times:
     """Time everything that a run does until the end of stage 1."""
     preset, keys, reading, before = programs.preset, run_keys(0), 0.0, 0.0
-
-    def read() -> float:
-        return _timed(lambda: programs.pyramid(finest_read(preset, programs.scene)))[1]
-
-    captured = programs.scene.surface is None  # matching reads a capture's finest photographs, too
-    if preset.coarse is not None and captured:
-        reading = read()
+    if preset.coarse is not None:
+        # First, because matching reads a capture's finest photographs too; without exposures,
+        # which come from matching.
+        finest = finest_read(preset, programs.scene)
+        _, reading = _timed(lambda: programs.read.pyramid(finest))
     stereo, matching = _timed(lambda: programs.stereo)
     if preset.coarse is None:
         state = initial_state(programs, keys, stereo)
@@ -110,7 +108,6 @@ def _time_steps(programs: Programs) -> _Times:
         coarse = programs.coarse
         state = initial_state(coarse, keys, stereo)
         state, each = _steps(coarse, state, TrainData(with_depths(coarse, stereo)))
-        reading = reading or read()
         state, refining = _timed(functools.partial(refine_state, programs, state))
         before = preset.coarse.steps * each + refining
         if corrects_poses(preset, programs.scene):

@@ -70,15 +70,9 @@ def _looked_at(detail: Detail, points: np.ndarray) -> np.ndarray:
     """Return the share `[N]` of the photographs that have points `[N, 3]` in their middle half."""
     cameras = detail.sources.cameras
     pixels, depth = jax.vmap(points_to_pixels, in_axes=(0, None))(cameras, jnp.asarray(points))
-    shares = np.asarray(pixels) / _map_sizes(detail)[:, None]
+    shares = np.asarray(pixels) / np.asarray(detail.map_sizes)[:, ::-1][:, None]
     inside = np.all(np.abs(shares - 0.5) < 0.25, axis=-1)
     return np.mean(inside & (np.asarray(depth) > 0), axis=0)
-
-
-def _map_sizes(detail: Detail) -> np.ndarray:
-    """Return width and height `[V, 2]` of the photographs' depth maps, which are padded to one."""
-    level = detail.shown.sizes.index(detail.sources.trust.shape[1:])
-    return np.asarray(detail.shown.extents)[:, level, ::-1]
 
 
 def _windows_of(detail: Detail, view: int, near: float) -> tuple[list[_Found], float]:
@@ -86,7 +80,7 @@ def _windows_of(detail: Detail, view: int, near: float) -> tuple[list[_Found], f
     shown, sources = detail.shown, detail.sources
     colors = np.asarray(shown.image(view, shown.level_near(_WIDTH)), np.float32)[..., 3:6]
     rows, columns = colors.shape[:2]
-    width, height = _map_sizes(detail)[view]
+    width, height = np.asarray(detail.map_sizes)[:, ::-1][view]
     trust, inverse = (
         cv2.resize(np.asarray(maps[view])[:height, :width], (columns, rows), interpolation=how)
         for maps, how in (

@@ -69,12 +69,13 @@ def export_splats(
     surfels, alive = programs.method.splats(state.params, state.buffers)
     for name in files:
         path = output_dir / name
-        if name == "splats.spz":
-            kept, antialiased = _shown(programs, state, alive), record.preset.field.raster.antialias
-            packed = pack_spz(surfels, kept, placement=scene.placement, antialiased=antialiased)
-            write_file(path, packed[0])
-        elif name in PACKED:
-            write_file(path, PACKED[name](surfels, alive, placement=scene.placement)[0])
+        if name in PACKED:
+            kept: np.ndarray | jax.Array = alive
+            how: dict[str, bool] = {}
+            if name == "splats.spz":
+                kept = _shown(programs, state, alive)
+                how = {"antialiased": record.preset.field.raster.antialias}
+            write_file(path, PACKED[name](surfels, kept, placement=scene.placement, **how)[0])
         else:
             write_surfels(path, surfels, alive, placement=scene.placement)
         print(f"wrote {path}, {path.stat().st_size / 1e6:.1f} MB")
