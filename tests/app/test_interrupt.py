@@ -111,6 +111,21 @@ def test_a_run_is_interrupted_and_resumes(start, capture_folder, tmp_path):
     stop(process)
 
 
+def test_a_file_that_is_being_written_is_not_said_to_fail(start, tmp_path):
+    """Its unfinished file is removed while the main thread would write on."""
+    begin = "import pathlib, sys, time; from jaxcloseup.app.cli.interrupt import *; "
+    begin += "from jaxcloseup.io.files import writing; folder = pathlib.Path(sys.argv[1]); "
+    begin += "from jaxcloseup.app.cli.output_folder import remove_unfinished; "
+    begin += "when_stopped(lambda: remove_unfinished(folder) or time.sleep(1) or 'ended'); "
+    begin += "end_at_ctrl_c('it')\n"
+    write = "with writing(folder / 'a'): print('begun'); time.sleep(0.5)"
+    process = start("-c", f"{begin}{write}", str(tmp_path))
+    wait_for(process.stdout, "begun")
+    _, err = stop(process)
+    assert err == "it: ended\n"
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_program_in_the_background_ignores_it(start):
     """A shell asks that of it by ignoring the signal before it starts it."""
     process = start(

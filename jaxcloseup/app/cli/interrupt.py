@@ -50,6 +50,7 @@ def end_at_ctrl_c(program: str) -> None:
         return
     wakeups, wakes = socket.socketpair()
     wakes.setblocking(False)
-    signal.signal(signal.SIGINT, lambda *_: None)
+    # The main thread waits meanwhile: it would miss the unfinished files that are removed.
+    signal.signal(signal.SIGINT, lambda *_: threading.Event().wait())
     signal.set_wakeup_fd(wakes.detach(), warn_on_full_buffer=False)
     threading.Thread(target=_watch, args=(wakeups, program), daemon=True).start()
