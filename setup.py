@@ -15,7 +15,10 @@ FLAGS = ["-std=c++17", "-O3", "-g0", "-ffp-contract=off", "-fvisibility=hidden",
 # The files that are compiled for several processors, of which one is chosen when it is loaded.
 OF_PROCESSOR = [
     str(FOLDER / f"{name}.cc")
-    for name in ("gather_block", "splat_project", "splat_reach", "splat_tiles", "stereo_rows")
+    for name in (
+        *("gather_block", "splat_project", "splat_reach", "splat_tiles"),
+        *("ssim_rows", "stereo_rows"),
+    )
 ]
 PROCESSORS = {"baseline": []}
 if platform.machine() in ("x86_64", "AMD64"):

@@ -6,6 +6,7 @@
 
 #include "gather.h"
 #include "parallel.h"
+#include "processor.h"
 #include "xla/ffi/api/ffi.h"
 
 namespace jaxcloseup {
@@ -14,17 +15,6 @@ namespace {
 namespace ffi = xla::ffi;
 using Floats = ffi::Buffer<ffi::F32>;
 using Integers = ffi::Buffer<ffi::S32>;
-
-const Gatherer& best_gatherer() {
-#if defined(__x86_64__)
-  static const bool avx512 = __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
-                             __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512bw");
-  static const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
-  if (avx512) return gatherer_avx512;
-  if (avx2) return gatherer_avx2;
-#endif
-  return gatherer_baseline;
-}
 
 float mean_focal(const float* intrinsics) { return std::sqrt(intrinsics[0] * intrinsics[1]); }
 
@@ -250,7 +240,7 @@ ffi::Error gather(ffi::ThreadPool pool, Floats pose, Floats intrinsics, Floats p
   const int64_t columns = axes ? depth.dimensions().back() : 1;
   const View view = {pose.typed_data(),  intrinsics.typed_data(), pixels.typed_data(),
                      depth.typed_data(), count / columns,         columns};
-  const Gatherer& gatherer = best_gatherer();
+  const Gatherer& gatherer = OF_THIS_PROCESSOR(gatherer);
   const int64_t blocks = view.blocks(), each = 16;
   parallel_for_with<Scratch>(pool, (blocks + each - 1) / each, [&](Scratch& scratch, int piece) {
     scratch.fit(job);

@@ -11,12 +11,12 @@ import pathlib
 import jax
 
 
-# The functions that XLA may call, of `splats.cc`, `surfels.cc`, `gather.cc`, `stereo.cc` and
-# `hash_grid.cc`.
+# The functions that XLA may call, of `splats.cc`, `surfels.cc`, `gather.cc`, `stereo.cc`,
+# `hash_grid.cc` and `ssim.cc`.
 TARGETS = (
     *("splats_forward", "splats_backward", "splats_count"),
     *("surfels_forward", "surfels_backward"),
-    *("gather", "stereo", "hash_forward", "hash_backward"),
+    *("gather", "stereo", "hash_forward", "hash_backward", "ssim"),
 )
 
 INSTALL = (

@@ -3,18 +3,11 @@
 #include <cstring>
 #include <memory>
 
+#include "processor.h"
+
 namespace jaxcloseup {
 
-const Passes& best_passes() {
-#if defined(__x86_64__)
-  static const bool avx512 = __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
-                             __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512bw");
-  static const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
-  if (avx512) return passes_avx512;
-  if (avx2) return passes_avx2;
-#endif
-  return passes_baseline;
-}
+const Passes& best_passes() { return OF_THIS_PROCESSOR(passes); }
 
 namespace {
 

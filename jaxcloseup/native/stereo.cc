@@ -1,5 +1,6 @@
 // Matching patches under planes as a function that XLA calls.
 #include "parallel.h"
+#include "processor.h"
 #include "stereo.h"
 #include "xla/ffi/api/ffi.h"
 
@@ -10,17 +11,6 @@ namespace ffi = xla::ffi;
 using Floats = ffi::Buffer<ffi::F32>;
 using Integers = ffi::Buffer<ffi::S32>;
 using Quads = ffi::Buffer<ffi::U32>;
-
-const Matcher& best_matcher() {
-#if defined(__x86_64__)
-  static const bool avx512 = __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
-                             __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512bw");
-  static const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
-  if (avx512) return matcher_avx512;
-  if (avx2) return matcher_avx2;
-#endif
-  return matcher_baseline;
-}
 
 ffi::Error stereo(ffi::ThreadPool pool, Quads quads, Floats weight, Integers reference, Integers neighbors,
                   Floats transforms, Floats planes, ffi::Result<Floats> cost, ffi::Span<const int64_t> patch,
@@ -57,7 +47,7 @@ ffi::Error stereo(ffi::ThreadPool pool, Quads quads, Floats weight, Integers ref
   job.cost = cost->typed_data();
   if (job.reference < 0 || job.reference >= job.photographs)
     return ffi::Error::InvalidArgument("there is no such photograph");
-  const Matcher& matcher = best_matcher();
+  const Matcher& matcher = OF_THIS_PROCESSOR(matcher);
   if (job.width) parallel_for(pool, job.height, [&](int row) { matcher.match_row(job, row); });
   return ffi::Error::Success();
 }

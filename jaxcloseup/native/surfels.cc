@@ -2,6 +2,7 @@
 #include <cstring>
 #include <memory>
 
+#include "processor.h"
 #include "splat_blend.h"
 #include "splat_surfels.h"
 #include "xla/ffi/api/ffi.h"
@@ -17,14 +18,6 @@ using Result = ffi::Result<Buffer>;
 
 constexpr int PIECE = 1024;  // surfels that a thread projects at once
 constexpr int CHANNELS = FEATURES + MOMENTS;
-
-const Projection& best_projection() {
-#if defined(__x86_64__)
-  if (&best_passes() == &passes_avx512) return projection_avx512;
-  if (&best_passes() == &passes_avx2) return projection_avx2;
-#endif
-  return projection_baseline;
-}
 
 // Surfels and cameras `[..., N, 3]` and so on, as all functions take them.
 struct Inputs {
@@ -83,7 +76,7 @@ struct Table {
         image{view.width, view.height, view.near, surfels.count, COLUMNS, table.get(), box.get(), order.get()} {
     const Projected out = {table.get(), box.get(), order.get()};
     parallel_for(pool, pieces(surfels.count), [&](int i) {
-      best_projection().project(surfels, view, i * PIECE, end_of(i, surfels.count), out);
+      OF_THIS_PROCESSOR(projection).project(surfels, view, i * PIECE, end_of(i, surfels.count), out);
     });
   }
 
@@ -138,7 +131,7 @@ ffi::Error backward(ffi::ThreadPool pool, Floats means, Floats log_scales, Float
       // A box between the centers of pixels is in no list, so its row of cotangents is not written.
       for (int k = begin; k < end; k++)
         if (listing.boxes[k].down.last < listing.boxes[k].down.first) table.box[4 * size_t(k) + 2] = -1;
-      best_projection().pull_back(surfels, view, begin, end, table_bar.get(), table.box.get(), out,
+      OF_THIS_PROCESSOR(projection).pull_back(surfels, view, begin, end, table_bar.get(), table.box.get(), out,
                                   of_camera ? cameras.data() + size_t(piece) * CAMERA : nullptr);
     });
     for (int piece = 0; piece < pieces; piece++)

@@ -1,3 +1,5 @@
+import functools
+
 import cv2
 import jax
 import jax.numpy as jnp
@@ -6,6 +8,7 @@ import pytest
 import reference
 
 from jaxcloseup.metrics.image_metrics import cc_psnr, fit_colors, psnr, quantize, ssim
+from jaxcloseup.native import library
 
 
 METRICS = {"psnr": psnr, "ssim": ssim, "cc_psnr": cc_psnr}
@@ -63,6 +66,71 @@ def test_ssim_agrees_with_the_oracle(pair, weight):
     np.testing.assert_allclose(
         ssim(*pair, weight=weight), (expected.mean(-1) * centers).sum() / centers.sum(), atol=1e-5
     )
+
+
+def test_the_gradient_of_ssim_is_the_finite_difference_of_the_oracle(pair, weight):
+    """By both images and the weights, along drawn directions."""
+    rng = np.random.default_rng(2)
+    inputs = [np.float64(x) for x in (*pair, weight)]
+    along = [rng.normal(size=x.shape) for x in inputs]
+
+    def of_oracle(*values):
+        centers = values[2][5:-5, 5:-5]
+        return np.sum(reference.ssim_map(*values[:2]).mean(-1) * centers) / np.sum(centers)
+
+    @jax.jit
+    def gradients(*inputs):
+        return jax.grad(lambda *x: ssim(*x[:2], weight=x[2]), argnums=(0, 1, 2))(*inputs)
+
+    for number, gradient in enumerate(gradients(*map(np.float32, inputs))):
+        moved = [
+            [x + sign * 1e-5 * along[k] * (k == number) for k, x in enumerate(inputs)]
+            for sign in (1, -1)
+        ]
+        expected = (of_oracle(*moved[0]) - of_oracle(*moved[1])) / 2e-5
+        np.testing.assert_allclose(np.sum(gradient * along[number]), expected, rtol=2e-3)
+
+
+@pytest.mark.skipif(not library.available(), reason=str(library.missing()))
+@pytest.mark.parametrize("size", [(11, 11), (12, 138), (40, 301)])
+def test_the_library_compares_several_images_as_jax_does(size):
+    """One window, a block of values and one more, several blocks; renders brighter than white."""
+    rng = np.random.default_rng(4)
+    image = rng.uniform(0, 1, (2, *size, 3)).astype(np.float32)
+    target = np.float32(image + 0.2 * rng.standard_normal(image.shape))
+    target[1, :, :60] = image[1, :, :60] = 1.3
+    weight = rng.uniform(0, 1, size).astype(np.float32)
+
+    def both(image, target):
+        called = functools.partial(ssim, weight=weight)
+        return jax.value_and_grad(called, argnums=(0, 1))(image, target)
+
+    ours = jax.jit(jax.vmap(both))(image, target)
+    centers = weight[5:-5, 5:-5]
+    with jax.enable_x64(True):
+        wide = [jnp.asarray(x, jnp.float64) for x in (image, target)]
+        theirs = jax.jit(jax.vmap(both))(*wide)
+    expected = [
+        np.sum(reference.ssim_map(a, b).mean(-1) * centers) / np.sum(centers)
+        for a, b in zip(image, target, strict=True)
+    ]
+    np.testing.assert_allclose(ours[0], expected, atol=2e-4)
+    for one, other in zip(ours[1], theirs[1], strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-3 * np.abs(other).max())
+
+
+def test_ssim_calls_the_library_on_cpus_only(pair):
+    traced = jax.jit(ssim).trace(*pair)
+    assert "jaxcloseup_ssim" not in traced.lower(lowering_platforms=("cuda",)).as_text()
+    called = "jaxcloseup_ssim" in traced.lower(lowering_platforms=("cpu",)).as_text()
+    assert called == library.available()
+
+
+def test_ssim_without_any_weight_is_none_and_moves_nothing(pair):
+    value, gradient = jax.value_and_grad(
+        lambda image: jnp.nan_to_num(ssim(image, pair[1], weight=jnp.zeros((14, 17))), nan=2.0)
+    )(pair[0])
+    assert value == 2 and not np.any(gradient)
 
 
 def test_ssim_closed_forms(pair):

@@ -75,3 +75,6 @@ void fuzz_matching();
 
 // Encodes positions once; in `fuzz_hash_grid.cc`.
 void fuzz_hash_grid();
+
+// Compares two images once; in `fuzz_ssim.cc`.
+void fuzz_comparing();

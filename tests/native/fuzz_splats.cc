@@ -187,6 +187,7 @@ int main(int, char** arguments) {
     fuzz_gathering();
     fuzz_matching();
     fuzz_hash_grid();
+    fuzz_comparing();
   }
   check_limits();
   std::printf("%d cases\n", cases);
