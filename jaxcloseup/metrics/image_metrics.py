@@ -82,13 +82,7 @@ def _similarity(image: jax.Array, target: jax.Array, weight: jax.Array) -> jax.A
 
     with jax.numpy_dtype_promotion("standard"):  # dm_pix mixes integers and floats
         found = dm_pix.ssim(
-            image,
-            target,
-            max_val=1.0,
-            k1=SSIM_K1,
-            k2=SSIM_K2,
-            filter_fn=_blur,
-            return_map=True,
+            image, target, max_val=1.0, k1=SSIM_K1, k2=SSIM_K2, filter_fn=_blur, return_map=True
         )
     return _weighted_mean(found, weight)
 
