@@ -16,7 +16,7 @@ MAY_IMPORT = {
     "geometry": set(),
     "native": set(),
     "photos": {"geometry", "io", "native"},
-    "metrics": {"geometry", "io"},
+    "metrics": {"geometry", "io", "native"},
     "stereo": {"geometry", "io", "native", "photos"},
     "fields": {"geometry", "metrics", "native", "photos"},
     "labels": {"geometry", "photos", "fields"},

@@ -62,7 +62,7 @@ def ssim(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = None
     single = image.dtype == jnp.float32
     if not (single and library.available()):
         return _similarity(image, target, windows)
-    # XLA's CPU backend takes eight times as long.
+    # XLA's CPU backend takes six times as long.
     return lax.platform_dependent(
         image, target, windows, cpu=_similarity_natively, default=_similarity
     )

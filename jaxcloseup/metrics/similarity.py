@@ -17,10 +17,8 @@ def similarity(
 ) -> jax.Array:
     """Sum SSIM over the windows inside two images, in the native library.
 
-    Wang et al. (2004), equation 13: with means m, n of image and target in a window, p the mean of
-    the sum of their squares and q of their product,
-    SSIM = (2 m n + C1) (2 (q - m n) + C2) / ((m^2 + n^2 + C1) (p - m^2 - n^2 + C2)),
-    the mean over the channels. It has a first derivative only.
+    Wang et al. (2004), equation 13, the mean over the channels, rearranged so that rounding leaves 1
+    where images are equal: see `native/ssim_rows.cc`. It has a first derivative only.
 
     Args:
       image: `[H, W, 3]` float32, at least 11 pixels a side.

@@ -32,9 +32,10 @@ inline V along(const float* values, const float* taps) {
   return sum;
 }
 
-// With means m, n of image and target in a window, p the mean of the sum of their squares and q of
-// their product, SSIM is l s, l = (2 m n + c1) / (m^2 + n^2 + c1) and s = (2 (q - m n) + c2) /
-// (p - m^2 - n^2 + c2). The derivatives of its weighted sum by m, p and q are kept.
+// With means m, n of image and target in a window, d the mean of their squared difference and q of
+// their product, SSIM is l s, l = 1 - (m - n)^2 / (m^2 + n^2 + c1) and s = 1 - e / (2 (q - m n) + e + c2),
+// where e = d - (m - n)^2 is the variance of the difference: so rounding leaves 1 where images are equal.
+// The derivatives of its weighted sum by m, d and q are kept.
 void compare_row(const Similarity& job, int64_t row) {
   const int64_t stride = job.width * CHANNELS, count = stride - REACH * CHANNELS;
   const int64_t padded = (job.width + REACH) * CHANNELS, plane = (job.height + REACH) * padded;
@@ -42,19 +43,19 @@ void compare_row(const Similarity& job, int64_t row) {
   for (int64_t begin = 0; begin < count; begin += BLOCK) {
     const int64_t size = at_most(BLOCK, count - begin), covered = size + REACH * CHANNELS;
     for (int64_t i = 0; i < whole(size) + REACH * CHANNELS; i += WIDTH) {
-      V m{}, n{}, p{}, q{};
+      V m{}, n{}, d{}, q{};
       for (int k = 0; k < TAPS; k++) {
         const int64_t from = (row + k) * stride + begin + i;
         const V a = load_some(job.image + from, covered - i), b = load_some(job.target + from, covered - i);
         const V tap = broadcast(job.taps[k]), tap_a = tap * a, tap_b = tap * b;
         m += tap_a;
         n += tap_b;
-        p = mad(tap_a, a, mad(tap_b, b, p));
+        d = mad(tap_a - tap_b, a - b, d);
         q = mad(tap_a, b, q);
       }
       store(rows[0] + i, m);
       store(rows[1] + i, n);
-      store(rows[2] + i, p);
+      store(rows[2] + i, d);
       store(rows[3] + i, q);
     }
     const float* share = job.share + row * (job.width - REACH) + begin / CHANNELS;
@@ -63,18 +64,17 @@ void compare_row(const Similarity& job, int64_t row) {
     for (int64_t i = size; i < whole(size); i++) shares[i] = 0;
     for (int64_t i = 0; i < size; i += WIDTH) {
       const V m = along(rows[0] + i, job.taps), n = along(rows[1] + i, job.taps);
-      const V p = along(rows[2] + i, job.taps), q = along(rows[3] + i, job.taps);
-      const V mean = m * n, means = mad(m, m, n * n);
-      const V below = means + job.c1, l = (2.f * mean + job.c1) / below;
-      // Rounding makes the variances of bright flat windows negative.
-      const V variances = greater(p - means, V{}), under = variances + job.c2;
-      const V s = (2.f * (q - mean) + job.c2) / under;
+      const V d = along(rows[2] + i, job.taps), q = along(rows[3] + i, job.taps);
+      const V apart = squared(m - n), below = mad(m, m, n * n) + job.c1, l = 1.f - apart / below;
+      // Rounding makes variances of flat windows negative.
+      const V e = greater(d - apart, V{}), under = greater(2.f * (q - m * n) + e, V{}) + job.c2;
+      const V s = 1.f - e / under;
       store(values + i, l * s);
       if (!job.pulls) continue;
       const V weight = load(shares + i);
       store(pulls[0] + i, 2.f * weight * (s * (n - m * l) / below + l * (m * s - n) / under));
       store(pulls[1] + i, -weight * l * s / under);
-      store(pulls[2] + i, 2.f * weight * l / under);
+      store(pulls[2] + i, 2.f * weight * l * (1.f - s) / under);
     }
     float* map = job.map + row * (job.width - REACH) + begin / CHANNELS;
     for (int64_t i = 0; i < size; i += CHANNELS)
@@ -105,9 +105,9 @@ void pull_row(const Similarity& job, int64_t row) {
     const int64_t from = row * stride + begin;
     for (int64_t i = 0; i < size; i += WIDTH) {
       const V a = load_some(job.image + from + i, size - i), b = load_some(job.target + from + i, size - i);
-      const V by_mean = along(rows[0] + i, job.taps), by_squares = along(rows[1] + i, job.taps);
+      const V by_mean = along(rows[0] + i, job.taps), by_difference = along(rows[1] + i, job.taps);
       const V by_product = along(rows[2] + i, job.taps);
-      store(values + i, by_mean + mad(2.f * a, by_squares, b * by_product));
+      store(values + i, by_mean + mad(2.f * (a - b), by_difference, b * by_product));
     }
     std::memcpy(job.gradient + from, values, size * sizeof(float));
   }
