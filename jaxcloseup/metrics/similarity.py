@@ -17,8 +17,8 @@ def similarity(
 ) -> jax.Array:
     """Sum SSIM over the windows inside two images, in the native library.
 
-    Wang et al. (2004), equation 13, the mean over the channels, rearranged so that rounding leaves 1
-    where images are equal: see `native/ssim_rows.cc`. It has a first derivative only.
+    Wang et al. (2004), equation 13, the mean over the channels, rearranged so that rounding leaves
+    1 where images are equal: see `native/ssim_rows.cc`. It has a first derivative only.
 
     Args:
       image: `[H, W, 3]` float32, at least 11 pixels a side.
