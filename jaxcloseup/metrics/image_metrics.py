@@ -12,7 +12,7 @@ import numpy as np
 from jax import lax
 
 from jaxcloseup.geometry.numerics import matmul, safe_divide
-from jaxcloseup.metrics.similarity import similarity
+from jaxcloseup.metrics.similarity import Window, similarity
 from jaxcloseup.native import library
 
 
@@ -71,8 +71,8 @@ def ssim(image: jax.Array, target: jax.Array, *, weight: jax.Array | None = None
 def _similarity_natively(image: jax.Array, target: jax.Array, weight: jax.Array) -> jax.Array:
     """Average SSIM over windows with weights `[H - 10, W - 10]`, in the native library."""
     total = jnp.sum(weight)
-    constants = SSIM_K1**2, SSIM_K2**2
-    mean = similarity(image, target, safe_divide(weight, total), _taps(), constants)
+    window = Window(_taps(), (SSIM_K1**2, SSIM_K2**2))
+    mean = similarity(image, target, safe_divide(weight, total), window)
     return jnp.where(total > 0, mean, jnp.nan)
 
 
@@ -108,7 +108,8 @@ def _blur_rows(image: jax.Array) -> jax.Array:
     filled = jnp.pad(image, [(0, (count + 1) * _BLOCK - size), (0, 0), (0, 0)])
     blocks = filled.reshape(count + 1, _BLOCK, *image.shape[1:])
     covered = jnp.concatenate([blocks[:-1], blocks[1:, :reach]], axis=1)
-    windows = [np.pad(_taps(), (k, _BLOCK - 1 - k)) for k in range(_BLOCK)]
+    taps = _taps()
+    windows = [np.pad(taps, (k, _BLOCK - 1 - k)) for k in range(_BLOCK)]
     matrix = jnp.asarray(np.stack(windows), image.dtype)
     blurred = jnp.einsum("oi,biwc->bowc", matrix, covered, precision=lax.Precision.HIGHEST)
     return blurred.reshape(-1, *image.shape[1:])[: size - reach]

@@ -1,20 +1,27 @@
 """SSIM natively: a weighted sum over windows, with its derivative in the same call."""
 
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
-def similarity(
-    image: jax.Array,
-    target: jax.Array,
-    share: jax.Array,
-    taps: tuple[float, ...],
-    constants: tuple[float, float],
-) -> jax.Array:
+class Window(NamedTuple):
+    """What SSIM's windows are.
+
+    Attributes:
+      taps: 11 weights along a row or column of a window, symmetric, with the sum 1.
+      constants: C1, C2.
+    """
+
+    taps: tuple[float, ...]
+    constants: tuple[float, float]
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3,))
+def similarity(image: jax.Array, target: jax.Array, share: jax.Array, window: Window) -> jax.Array:
     """Sum SSIM over the windows inside two images, in the native library.
 
     Wang et al. (2004), equation 13, the mean over the channels, rearranged so that rounding leaves
@@ -24,36 +31,28 @@ def similarity(
       image: `[H, W, 3]` float32, at least 11 pixels a side.
       target: the same.
       share: `[H - 10, W - 10]` weights of the windows.
-      taps: 11 weights along a row or column of a window, symmetric, with the sum 1.
-      constants: C1, C2.
+      window: see there.
 
     Returns:
       `[]` the weighted sum.
     """
-    found, _ = _call(image, target, share, taps, constants, derivative=False)
+    found, _ = _call(image, target, share, window, derivative=False)
     return jnp.sum(share * found)
 
 
 def _forward(
-    image: jax.Array,
-    target: jax.Array,
-    share: jax.Array,
-    taps: tuple[float, ...],
-    constants: tuple[float, float],
+    image: jax.Array, target: jax.Array, share: jax.Array, window: Window
 ) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-    found, gradient = _call(image, target, share, taps, constants, derivative=True)
+    found, gradient = _call(image, target, share, window, derivative=True)
     return jnp.sum(share * found), (image, target, share, found, gradient)
 
 
 def _backward(
-    taps: tuple[float, ...],
-    constants: tuple[float, float],
-    residuals: tuple[jax.Array, ...],
-    cotangent: jax.Array,
+    window: Window, residuals: tuple[jax.Array, ...], cotangent: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     image, target, share, found, gradient = residuals
     # Dead code unless someone differentiates the target; SSIM is symmetric.
-    _, other = _call(target, image, share, taps, constants, derivative=True)
+    _, other = _call(target, image, share, window, derivative=True)
     return cotangent * gradient, cotangent * other, cotangent * found
 
 
@@ -61,17 +60,11 @@ similarity.defvjp(_forward, _backward)
 
 
 def _call(
-    image: jax.Array,
-    target: jax.Array,
-    share: jax.Array,
-    taps: tuple[float, ...],
-    constants: tuple[float, float],
-    *,
-    derivative: bool,
+    image: jax.Array, target: jax.Array, share: jax.Array, window: Window, *, derivative: bool
 ) -> tuple[jax.Array, jax.Array]:
     """Return SSIM `[H - 10, W - 10]`, and the derivative of its sum by the image, if wanted."""
     height, width, channels = image.shape
-    reach = len(taps) - 1
+    reach = len(window.taps) - 1
     shapes = [share.shape, (0,), (0,)]
     if derivative:
         # The last one is only there to be written and read within the call.
@@ -81,7 +74,7 @@ def _call(
         image,
         target,
         share,
-        taps=np.array(taps, np.float32),
-        constants=np.array(constants, np.float32),
+        taps=np.array(window.taps, np.float32),
+        constants=np.array(window.constants, np.float32),
     )
     return found, gradient

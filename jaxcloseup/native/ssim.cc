@@ -2,7 +2,6 @@
 #include "ssim.h"
 
 #include <algorithm>
-#include <cstring>
 
 #include "parallel.h"
 #include "processor.h"

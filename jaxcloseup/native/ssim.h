@@ -11,7 +11,7 @@ constexpr int CHANNELS = 3;
 constexpr int PULLS = 3;  // blurred images that the pixels of `image` move, see `compare_row`
 
 // Two images of height x width pixels, and their windows, each named by its first pixel: see
-// `metrics/ssim.py`.
+// `metrics/similarity.py`.
 struct Similarity {
   int64_t height, width;
   const float* image;   // [height, width, 3]

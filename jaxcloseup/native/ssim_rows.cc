@@ -1,4 +1,4 @@
-// SSIM of a row of windows, and its derivative for a row of pixels: see `metrics/ssim.py`.
+// SSIM of a row of windows, and its derivative for a row of pixels: see `metrics/similarity.py`.
 //
 // Compiled once for each instruction set; ISA names the result. Nothing of the standard library
 // may be instantiated here: the linker would keep one copy for all processors.
@@ -16,14 +16,6 @@ constexpr int WIDE = BLOCK + 16 * ((REACH * CHANNELS + 15) / 16);  // with what 
 inline int64_t at_most(int64_t a, int64_t b) { return a < b ? a : b; }
 // As many values as whole vectors have.
 inline int64_t whole(int64_t count) { return (count + WIDTH - 1) / WIDTH * WIDTH; }
-
-// WIDTH values, of which those past the end are 0.
-inline V load_some(const float* from, int64_t count) {
-  if (count >= WIDTH) return load(from);
-  float some[WIDTH] = {};
-  for (int64_t i = 0; i < count; i++) some[i] = from[i];
-  return load(some);
-}
 
 // Sums `values` along a row with the weights of the taps.
 inline V along(const float* values, const float* taps) {

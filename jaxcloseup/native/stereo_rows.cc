@@ -25,14 +25,6 @@ inline I gather(const uint32_t* from, I at) {
 inline V to_float(I x) { return __builtin_convertvector(x, V); }
 inline I truncate(V x) { return __builtin_convertvector(x, I); }
 
-// The first `count` numbers, and 0.
-inline V load_some(const float* from, int count) {
-  if (count >= WIDTH) return load(from);
-  float some[WIDTH] = {};
-  std::memcpy(some, from, sizeof(float) * count);
-  return load(some);
-}
-
 inline void store_some(float* to, V from, int count) { std::memcpy(to, &from, sizeof(float) * (count < WIDTH ? count : WIDTH)); }
 
 inline V clamp(V x, float most) { return lesser(greater(x, V{}), broadcast(most)); }

@@ -132,7 +132,7 @@ ffi::Error backward(ffi::ThreadPool pool, Floats means, Floats log_scales, Float
       for (int k = begin; k < end; k++)
         if (listing.boxes[k].down.last < listing.boxes[k].down.first) table.box[4 * size_t(k) + 2] = -1;
       OF_THIS_PROCESSOR(projection).pull_back(surfels, view, begin, end, table_bar.get(), table.box.get(), out,
-                                  of_camera ? cameras.data() + size_t(piece) * CAMERA : nullptr);
+                                              of_camera ? cameras.data() + size_t(piece) * CAMERA : nullptr);
     });
     for (int piece = 0; piece < pieces; piece++)
       for (int k = 0; k < CAMERA; k++) camera_bar->typed_data()[i * CAMERA + k] += cameras[size_t(piece) * CAMERA + k];

@@ -39,6 +39,13 @@ inline V load(const float* from) {
   std::memcpy(&to, from, sizeof to);
   return to;
 }
+// The first `count` numbers, and 0; `count` may be negative.
+inline V load_some(const float* from, int64_t count) {
+  if (count >= WIDTH) return load(from);
+  float some[WIDTH] = {};
+  for (int64_t i = 0; i < count; i++) some[i] = from[i];
+  return load(some);
+}
 inline void store(float* to, V from) { std::memcpy(to, &from, sizeof from); }
 
 // a b + c
