@@ -57,7 +57,7 @@ void pull_back(xla::ffi::ThreadPool& pool, const Image& image, const Listing& li
   parallel_for_with<std::vector<float>>(pool, (shown + each - 1) / each, [&](std::vector<float>& total, int part) {
     for (int i = part * each; i < std::min(shown, (part + 1) * each); i++) {
       total.assign(stride, 0.f);
-      const Range bands = listing.of_bands[i];
+      const Range bands = listing.bands_of(i);
       for (int band = bands.first; band <= bands.last; band++) {
         const float* own = sums[band].get() + static_cast<size_t>(listing.places[listing.starts[i] + band - bands.first]) * stride;
         for (int f = 0; f < stride; f++) total[f] += own[f];

@@ -49,11 +49,10 @@ Listing::Listing(xla::ffi::ThreadPool& pool, const Passes& passes, const Image& 
     if (boxes[i].down.first <= boxes[i].down.last) splats.push_back(i);
   sort_by_depth(image.order, splats);
   starts.resize(splats.size() + 1);
-  of_bands.resize(splats.size());
+  down.resize(splats.size());
   for (size_t i = 0; i < splats.size(); i++) {
-    const Range down = boxes[splats[i]].down;
-    starts[i + 1] = starts[i] + down.last - down.first + 1;
-    of_bands[i] = {static_cast<int16_t>(down.first / rows_each), static_cast<int16_t>(down.last / rows_each)};
+    down[i] = boxes[splats[i]].down;
+    starts[i + 1] = starts[i] + down[i].last - down[i].first + 1;
   }
   deal_out();
   ranges.resize(starts.back());
@@ -65,17 +64,18 @@ Listing::Listing(xla::ffi::ThreadPool& pool, const Passes& passes, const Image& 
 
 void Listing::deal_out() {
   band_starts.resize(bands + 1);
-  for (const Range own : of_bands)
-    for (int band = own.first; band <= own.last; band++) band_starts[band + 1]++;
+  for (size_t i = 0; i < splats.size(); i++)
+    for (int band = bands_of(i).first; band <= bands_of(i).last; band++) band_starts[band + 1]++;
   for (int band = 0; band < bands; band++) band_starts[band + 1] += band_starts[band];
   members.resize(band_starts.back());
   places.resize(starts.back());
   std::vector<int64_t> next(band_starts.begin(), band_starts.end() - 1);
   for (size_t i = 0; i < splats.size(); i++) {
-    for (int band = of_bands[i].first; band <= of_bands[i].last; band++) {
+    const Range own = bands_of(i);
+    for (int band = own.first; band <= own.last; band++) {
       const int64_t place = next[band]++;
       members[place] = static_cast<int32_t>(i);
-      places[starts[i] + band - of_bands[i].first] = static_cast<int32_t>(place - band_starts[band]);
+      places[starts[i] + band - own.first] = static_cast<int32_t>(place - band_starts[band]);
     }
   }
 }
@@ -91,17 +91,23 @@ void BandLists::make(const Image& image, const Listing& listing, int number) {
   const auto each_row = [&](const auto& work) {
     for (size_t k = 0; k < count; k++) {
       const int i = members[k];
-      const Range down = listing.boxes[listing.splats[i]].down;
+      if (k + 16 < count) __builtin_prefetch(listing.ranges.data() + listing.starts[members[k + 16]]);
+      const Range down = listing.down[i];
       const Range* ranges = listing.ranges.data() + listing.starts[i];
       const int last = std::min<int>(down.last, first_row + band_rows - 1);
       for (int row = std::max<int>(down.first, first_row); row <= last; row++)
         work(static_cast<int>(k), row - first_row, ranges[row - down.first]);
     }
   };
+  // First by how much a tile has more than the one before it, in `next`.
+  next.assign(tiles + 1, 0);
   each_row([&](int, int row, Range range) {
-    for (int tile = range.first; tile <= range.last; tile++) starts[row * columns + tile + 1]++;
+    if (range.first > range.last) return;
+    next[row * columns + range.first]++;
+    next[row * columns + range.last + 1]--;
   });
-  for (int tile = 0; tile < tiles; tile++) starts[tile + 1] += starts[tile];
+  int64_t length = 0;
+  for (int tile = 0; tile < tiles; tile++) starts[tile + 1] = starts[tile] + (length += next[tile]);
   list.resize(starts.back());
   next.assign(starts.begin(), starts.end() - 1);
   each_row([&](int member, int row, Range range) {
@@ -111,7 +117,10 @@ void BandLists::make(const Image& image, const Listing& listing, int number) {
   rows.resize(count * size);
   for (size_t k = 0; k < count; k++) {
     const auto row_of = [&](size_t member) { return image.table + listing.splats[members[member]] * size; };
-    if (k + 8 < count) __builtin_prefetch(row_of(k + 8));
+    if (k + 8 < count) {
+      __builtin_prefetch(row_of(k + 8));
+      __builtin_prefetch(row_of(k + 8) + 16);
+    }
     std::memcpy(rows.data() + k * size, row_of(k), size * sizeof(float));
   }
   band = {image.width,   image.height, columns,     first_row,    band_rows, image.features(),

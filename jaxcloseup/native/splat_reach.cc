@@ -66,8 +66,12 @@ void find_reach(const Image& image, int count, const int32_t* splats, const Tile
     int most_rows = 0;
     for (int k = 0; k < LANES; k++) {
       const int lane = k < lanes ? k : 0;
-      if (begin + LANES + k < count)
-        __builtin_prefetch(image.table + static_cast<long>(splats[begin + LANES + k]) * image.columns);
+      if (begin + LANES + k < count) {
+        const int32_t later = splats[begin + LANES + k];
+        __builtin_prefetch(boxes + later);
+        __builtin_prefetch(image.table + static_cast<long>(later) * image.columns);
+        __builtin_prefetch(image.table + static_cast<long>(later) * image.columns + LOW_PASS);
+      }
       const float* row = image.table + static_cast<long>(splats[begin + lane]) * image.columns;
       for (int i = 0; i < HOMOGRAPHY + 9; i++) at[i][k] = row[i];
       const float opacity = row[OPACITY] / ALPHA_MIN;
