@@ -182,7 +182,7 @@ def training(size: Size) -> dict[str, Any]:
         )
         whole = Training(programs, checkpoints, save_every=10**9)
         outcome = run_stages(whole, 0, output, to_run=size.stages)
-    start = start_labels(programs, outcome.start.state, run_keys(0))
+    start = start_labels(programs, outcome.start.state)
     target = jax.tree.map(lambda leaf: leaf[:1], scene.test.cameras)
     begun = time.perf_counter()
     tuned = fine_tune(programs, start, target, detail_getter(programs, start.state))

@@ -42,7 +42,7 @@ def step_seconds(
     state = initial_state(programs, run_keys(0))
     views = jax.device_put(scene.train)
     state, _ = programs.run(state, TrainData(views), count=warmup)
-    start = start_labels(programs, state, run_keys(0))
+    start = start_labels(programs, state)
     arms = [make_arm(arm, preset) for arm in ARMS + GRID]
     arms = [arm.settings for arm in sorted(arms, key=lambda arm: arm.outlook)]
     states, together = join_arms(arms, [start] * len(arms), views, devices=len(jax.devices()))

@@ -31,7 +31,6 @@ from experiments.studies.tables import CLOSEUPS, ORDINARY, format_gain, print_ta
 from experiments.studies.trained_run import TrainedRun, open_run
 from jaxcloseup.app.cli.start import loading, set_up_compilation_cache, start
 from jaxcloseup.app.run.kept_detail import detailed, make_detail
-from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.labels import start_labels
 from jaxcloseup.app.run.scoring import hold_out
 from jaxcloseup.app.run.step_data import TrainData
@@ -98,7 +97,7 @@ def main(_: list[str]) -> None:
 def print_arms(run: TrainedRun) -> None:
     """Train and score both arms of a run, and print them beside detail as it is."""
     programs, detail = run.programs, run.detail()
-    held_out = hold_out(programs, start_labels(programs, run.state, run_keys(0)))
+    held_out = hold_out(programs, start_labels(programs, run.state))
     score = functools.partial(score_views, held_out.targets)
     scores = {"field": score(functools.partial(programs.render, run.state))}
     scores["detail"] = score(with_detail(run, run.state, detail))

@@ -181,7 +181,7 @@ def _work(piece: Piece, keys: RunKeys) -> None:
     )
     if set(_STAGES) <= set(piece.scores["stages"]):
         return
-    start = start_labels(programs, baseline, keys, expected_depth=preset.labels.expected_depth)
+    start = start_labels(programs, baseline, expected_depth=preset.labels.expected_depth)
     targets = hold_out(programs, start).targets
     piece.clock.restart()
     piece.score("baseline", baseline, targets)

@@ -33,7 +33,6 @@ from experiments.studies.trained_run import open_run
 from jaxcloseup.app.cli.start import loading, set_up_compilation_cache, start
 from jaxcloseup.app.methods.nerf import RELEASED
 from jaxcloseup.app.methods.registry import METHODS
-from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.labels import LabelStart, start_labels
 from jaxcloseup.app.run.loop import Training, train_stage
 from jaxcloseup.app.run.scoring import hold_out
@@ -196,7 +195,7 @@ def train_arms(folder: pathlib.Path, names: Mapping[str, str]) -> dict[str, Any]
     run = open_run(folder, "baseline")
     programs, labels = run.programs, run.programs.preset.labels
     seed = read_object(folder / "checkpoints" / "run.json")["seed"]
-    start = start_labels(programs, run.state, run_keys(seed), expected_depth=labels.expected_depth)
+    start = start_labels(programs, run.state, expected_depth=labels.expected_depth)
     arms = {title: make_arm(name, programs.preset) for title, name in missing.items()}
     scorer = ArmScorer(programs, hold_out(programs, start), [*arms.values()], find_perceptual())
     for title, arm in arms.items():

@@ -104,8 +104,8 @@ class LabelRule(NamedTuple):
 
     Attributes:
       depth: `(rendering, near=, far=) -> [...]`, the z-depth of labels, 0 where undefined.
-      depth_key: `key -> key | None`, the random key of the rendering that depth is taken from;
-        None renders without sampling noise.
+      depth_key: `key -> key | None`, the random key with which virtual pixels are rendered for
+        their depth; None renders without sampling noise. Photographs' depths never have it.
       loss: joins the losses of photographs and labels, as `add_label_loss` does.
     """
 

@@ -16,7 +16,7 @@ import plane
 import pytest
 from absl import flags
 from absl.testing import flagsaver
-from tiny_runs import TINY_MIP, TINY_SURFELS
+from tiny_runs import TINY, TINY_MIP, TINY_SURFELS
 
 from jaxcloseup.app import methods
 from jaxcloseup.app.cli import render, run, sweep
@@ -26,6 +26,7 @@ from jaxcloseup.app.methods.settings import with_settings
 from jaxcloseup.app.methods.shared import splat_training
 from jaxcloseup.app.methods.shared.splat_training import extent, make_field
 from jaxcloseup.app.run.keys import run_keys
+from jaxcloseup.app.run.labels import start_labels
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.states import (
     FEWEST_POINTS,
@@ -69,6 +70,21 @@ def test_cameras_in_one_place_have_the_size_of_what_they_see(scene):
         assert extent(here) == pytest.approx(0.5 * scene.far)
     own = 1.1 * np.hypot(1, 0.1)
     assert extent(scene) == pytest.approx(own * scene.placement.scale, rel=1e-3)
+
+
+def test_the_released_rule_perturbs_virtual_views_and_no_photographs(scene, monkeypatch):
+    train = dataclasses.replace(TINY.train, label_rule="released")
+    programs = Programs(dataclasses.replace(TINY, train=train), scene)
+    state, keys = initial_state(programs, run_keys(0)), []
+    render = programs.render
+
+    def recorded(state, camera, key=None):
+        keys.append(key)
+        return render(state, camera, key)
+
+    monkeypatch.setattr(programs, "render", recorded)
+    depths = start_labels(programs, state).sources.depths
+    assert keys == [None] * len(depths)
 
 
 def test_the_near_plane_is_small_in_a_small_scene(scene, monkeypatch):

@@ -24,7 +24,6 @@ from tiny_training import assert_same_step
 from jaxcloseup.app.cli import sweep
 from jaxcloseup.app.report.pictures import comparisons
 from jaxcloseup.app.report.sweep_tables import write_sweep
-from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.labels import start_labels
 from jaxcloseup.app.run.states import initial_points
 from jaxcloseup.app.run.step_data import CloseupData, TrainData
@@ -51,7 +50,7 @@ def begin(preset, capture_folder):
         jax.random.key(0), *points, field=programs.field, optimizer=programs.optimizer
     )
     state, _ = programs.run(state, TrainData(scene.train), count=3)
-    start = start_labels(programs, state, run_keys(0))
+    start = start_labels(programs, state)
     return programs, start, [make_arm(name, preset).settings for name in ARMS]
 
 

@@ -47,7 +47,7 @@ def serve(viser):
     def call(programs, state):
         port = free_port()
         servers.append(serve("127.0.0.1", port))
-        page = Viewer(servers[0], programs, state, stage="closeup", seed=0)
+        page = Viewer(servers[0], programs, state, stage="closeup")
         call.visitors = welcome_visitors(servers[0], page)
         return page, f"http://127.0.0.1:{port}"
 

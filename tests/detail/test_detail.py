@@ -103,7 +103,7 @@ def test_target_views_may_be_labeled_by_their_detail(rendered, found, monkeypatc
     monkeypatch.setattr(programs, "preset", gated)
     monkeypatch.setattr(gate, "weigh_labels", lambda *_: pytest.fail("asked the gate"))
     monkeypatch.setattr(kept_detail, "make_detail", lambda *_: pytest.fail("made again"))
-    views, start = programs.scene.test, start_labels(programs, state, run_keys(0))
+    views, start = programs.scene.test, start_labels(programs, state)
     find = detail_getter(programs, state, path)
     labels = label_target_views(programs, start, views.cameras, by_detail, None, find)
     truth = np.asarray(to_float(views.rgb))

@@ -51,12 +51,7 @@ def main(_: list[str]) -> None:
         programs, state = restore(record, scene, stage)
         viser_server = server.serve(FLAGS.host, FLAGS.port)
         viewer = Viewer(
-            viser_server,
-            programs,
-            state,
-            stage=stage,
-            seed=record.identity["seed"],
-            kept=detail_path(record.folder, stage),
+            viser_server, programs, state, stage=stage, kept=detail_path(record.folder, stage)
         )
         welcome.welcome_visitors(viser_server, viewer)
     print(f"open http://{FLAGS.host}:{FLAGS.port} in a browser; press Ctrl-C to stop", flush=True)

@@ -9,8 +9,6 @@ class RunKeys:
     """A key for each use of random numbers, all from the seed of a run."""
 
     init: jax.Array  # draws the initial parameters, and from there the steps of all stages
-    # Renders the depths of photographs, where the label rule asks for sampling noise.
-    depths: jax.Array
     points: jax.Array  # draws initial points
     closeups: jax.Array  # draws the cameras of close-ups that are labeled before the first step
     audit: jax.Array  # draws the close-ups of the audit of labels
@@ -24,7 +22,6 @@ def run_keys(seed: int) -> RunKeys:
     init, audit, pictures = jax.random.split(root, 3)
     return RunKeys(
         init=init,
-        depths=jax.random.fold_in(init, 1),
         points=jax.random.fold_in(init, 2),
         closeups=jax.random.fold_in(root, 3),
         audit=audit,

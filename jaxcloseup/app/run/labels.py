@@ -32,7 +32,7 @@ class LabelStart(NamedTuple):
 
 
 def start_labels(
-    programs: Programs, state: Any, keys: RunKeys, *, expected_depth: bool | None = None
+    programs: Programs, state: Any, *, expected_depth: bool | None = None
 ) -> LabelStart:
     """Return the state whose depth labels are made from, and the photographs with its depths."""
     if expected_depth is not None:
@@ -45,7 +45,6 @@ def start_labels(
         scene.train.cameras,
         scene,
         near=scene.near,
-        key=rule.depth_key(keys.depths),
         depth=rule.depth,
         sizes=scene.sizes("train"),
     )
@@ -58,22 +57,20 @@ def rendered_depths(
     scene: Scene,
     *,
     near: float = 0.0,
-    key: jax.Array | None = None,
     depth: Callable[..., jax.Array] = label_depth,
     sizes: Sequence[tuple[int, int]] | None = None,
 ) -> jax.Array:
     """Render the depths `[V, H, W]` of stacked cameras, for labels and anchors.
 
     `near` is 0 by default, because close-ups may be nearer to the surface than any photograph.
-    Without a key, rendering is deterministic; `depth` is that of a `LabelRule`, and `sizes` are
-    those of views without padding.
+    Rendering is deterministic; `depth` is that of a `LabelRule`, and `sizes` are those of views
+    without padding.
     """
     return render_depths(
         render,
         cameras,
         near=near,
         far=scene.far,
-        key=key,
         depth=depth,
         sizes=sizes,
         each=lambda one_view, views: progress.each(one_view, views, "rendering depths"),

@@ -162,7 +162,7 @@ def train_baseline_stage(
     write_exposures(output_dir, programs.exposures, programs.scene.names["train"])
     state = train_baseline(training, "baseline", keys, coarse)
     with timed(training.seconds, "depths"):
-        start = start_labels(programs, state, keys, expected_depth=labels.expected_depth)
+        start = start_labels(programs, state, expected_depth=labels.expected_depth)
         held_out = hold_out(programs, start)
     write_truth(output_dir / "renders" / "truth", held_out.all)
     scorer = Scorer(training, held_out, output_dir, perceptual)

@@ -111,10 +111,8 @@ class Starts:
     def __init__(self, training: Training, seeds: int) -> None:
         """Train a baseline for each seed."""
         self._programs = training.programs
-        self._keys = [run_keys(seed) for seed in range(seeds)]
         self._baselines = [
-            train_baseline(training, f"baseline_{seed}", keys)
-            for seed, keys in enumerate(self._keys)
+            train_baseline(training, f"baseline_{seed}", run_keys(seed)) for seed in range(seeds)
         ]
         histories = (training.history[f"baseline_{seed}"] for seed in range(seeds))
         self.skipped = [count_skipped(history) for history in histories]
@@ -124,10 +122,7 @@ class Starts:
         """Return the start of a seed; `expected_depth` as in `LabelConfig`."""
         if (seed, expected_depth) not in self._starts:
             self._starts[seed, expected_depth] = start_labels(
-                self._programs,
-                self._baselines[seed],
-                self._keys[seed],
-                expected_depth=expected_depth,
+                self._programs, self._baselines[seed], expected_depth=expected_depth
             )
         return self._starts[seed, expected_depth]
 

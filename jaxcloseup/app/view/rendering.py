@@ -13,7 +13,6 @@ from jaxcloseup.app import progress
 from jaxcloseup.app.run.exposed import how_taken
 from jaxcloseup.app.run.fine_tuning import fine_tune, tuned_detail
 from jaxcloseup.app.run.kept_detail import detail_getter, detail_path
-from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.labels import start_labels
 from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.store.stored_run import StoredRun, restore
@@ -105,8 +104,7 @@ def render_run(
     sources = None
     if support or fine_tuned:
         expected = record.preset.labels.expected_depth
-        keys = run_keys(record.identity["seed"])
-        start = start_labels(programs, state, keys, expected_depth=expected)
+        start = start_labels(programs, state, expected_depth=expected)
         sources = start.sources if support else None
     begin = start.state if fine_tuned else state
     kept = detail_path(record.folder, stage) if begin is state else None

@@ -18,7 +18,6 @@ import numpy as np
 from jaxcloseup.app.run.exposed import expose
 from jaxcloseup.app.run.fine_tuning import fine_tune, tuned_detail
 from jaxcloseup.app.run.kept_detail import detail_getter, detailed
-from jaxcloseup.app.run.keys import run_keys
 from jaxcloseup.app.run.labels import LabelStart, start_labels
 from jaxcloseup.app.run.loop import TrainingError
 from jaxcloseup.app.run.programs import Programs
@@ -91,7 +90,6 @@ class Viewer:
         state: TrainState,
         *,
         stage: str,
-        seed: int,
         kept: pathlib.Path | None = None,
     ) -> None:
         """Show the scene on the server's pages; `welcome_visitors` fills them.
@@ -101,12 +99,11 @@ class Viewer:
           programs: the run's compiled programs.
           state: the state to show; every fine-tuning starts from it.
           stage: name of the state's stage.
-          seed: the run's seed.
           kept: file that keeps the state's detail, or None.
         """
         self.programs, self.state, self.scene = programs, state, programs.scene
         self.title = f"{self.scene.name}, {stage}"
-        self._keys, self._find = run_keys(seed), detail_getter(programs, state, kept)
+        self._find = detail_getter(programs, state, kept)
         self._jobs: queue.Queue[_Job] = queue.Queue(maxsize=1)
         self._queueing = threading.Lock()
         _, positions = training_focus(self.scene)
@@ -276,4 +273,4 @@ class Viewer:
     def labels(self) -> LabelStart:
         """Start of fine-tuning, with the depths that support needs; made once."""
         expected = self.programs.preset.labels.expected_depth
-        return start_labels(self.programs, self.state, self._keys, expected_depth=expected)
+        return start_labels(self.programs, self.state, expected_depth=expected)
