@@ -56,7 +56,7 @@ def load_scene(
       name_or_path: one of `DRAWN_SCENES`, or a folder; `./table` always names a folder.
       downscale: divisor of the photographs' size, by averaging areas; None: chosen by `pixels`.
       pixels: about how many pixels photographs keep.
-      half_pixel: whether the files put pixel centers at integers, as the paper's data does.
+      half_pixel: whether the files put pixel centers at integers, as the paper's script does.
       background: gray level in [0, 1] behind transparent pixels.
       format: the only format to read, `transforms`, `colmap` or `llff`; None reads the first found.
       split: how to hold out photographs: one of `SPLITS`, as docs/programs.md describes them.
