@@ -64,8 +64,10 @@ Listing::Listing(xla::ffi::ThreadPool& pool, const Passes& passes, const Image& 
 
 void Listing::deal_out() {
   band_starts.resize(bands + 1);
-  for (size_t i = 0; i < splats.size(); i++)
-    for (int band = bands_of(i).first; band <= bands_of(i).last; band++) band_starts[band + 1]++;
+  for (size_t i = 0; i < splats.size(); i++) {
+    const Range own = bands_of(i);
+    for (int band = own.first; band <= own.last; band++) band_starts[band + 1]++;
+  }
   for (int band = 0; band < bands; band++) band_starts[band + 1] += band_starts[band];
   members.resize(band_starts.back());
   places.resize(starts.back());
@@ -99,7 +101,7 @@ void BandLists::make(const Image& image, const Listing& listing, int number) {
         work(static_cast<int>(k), row - first_row, ranges[row - down.first]);
     }
   };
-  // First by how much a tile has more than the one before it, in `next`.
+  // By how much each tile's list is longer than that of the tile before it, for now in `next`.
   next.assign(tiles + 1, 0);
   each_row([&](int, int row, Range range) {
     if (range.first > range.last) return;
