@@ -75,7 +75,7 @@ def read_colmap(files: ModelFiles) -> Model:
         visible = np.array(sorted(rows[point] for point in seen & rows.keys()), np.int64)
         observed |= bool(len(visible))
         frames.append(frame._replace(seen=visible))
-    if len(points) and not observed:
+    if not observed:
         frames = [frame._replace(seen=None) for frame in frames]
     return Model(source, frames, points, rgb, errors, notes)
 

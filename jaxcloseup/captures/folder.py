@@ -213,6 +213,8 @@ def _with_points(
 ) -> Listing:
     """Add points triangulated from the training photographs to a listing without points.
 
+    What the capture's files say of points, which photographs see them and how well, goes.
+
     Args:
       listing: listing without points.
       photos: training photographs.
@@ -230,7 +232,13 @@ def _with_points(
         f"features of its {count} training photographs"
     )
     _log.info(note)
-    return listing._replace(points=points, rgb=rgb, notes=(*listing.notes, note))
+    frames = {
+        split: [frame._replace(seen=None) for frame in part]
+        for split, part in listing.frames.items()
+    }
+    return listing._replace(
+        frames=frames, points=points, rgb=rgb, errors=None, notes=(*listing.notes, note)
+    )
 
 
 def _triangulate(

@@ -16,7 +16,7 @@ from jaxcloseup.io.files import read_bytes
 from jaxcloseup.photos.scene import SceneError
 
 
-ENDINGS = {".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"}  # of photographs
+ENDINGS = {".png", ".jpg", ".jpeg", ".jfif", ".webp", ".tif", ".tiff", ".bmp"}  # of photographs
 MOST_PIXELS = 170_000_000  # a file of 100 kB may claim a billion of them
 _MARKER = re.compile(rb"\xff+([^\x00\xff])", re.DOTALL)  # of a JPEG, before its scan
 _filters = threading.Lock()  # filters of warnings belong to all threads
@@ -93,8 +93,7 @@ def downscale_image(image: np.ndarray, factor: int) -> np.ndarray:
 def size_of_image(path: pathlib.Path) -> tuple[int, int] | None:
     """Return width and height that a file's header says; None where Pillow cannot read it."""
     try:
-        with PIL.Image.open(path) as image:
-            return image.size
+        return _header_size(path)
     except (OSError, ValueError, PIL.Image.DecompressionBombError):
         return None
 
@@ -145,15 +144,20 @@ def decode_channels(path: pathlib.Path, data: np.ndarray) -> tuple[np.ndarray, n
 def _pixels(data: np.ndarray) -> float:
     """Return the pixels that an image's header claims; 0 for formats unknown to Pillow."""
     try:
-        # Pillow warns of many pixels too, and of fields that do not matter here.
-        with _filters, warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with PIL.Image.open(io.BytesIO(data.data)) as image:
-                return math.prod(image.size)
+        return math.prod(_header_size(io.BytesIO(data.data)))
     except PIL.Image.DecompressionBombError:
         return math.inf
     except Exception:  # OpenCV tells what is wrong
         return 0
+
+
+def _header_size(file: pathlib.Path | io.BytesIO) -> tuple[int, int]:
+    """Return width and height that an image's header says; raise what Pillow raises."""
+    # Pillow warns of many pixels, which `MOST_PIXELS` limits, and of fields that do not matter.
+    with _filters, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with PIL.Image.open(file) as image:
+            return image.size
 
 
 def _is_truncated_jpeg(data: bytes) -> bool:

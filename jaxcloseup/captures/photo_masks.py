@@ -9,7 +9,7 @@ instant-ngp's `images/dynamic_mask_a.png` comes last, and ignores all that is no
 import collections
 import functools
 import pathlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 
 from jaxcloseup.captures.mask_values import MaskValues, understand_masks
 from jaxcloseup.captures.photo_files import ENDINGS
@@ -53,12 +53,12 @@ def attach_masks(folder: pathlib.Path, splits: dict[str, list[Frame]]) -> dict[s
     """
     every = [frame for frames in splits.values() for frame in frames]
     waiting = list({frame.file: frame for frame in every if frame.mask is None}.values())
-    places = {frame.file: list(_places(folder, frame.file)) for frame in waiting}
-    holders = sorted({holder for found in places.values() for holder, _ in found})
+    places = functools.cache(functools.partial(_places, folder.resolve()))
+    holders = sorted({holder for frame in waiting for holder, _ in places(frame.file.parent)})
     pictures = functools.cache(_by_stem)  # list each folder once
     found: dict[pathlib.Path, pathlib.Path | None] = {}
-    for file, around in places.items():
-        masks = (_find(pictures(place), file, _IN_FOLDER) for _, place in around)
+    for file in (frame.file for frame in waiting):
+        masks = (_find(pictures(place), file, _IN_FOLDER) for _, place in places(file.parent))
         found[file] = next((mask for mask in masks if mask), None)
     listed = {frame.file for frame in every}
     total = len(listed)
@@ -105,20 +105,23 @@ def understood_masks(
     return values, (note + "; the others are used whole" * (len(masked) < len(every)),)
 
 
-def _places(
-    folder: pathlib.Path, photograph: pathlib.Path
-) -> Iterator[tuple[pathlib.Path, pathlib.Path]]:
-    """Yield the `masks/` folders around a photograph, each with the subfolder for its mask."""
-    around = list(photograph.parents)
+def _places(capture: pathlib.Path, folder: pathlib.Path) -> list[tuple[pathlib.Path, pathlib.Path]]:
+    """List the `masks/` folders around a folder of photographs, each with the one for its masks.
+
+    `capture` is the resolved path of the capture's folder.
+    """
+    around, places = [folder, *folder.parents], []
+    # A file may list absolute paths of a capture whose own path is relative or leads over a link.
+    ends = (end for end, root in enumerate(around, 1) if root.resolve() == capture)
     # Photographs may lie outside the capture's folder; then their two nearest folders count.
-    around = around[: around.index(folder) + 1] if folder in around else around[:2]
-    for root in around:
+    for root in around[: next(ends, 2)]:
         if (root / FOLDER).is_dir():
             # A file may list ../images/a.jpg, but masks/../images holds no masks.
-            inner = [part for part in photograph.parent.relative_to(root).parts if part != ".."]
-            yield root / FOLDER, root.joinpath(FOLDER, *inner)
+            inner = [part for part in folder.relative_to(root).parts if part != ".."]
+            places.append((root / FOLDER, root.joinpath(FOLDER, *inner)))
             if inner:  # masks/ beside images/ may leave out the name images
-                yield root / FOLDER, root.joinpath(FOLDER, *inner[1:])
+                places.append((root / FOLDER, root.joinpath(FOLDER, *inner[1:])))
+    return places
 
 
 def list_pictures(folder: pathlib.Path) -> tuple[pathlib.Path, ...]:

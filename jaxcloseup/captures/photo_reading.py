@@ -25,7 +25,7 @@ from jaxcloseup.io.memory import installed_memory
 from jaxcloseup.photos.scene import SceneError
 
 
-_MAX_CONCURRENT = 4  # each needs a few times its own size: 12 megapixels take about 100 MB
+MAX_CONCURRENT = 4  # each needs a few times its own size: 12 megapixels take about 100 MB
 _SOURCES = (
     *("photo.py", "photo_reading.py", "photo_files.py", "file_kinds.py", "mask_values.py"),
     "distortion.py",
@@ -37,7 +37,7 @@ _log = logging.getLogger(__name__)
 
 
 def read_photos(splits: Mapping[str, Sequence[Frame]], reading: Reading) -> dict[str, list[Photo]]:
-    """Read the photographs of each split, at most `_MAX_CONCURRENT` at full size in memory.
+    """Read the photographs of each split, at most `MAX_CONCURRENT` at full size in memory.
 
     Raises:
       SceneError: a photograph or mask cannot be read, their sizes differ, or the photographs do not
@@ -56,7 +56,7 @@ def read_photos(splits: Mapping[str, Sequence[Frame]], reading: Reading) -> dict
     )
     first = read(frames[0], frames[0].file in closeups)
     _check_memory(first[0], len(frames), reading)
-    workers = min(_MAX_CONCURRENT, os.cpu_count() or 1)
+    workers = min(MAX_CONCURRENT, os.cpu_count() or 1)
     # OpenCV decodes without Python's lock.
     with concurrent.futures.ThreadPoolExecutor(workers) as pool:
         each = pool.map(read, frames[1:], [frame.file in closeups for frame in frames[1:]])

@@ -26,7 +26,14 @@ def is_stand_in(frame: Frame) -> bool:
     """Return True if a frame's file is shrunk, because `images` does not exist."""
     names = {f"{_FOLDER}_{factor}" for factor in _FACTORS}
     names -= set(pathlib.PurePath(frame.listed).parts)
-    return any(root.name in names for root in frame.file.parents)
+    shrunk = [root for root in frame.file.absolute().parents if root.name in names]
+    if not shrunk:
+        return False
+    # The capture holds the file that lists the photograph, so what this lies in too is the capture
+    # or above it, whatever its name. A model's folder is resolved to find its capture.
+    source = frame.source
+    ways = source.absolute(), source.parent.resolve() / source.name
+    return not {root for way in ways for root in way.parents}.issuperset(shrunk)
 
 
 def note_stand_ins(name: str, frames: Sequence[Frame]) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ from jaxcloseup.captures.contents import list_photographs
 from jaxcloseup.captures.names import file_names
 from jaxcloseup.captures.photo import Reading
 from jaxcloseup.captures.photo_masks import understood_masks
+from jaxcloseup.captures.world_frames import Frame
 from jaxcloseup.checks.evidence import gather
 from jaxcloseup.checks.judge import Checked, judge
 from jaxcloseup.io.cache import Stored, cache_path, cached, content_hash, hash_files
@@ -67,7 +68,7 @@ def check_capture(
 
     files = [file for frame in frames for file in (frame.file, frame.mask) if file]
     stats = [(str(file), (s := file.stat()).st_size, s.st_mtime_ns) for file in files]
-    given = [(f.listed, f.camtoworld.tolist(), f.size, f.lens, f.turns) for f in frames], names
+    given = [(f.listed, f.camtoworld.tolist(), f.size, _lens(f), f.turns) for f in frames], names
     code = hash_files(sorted(pathlib.Path(__file__).parent.glob("*.py")))
     points = content_hash(np.ascontiguousarray(listed.points))
     key = content_hash(repr([code, reading, stats, given, points]).encode())
@@ -80,6 +81,15 @@ def check_capture(
         report=_log.warning,
         report_unwritable=_log.debug,
     )
+
+
+def _lens(frame: Frame) -> list[dict[str, Any]]:
+    """Return a frame's own fields and those of its whole file, without lists."""
+    # Those of a file are of all its photographs, whose text would be repeated for each of them.
+    return [
+        {key: value for key, value in fields.items() if not isinstance(value, list)}
+        for fields in frame.lens
+    ]
 
 
 def _unpack(record: dict[str, Any]) -> Checked:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxcloseup.captures.names import file_names
 from jaxcloseup.captures.photo import Photo, Reading
 from jaxcloseup.captures.photo_checks import is_rotated, wrong_size
+from jaxcloseup.captures.photo_reading import MAX_CONCURRENT
 from jaxcloseup.captures.sift import Features, find_features
 from jaxcloseup.captures.small_photos import read_small
 from jaxcloseup.captures.world_frames import Frame
@@ -60,8 +61,8 @@ def gather(
         # Colors are done with.
         return photo._replace(rgb=photo.rgb[:, :, :0]), gray, features, look(photo.rgb, photo.mask)
 
-    done = []
-    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+    done, workers = [], min(MAX_CONCURRENT, os.cpu_count() or 1)  # each decodes at full size
+    with concurrent.futures.ThreadPoolExecutor(workers) as pool:
         for found in pool.map(measure, frames):
             done.append(found)
             report(len(done))

@@ -13,7 +13,7 @@ from absl import flags
 from posing import run_process, write_noise
 from wrong_input import HEIC, put
 
-from jaxcloseup.app.process import solver_process
+from jaxcloseup.app.process import capture_stages, solver_process
 from jaxcloseup.app.process.from_above import draw_cameras
 from jaxcloseup.app.process.pairs import (
     choose_pairing,
@@ -23,6 +23,7 @@ from jaxcloseup.app.process.pairs import (
 )
 from jaxcloseup.app.process.photo_folder import copy_photographs, list_files
 from jaxcloseup.app.process.video_frames import choose_frames
+from jaxcloseup.app.run import manifest
 from jaxcloseup.artifacts.video import write_video
 from jaxcloseup.captures.load import SceneError, load_scene
 
@@ -39,7 +40,7 @@ def test_photographs_in_subfolders(tmp_path, capsys):
     names = ["0.png", "1.png", "images/0.png", "images/1.png"]
     names += [f"left cam/{i}.png" for i in range(3)]
     found, left_out = list_files(tmp_path / "in")
-    assert [path.as_posix() for path in found] == names and not left_out
+    assert [path.as_posix() for path in found] == names and list(left_out) == ["made/"]
     for i, name in enumerate(names):  # none is a copy of another
         image = np.random.default_rng(i).integers(0, 255, (60, 80, 3))
         cv2.imwrite(str(tmp_path / "in" / name), image)
@@ -52,6 +53,40 @@ def test_photographs_in_subfolders(tmp_path, capsys):
     assert set(lenses) == {name.replace(" ", "_") for name in names}
     groups = {(pathlib.PurePath(name).parent, lens) for name, lens in lenses.items()}
     assert len(groups) == len(set(lenses.values())) == 3
+
+
+def test_results_of_this_package_are_no_photographs(tmp_path):
+    """They are left out with all below them, and this is said; the folder that is given counts."""
+    marks = [capture_stages.NAME, "source.json", manifest.NAME]
+    write_noise(tmp_path / "in", 3)
+    (tmp_path / "in" / manifest.NAME).write_text("{}")
+    for i, mark in enumerate(marks):
+        (tmp_path / f"in/outputs/{i}/share").mkdir(parents=True)
+        (tmp_path / f"in/outputs/{i}" / mark).write_text("{}")
+        write_noise(tmp_path / f"in/outputs/{i}/closeups", 3)
+        write_noise(tmp_path / f"in/outputs/{i}/share/closeups", 3)
+    found, left_out = list_files(tmp_path / "in")
+    assert [path.name for path in found] == ["0.png", "1.png", "2.png"]
+    assert left_out.pop(manifest.NAME) == "is not a photograph"
+    assert list(left_out) == ["outputs/0/", "outputs/1/", "outputs/2/"]
+    for mark, why in zip(marks, left_out.values(), strict=True):
+        assert why.startswith(f"holds {mark}, as results of jaxcloseup do: move photographs")
+    for path in found:
+        (tmp_path / "in" / path).unlink()
+    words = r"0 photographs .* beside 1 files .*, and outputs/0/ holds process\.json, as results"
+    with pytest.raises(solver_process.ProcessingError, match=words):
+        list_files(tmp_path / "in")
+
+
+def test_jpegs_of_another_ending_are_photographs(tmp_path):
+    names = ["0.jfif", "1.JFIF", "2.jpg"]
+    for i, name in enumerate(names):
+        data = cv2.imencode(".jpg", np.full((60, 80, 3), 50 * i, np.uint8))[1]
+        (tmp_path / name).write_bytes(data.tobytes())
+    found, left_out = list_files(tmp_path)
+    assert [path.name for path in found] == names and not left_out
+    copied, left_out = copy_photographs(found, tmp_path, tmp_path / "out")
+    assert [copy.name for copy in copied] == ["0.jpg", "1.jpg", "2.jpg"] and not left_out
 
 
 def test_numbered_folders_hold_photographs_unless_beside_their_originals(tmp_path):

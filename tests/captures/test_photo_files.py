@@ -10,7 +10,7 @@ from tiny_capture import HEIGHT, WIDTH, tiff, write_image
 
 from jaxcloseup.captures import photo_files
 from jaxcloseup.captures.load import SceneError
-from jaxcloseup.captures.photo_files import decode_image, read_image
+from jaxcloseup.captures.photo_files import decode_image, read_image, size_of_image
 
 
 def test_gray_deep_and_transparent_images(tmp_path):
@@ -107,6 +107,7 @@ def test_small_files_of_many_pixels_are_refused_before_they_are_decoded(tmp_path
                 read_image(tmp_path / f"a{suffix}")
     monkeypatch.setattr(PIL.Image, "MAX_IMAGE_PIXELS", WIDTH * HEIGHT - 1)  # Pillow would warn
     assert read_image(tmp_path / "a.png").shape == (HEIGHT, WIDTH, 3)
+    assert size_of_image(tmp_path / "a.png") == (WIDTH, HEIGHT)
     monkeypatch.setattr(PIL.Image, "MAX_IMAGE_PIXELS", 1)  # and raise
     with pytest.raises(SceneError, match="megapixels and is too large to decode"):
         read_image(tmp_path / "a.png")

@@ -77,6 +77,20 @@ def test_photographs_outside_the_folder(tmp_path, beside):
     assert weights(load_scene(tmp_path / "ngp"))["a"] == pytest.approx(3 / 8)
 
 
+@pytest.mark.parametrize("given", ["capture", "link"])
+def test_absolute_paths_of_photographs(tmp_path, monkeypatch, given):
+    """The capture itself may be given by another path, relative or through a link."""
+    capture = tmp_path / "capture"
+    write_image(capture / "images/left/a.png")
+    write_image(capture / "masks/left/a.png", HALF)
+    file = str(capture / "images/left/a.png")
+    pose = {"file_path": file, "transform_matrix": POSE.tolist(), "fl_x": 9.0}
+    write_json(capture / "transforms.json", [pose])
+    (tmp_path / "link").symlink_to(capture)
+    monkeypatch.chdir(tmp_path)
+    assert weights(load_scene(given)) == pytest.approx({"a": 3 / 8})
+
+
 def test_a_mask_is_undistorted_with_its_photograph(tmp_path):
     """A mask found by name gives the same weights as one that the frame names."""
     lens = {"fl_x": 30.0, "cx": 24.0, "cy": 20.0, "w": 48, "h": 40, "k1": -0.2, "p1": 0.01}

@@ -28,7 +28,7 @@ def write_photographs(folder, count, width, height):
 
 def test_photographs_are_never_all_in_memory_at_full_size(tmp_path, monkeypatch):
     """12 photographs of 3 megapixels take 108 MB; loading holds only a few at full size."""
-    monkeypatch.setattr(photo_reading, "_MAX_CONCURRENT", 2)
+    monkeypatch.setattr(photo_reading, "MAX_CONCURRENT", 2)
     image = write_photographs(tmp_path, 12, 2000, 1500)
     tracemalloc.start()
     try:

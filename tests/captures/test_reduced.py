@@ -128,6 +128,26 @@ def test_shrunk_photographs_alone_need_sizes(tmp_path):
         load_scene(tmp_path)
 
 
+@pytest.mark.parametrize("place", ["images_4/capture", "images_4"])
+def test_folders_above_a_capture_do_not_shrink_its_photographs(tmp_path, monkeypatch, place):
+    image = {"file_path": "a.png", "transform_matrix": POSE.tolist()}
+    write_image(tmp_path / place / "a.png", picture(0))
+    write_json(tmp_path / place / "transforms_train.json", [image], fl_x=7.0)
+    monkeypatch.chdir(tmp_path)
+    for folder in (tmp_path / place, place):
+        rgb, _, scene = load(folder)
+        assert (rgb[0] == picture(0)).all() and "shrunk" not in " ".join(scene.metadata["notes"])
+
+
+def test_folders_above_a_model_do_not_shrink_its_photographs(tmp_path, monkeypatch):
+    """The folder of a model is given by its relative path, and its capture is found from there."""
+    pytest.importorskip("pycolmap")
+    colmap_capture(tmp_path / "images_4/capture")
+    monkeypatch.chdir(tmp_path)
+    for folder in ("images_4/capture", "images_4/capture/sparse/0"):
+        assert "shrunk" not in " ".join(load(folder)[2].metadata["notes"])
+
+
 # The cache.
 
 

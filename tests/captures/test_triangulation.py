@@ -1,8 +1,9 @@
 import cv2
 import numpy as np
 import pytest
-from tiny_capture import own_points, write_image, write_json
+from tiny_capture import image_line, own_points, write_image, write_json, write_model
 
+from jaxcloseup.app.methods.shared.sightings import find_sightings
 from jaxcloseup.captures import folder as folder_module
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.captures.triangulation import triangulate
@@ -90,6 +91,27 @@ def test_a_capture_without_points_gets_triangulated_ones(tmp_path, views):
     assert closest.metadata["times_nearer"] == pytest.approx([4.7 / 4.4], rel=0.03)
     again = load_scene(tmp_path, downscale=2)
     assert np.median(np.abs(own_points(again)[:, 2] - DEPTH)) < 0.05
+
+
+@pytest.mark.parametrize("point", [False, True])
+def test_triangulated_points_are_not_those_that_a_model_lists(tmp_path, views, point):
+    """The only one, if any, is dropped, because but one training photograph sees it."""
+    pytest.importorskip("pycolmap")
+    lines = []
+    for i, (image, pose) in enumerate(zip(*views, strict=True)):
+        write_image(tmp_path / f"images/{i}.png", image)
+        turn = -cv2.Rodrigues(pose[:, :3])[0][:, 0]  # to world-to-camera
+        half = np.linalg.norm(turn) / 2
+        quaternion = [np.cos(half), *(np.sin(half) * turn / (2 * half))]
+        numbers = " ".join(map(str, [*quaternion, *(-pose[:, :3].T @ pose[:, 3])]))
+        lines += [image_line(i + 1, f"{i}.png", numbers), "118 91 1" if point and i < 2 else ""]
+    camera = f"1 PINHOLE {WIDTH} {HEIGHT} {' '.join(map(str, LENS))}"
+    points = ["1 0 0 5 9 9 9 0.5 1 0 2 0"] if point else []
+    write_model(tmp_path / "sparse/0", lines, [camera], points)
+    scene = load_scene(tmp_path)
+    assert any("dropped 1 of 1 points" in note for note in scene.metadata["notes"]) == point
+    assert len(scene.points) > 300 and scene.metadata["point_errors"] is None
+    assert "seen" not in scene.metadata and len(find_sightings(scene).view) > 300
 
 
 def test_too_few_points_are_dropped(tmp_path, views, monkeypatch):

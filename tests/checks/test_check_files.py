@@ -1,6 +1,9 @@
 """A check reads sizes, masks and names as training does."""
 
 import json
+import os
+import threading
+import time
 
 import cv2
 import numpy as np
@@ -13,7 +16,9 @@ from jaxcloseup.captures.contents import list_photographs
 from jaxcloseup.captures.corrections import correct_frames
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.captures.photo import Reading
+from jaxcloseup.captures.photo_reading import MAX_CONCURRENT
 from jaxcloseup.captures.world_frames import Frame
+from jaxcloseup.checks import check, evidence
 from jaxcloseup.checks.check import check_capture
 from jaxcloseup.photos.scene import SceneError
 
@@ -78,6 +83,46 @@ def test_masks_of_ones_are_understood(write):
         cv2.imwrite(str(folder / f"masks/{i:02d}.png"), mask)
     found = check_capture(folder)
     assert found.verdict == "fits" and not any("constant" in note for note in found.notes)
+
+
+def test_the_key_holds_a_files_lens_but_no_photograph_twice(write, monkeypatch):
+    texts = []
+
+    def spy(data):
+        texts.append(data)
+        return content_hash(data)
+
+    content_hash = check.content_hash
+    monkeypatch.setattr(check, "content_hash", spy)
+    monkeypatch.setattr(check, "cached", lambda path, key, *_, **__: key)
+    every = [f"images/{i:02d}.png" for i in range(len(poses()))]
+    folder = write(train_filenames=every)
+    key = check_capture(folder)
+    assert texts[-1].count(b"file_path") == len(every)
+    assert texts[-1].count(b"images/03.png") < 10
+    assert check_capture(folder) == key
+    fields = json.loads((folder / "transforms.json").read_text())
+    (folder / "transforms.json").write_text(json.dumps(fields | {"k1": 0.01}))
+    assert check_capture(folder) != key
+
+
+def test_few_photographs_are_in_memory_at_full_size(write, monkeypatch):
+    monkeypatch.setattr(os, "cpu_count", lambda: 64)
+    running, most, lock, read = [], [], threading.Lock(), evidence.read_small
+
+    def spy(*given):
+        with lock:
+            running.append(given)
+            most.append(len(running))
+        time.sleep(0.02)  # in which other threads would begin
+        photo = read(*given)
+        running.pop()
+        return photo
+
+    monkeypatch.setattr(evidence, "read_small", spy)
+    monkeypatch.setattr(evidence, "find_matches", lambda features: features)
+    assert evidence.gather(list_photographs(write()).frames, Reading()).names
+    assert 1 < max(most) <= MAX_CONCURRENT
 
 
 def test_points_that_measure_nearness_do_not_lie_where_masks_hide(write, monkeypatch):

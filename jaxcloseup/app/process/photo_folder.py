@@ -33,6 +33,9 @@ _QUALITY = 95  # of a JPEG that was turned
 _KEPT = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}  # formats that COLMAP reads everywhere
 _HEAD = 2**16  # bytes that tell a format
 _OTHER = "is not a photograph"
+_RESULT = "holds {}, as results of jaxcloseup do: move photographs of your own elsewhere"
+# Files of `process`, `closeup`, and `run` and `sweep`, below which all pictures are their results.
+_RESULTS = {NAME, "source.json", "manifest.json"}
 _OTHERS = re.compile(r"\..*|masks")  # folders without photographs
 _REDUCED = re.compile(r"images_[248]")  # and, beside `images`, those of reduced copies
 _NEEDS_CONVERSION = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"}
@@ -54,22 +57,26 @@ class Copied(NamedTuple):
 
 
 def list_files(folder: pathlib.Path) -> tuple[list[pathlib.Path], dict[str, str]]:
-    """List the photographs of a folder and its subfolders, and why other files are left out.
+    """List the photographs of a folder and its subfolders, and why others are left out.
 
-    Both by path in the folder. Hidden folders, masks, reduced copies beside `images` and captures
-    that `process` made are not looked at.
+    Both by path in the folder. Hidden folders, masks and reduced copies beside `images` are not
+    looked at. Subfolders with results of this package are left out as a whole, because renders are
+    no photographs. What `render` and `export` write elsewhere than in a run is not recognized.
 
     Raises:
       ProcessingError: it is not a folder, or has fewer than 3 photographs.
     """
     if not folder.is_dir():
         raise ProcessingError(f"--images={folder} is not a folder: name a folder of photographs")
-    files = []
+    files, results = [], {}
     for place, folders, names in os.walk(folder, onerror=_refuse):
         inside = pathlib.Path(place).relative_to(folder)
-        captured = place != str(folder) and NAME in names
-        folders[:] = [] if captured else _with_photographs(folders)
-        paths = [inside / name for name in names if not captured and name[0] != "."]
+        if place != str(folder) and (held := _RESULTS.intersection(names)):
+            results[f"{printable(inside.as_posix())}/"] = _RESULT.format(min(held))
+            folders.clear()
+            continue
+        folders[:] = sorted(_with_photographs(folders))
+        paths = [inside / name for name in names if name[0] != "."]
         files += [path for path in paths if (folder / path).is_file()]
     files.sort()
     photographs = [path for path in files if path.suffix.lower() in ENDINGS]
@@ -79,13 +86,14 @@ def list_files(folder: pathlib.Path) -> tuple[list[pathlib.Path], dict[str, str]
             left_out[printable(path.as_posix())] = _why_not(folder / path)
     if len(photographs) < FEWEST:
         others = f" beside {len(left_out)} files that are not" if left_out else ""
+        left_out |= results
         unread = [f", and {name} {why}" for name, why in left_out.items() if why != _OTHER]
         raise ProcessingError(
             f"--images={folder} holds {len(photographs)} photographs "
             f"({', '.join(sorted(ENDINGS))}){others}: poses need at least {FEWEST}"
             + "".join(unread[:1])
         )
-    return photographs, left_out
+    return photographs, left_out | results
 
 
 def _with_photographs(folders: Sequence[str]) -> list[str]:
