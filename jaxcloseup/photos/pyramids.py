@@ -65,8 +65,9 @@ class Pyramid:
         return jnp.log2(focal[0] / focal)
 
     def level_near(self, width: float) -> int:
-        """Return the finest level that is not 1.5 times as wide as `width`; there must be one."""
-        return [finer < _WIDER * width for _, finer in self.sizes].index(True)
+        """Return the finest level that is not 1.5 times as wide as `width`, else the coarsest."""
+        fitting = (i for i, (_, wide) in enumerate(self.sizes) if wide < _WIDER * width)
+        return next(fitting, len(self.sizes) - 1)
 
     def image(self, view: int, index: int) -> jax.Array:
         """Return the image `[H, W, C]` of one view at one level."""

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+from types import SimpleNamespace
 
 import cv2
 import jax
@@ -111,6 +112,105 @@ def test_a_folder_holds_closeups_of_one_source(closeup, started, tmp_path, capsy
     (out / "run" / "results.json").write_text("{}")
     closeup(photographs)
     assert "monday has other files than those that" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "name", ["mesh/a.ply", "share/index.html", "run/results.json", "source.json"]
+)
+def test_a_folder_that_no_closeup_began_stays_as_it_is(closeup, started, tmp_path, name):
+    photographs, mine = write_photographs(tmp_path / "photographs"), tmp_path / "mine" / name
+    mine.parent.mkdir(parents=True)
+    mine.write_text("{}")
+    with pytest.raises(SystemExit, match=r"--output_dir=.*mine already exists and is not empty"):
+        closeup(photographs, mesh=True, output_dir=str(tmp_path / "mine"))
+    assert [path for path in (tmp_path / "mine").rglob("*") if path.is_file()] == [mine]
+    assert mine.read_text() == "{}" and not started
+
+
+def write_run(folder):
+    (folder / "checkpoints").mkdir(parents=True)
+    return folder
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_closeups_of_a_run_go_into_its_folder(closeup, started, tmp_path, named):
+    run = write_run(tmp_path / "run")
+    closeup(run, output_dir=str(run) if named else None)
+    assert started == [run] and not (run / "source.json").exists()
+    mine = run / "mesh" / "mine.ply"
+    mine.parent.mkdir()
+    mine.touch()
+    with pytest.raises(SystemExit, match="mesh already exists and is not empty: name a new"):
+        closeup(run, output_dir=str(run) if named else None, mesh=True)
+    assert mine.exists() and started == [run]
+
+
+def test_a_mesh_that_was_cut_off_is_made_anew(closeup, started, monkeypatch, tmp_path):
+    run, out = write_run(tmp_path / "run"), tmp_path / "out"
+    endings = iter(["glb", "json"])
+
+    def start(name, *given):
+        assert not (out / "mesh").exists()
+        started.append(name)
+        (out / "mesh").mkdir()
+        (out / "mesh" / f"mesh.{(ending := next(endings))}").touch()
+        if ending == "glb":
+            raise SystemExit(130)
+
+    monkeypatch.setattr(program, "_start", start)
+    with pytest.raises(SystemExit):
+        closeup(run, mesh=True)
+    closeup(run, mesh=True)
+    closeup(run, mesh=True)  # it is there
+    assert started == [run, "mesh", run, "mesh", run]
+    assert {path.name for path in out.iterdir()} == {".lock", "source.json", "mesh"}
+
+
+def test_a_link_to_nothing_is_no_photograph(closeup, started, tmp_path):
+    photographs = write_photographs(tmp_path / "photographs")
+    (photographs / "x.jpg").symlink_to("moved.jpg")
+    out = closeup(photographs)
+    files = json.loads((out / "source.json").read_text())["files"]
+    assert [name for name, _ in files] == ["a.png", "b.png"]
+
+
+def test_flags_that_come_after_training_are_said_to_change_nothing(
+    closeup, started, tmp_path, capsys
+):
+    photographs = write_photographs(tmp_path / "photographs")
+    out = closeup(photographs, minutes=3.0, check=False)
+    (out / "run").mkdir()
+    (out / "run" / "results.json").write_text("{}")
+    capsys.readouterr()
+    closeup(photographs, minutes=3.0, check=False)
+    closeup(photographs)
+    assert "stays as it is" not in capsys.readouterr().out
+    closeup(photographs, minutes=20.0, check=False, fix=True)
+    said = (
+        "run is trained and stays as it is: to train with --minutes=20 --fix, name another folder"
+    )
+    assert said in capsys.readouterr().out
+    # An earlier version did not write down how it trained.
+    about = json.loads((out / "source.json").read_text())
+    del about["check"]
+    (out / "source.json").write_text(json.dumps(about))
+    closeup(photographs, check=False)
+    assert "to train with --nocheck, name" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        (-9, r"closeup: the program run was ended by signal 9 .*, perhaps for lack of memory: go"),
+        (-11, r"closeup: the program run was ended by signal 11 \([^)]*\): go on with the same"),
+        (3, "^3$"),  # it has said why
+    ],
+)
+def test_a_program_that_is_killed_is_one_sentence(monkeypatch, code, said):
+    monkeypatch.setattr(program.subprocess, "run", lambda _: SimpleNamespace(returncode=code))
+    with pytest.raises(SystemExit, match=said) as ended:
+        program._start("run", "--minutes=3")
+    assert isinstance(ended.value.code, int) == (code > 0)
 
 
 def test_folders_are_called_by_their_whole_name(tmp_path):

@@ -87,6 +87,17 @@ def test_an_edited_run_is_one_sentence(kept, tmp_path, name, change, message):
     assert "\n" not in str(error.value) and str(tmp_path / "run") in str(error.value)
 
 
+def test_a_coarse_model_is_no_stage_to_render(kept, tmp_path):
+    """Its state has other shapes than the preset's."""
+    copy_of(kept, tmp_path, None, None)
+    checkpoints = tmp_path / "checkpoints"
+    (checkpoints / "coarse_baseline" / "20").mkdir(parents=True)
+    assert read_run(tmp_path).stages == ["closeup"]
+    (checkpoints / "closeup" / "3").rmdir()
+    with pytest.raises(RunError, match="has no checkpoint yet: resume its training"):
+        read_run(tmp_path)
+
+
 @pytest.mark.parametrize("make", [pipe, endless, terabyte])
 def test_a_file_that_does_not_end_is_not_read(kept, tmp_path, make):
     copy_of(kept, tmp_path, None, None)

@@ -2,12 +2,14 @@
 
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxcloseup.app.share import closeups, places
 from jaxcloseup.detail.add import Detailed
 from jaxcloseup.geometry.cameras import Camera
+from jaxcloseup.photos.pyramids import Pyramid
 
 
 def test_the_middle_of_a_photograph_is_that_of_its_own_size():
@@ -28,6 +30,36 @@ def test_the_middle_of_a_photograph_is_that_of_its_own_size():
     np.testing.assert_array_equal(
         places._looked_at(detail, np.array([ahead, aside, behind])), [1, 0.5, 0]
     )
+
+
+def test_photographs_that_training_read_large_are_searched_too():
+    """Their pyramid has no level near the width that is searched elsewhere."""
+    height, width, depth = 90, 1000, 5.0
+    rng = np.random.default_rng(0)
+    rgb = np.zeros((height, width, 3), np.float32)
+    rgb[:, :500] = rng.choice([0.2, 0.8], (height, 500, 1))
+    camera = Camera(
+        camtoworld=jnp.eye(4)[:3],
+        intrinsics=jnp.array([800.0, 800.0, width / 2, height / 2]),
+        height=height,
+        width=width,
+    )
+    extents = jnp.array([[[height, width]]], jnp.int32)
+    values = jnp.asarray(rgb.reshape(-1, 3))
+    shown = Pyramid(jnp.concatenate([values, values], -1), camera.intrinsics[None, None], extents)
+    everywhere = np.ones((1, height, width), np.float32)
+    detail = SimpleNamespace(
+        shown=shown,
+        sources=SimpleNamespace(
+            cameras=jax.tree.map(lambda leaf: leaf[None], camera),
+            maps=everywhere,
+            trust=everywhere,
+            inverse_depth=everywhere / depth,
+        ),
+        map_sizes=np.array([[height, width]]),
+    )
+    (place,) = places.best_places(detail, count=1, near=4.0)
+    assert place.view == 0 and place.x < 0.5
 
 
 def test_places_whose_contrast_is_trusted_are_chosen(monkeypatch):

@@ -61,6 +61,7 @@ def test_pages_of_other_servers_are_refused():
             "http://127.0.0.1:8000",
             f"http://127.0.0.1:{port}.evil.example",
             "null",
+            "http://[",
         ):
             assert not opens(origin)
         assert not opens(f"http://evil.example:{port}", f"evil.example:{port}")
@@ -90,3 +91,4 @@ def test_the_address_of_a_request_is_the_served_one(served, host, foreign):
     assert is_foreign(served, [host], []) == foreign
     assert is_foreign(served, [host, host], [])
     assert is_foreign(served, [host], ["http://elsewhere.example"])
+    assert is_foreign(served, [host], ["http://["])

@@ -12,13 +12,21 @@ import pathlib
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import time
-from typing import Any
 
 from absl import flags
 
+from jaxcloseup.app.cli.closeup_folder import (
+    MESH_BEGUN,
+    begun,
+    check_folder,
+    check_mesh,
+    check_source,
+    keep,
+)
 from jaxcloseup.app.cli.flags import CHECK, OUTPUT, TIME
 from jaxcloseup.app.cli.interrupt import when_stopped
 from jaxcloseup.app.cli.invocation import program_command, program_name
@@ -29,7 +37,6 @@ from jaxcloseup.app.cli.topics import share
 
 FLAGS = flags.FLAGS
 _PLAIN = "images", "photographs", "photos", "pictures"  # names of folders that say nothing
-_SOURCE = "source.json"  # in the output folder: what its close-ups are of
 OPERANDS = 1  # what to look at
 share(TIME, CHECK, OUTPUT, ["data"])
 flags.DEFINE_multi_string(
@@ -56,20 +63,18 @@ def main(arguments: list[str]) -> None:
         if FLAGS.data is not None and kind != "run":
             raise ValueError(f"--data={FLAGS.data} is for a run whose capture was moved")
         folder = _folder(source, kind)
+        check_folder(source, kind, folder, mesh=FLAGS.mesh)
     when_stopped(lambda: _say_stopped(folder))
     with in_one_sentence("closeup", OSError):
         lock = lock_output_dir(folder)
     with lock:
         began = time.perf_counter()
         with in_one_sentence("closeup", ValueError, OSError):
-            _check_source(source, kind, folder)
+            check_source(source, kind, folder)
         run = _trained(source, kind, folder)
         _present(folder, run, asked, _name(source) if kind in ("photographs", "video") else None)
-        if FLAGS.mesh and not (folder / "mesh" / "mesh.json").exists():
-            shutil.rmtree(folder / "mesh", ignore_errors=True)  # of one that was cut off
-            given = [f"--data={FLAGS.data}"] if FLAGS.data is not None else []
-            given += [f"--output_dir={folder / 'mesh'}", "--texture=4096"]
-            _start("mesh", f"--run={run}", *given)
+        if FLAGS.mesh:
+            _make_mesh(folder, run)
     minutes, seconds = divmod(round(time.perf_counter() - began), 60)
     print(f"took {minutes}:{seconds:02} minutes")
     print(f"open {folder / 'share' / 'index.html'} in a browser, or send the folder it lies in")
@@ -99,54 +104,13 @@ def _present(
     print("\n".join(f"wrote {path}" for path in paths[:-1]))
 
 
-def _check_source(source: str, kind: str, folder: pathlib.Path) -> None:
-    """Refuse a folder with close-ups of another source; say if the source has other files now.
-
-    Raises:
-      ValueError: one sentence that names the flag.
-      OSError: the source cannot be read, or the folder not written.
-    """
-    from jaxcloseup.io.files import read_object, write_json
-
-    if kind == "run" and FLAGS.output_dir is None:
-        return
-    place = source if kind == "scene" else str(pathlib.Path(source).resolve())
-    known = {"source": place, "files": _files(pathlib.Path(source), kind, folder)}
-    kept = folder / _SOURCE
-    before = read_object(kept) if kept.exists() else known
-    moved = kind in ("photographs", "video") and before.get("files") == known["files"]
-    if before.get("source") != place and not moved:
-        raise ValueError(
-            f"{folder} holds close-ups of {before.get('source')}, not of {source}: name another "
-            "folder with --output_dir"
-        )
-    if before.get("files") != known["files"] and (folder / "run" / "results.json").exists():
-        print(
-            f"{source} has other files than those that {folder} was made of, which stays as it is: "
-            "to use them, name another folder with --output_dir"
-        )
-    if not kept.exists():
-        write_json(kept, known)
-
-
-def _files(source: pathlib.Path, kind: str, folder: pathlib.Path) -> list[list[Any]]:
-    """Return names and bytes of the photographs or the video; nothing of what has poses."""
-    from jaxcloseup.captures.photo_files import ENDINGS
-
-    found = [source] if kind == "video" else []
-    if kind == "photographs":
-        paths = (path for path in source.rglob("*") if path.suffix.lower() in ENDINGS)
-        made = folder.resolve()  # perhaps within the photographs
-        found = [path for path in paths if made not in path.resolve().parents]
-    return sorted([path.name, path.stat().st_size] for path in found)
-
-
 def _trained(source: str, kind: str, folder: pathlib.Path) -> pathlib.Path:
     """Return the folder of the run; find poses and train first, as far as that is not done."""
     if kind == "run":
         return pathlib.Path(source)
     run, capture = folder / "run", source
     if (run / "results.json").exists():
+        _say_what_stays(folder, run)
         return run
     if kind in ("photographs", "video"):
         flag = "images" if kind == "photographs" else "video"
@@ -155,14 +119,51 @@ def _trained(source: str, kind: str, folder: pathlib.Path) -> pathlib.Path:
         _start("process", f"--{flag}={source}", f"--output_dir={capture}")
     else:
         print(f"{source}: a {kind}; {_training()}")
-    resume = ["--resume"] if (run / CHECKPOINTS).is_dir() else []
-    given = [f"--scene={capture}", f"--output_dir={run}", f"--minutes={_minutes():g}"]
+    resume, written = ["--resume"] if (run / CHECKPOINTS).is_dir() else [], _written()
+    given = [f"--scene={capture}", f"--output_dir={run}", written["minutes"]]
     # A picture is wanted, not a score: all photographs train but those that the capture holds out.
     given += ["--split=listed"] * (kind != "scene")
-    changed = [FLAGS[name] for name in CHECK if FLAGS[name].value != FLAGS[name].default]
-    checking = [f"--{'' if flag.value else 'no'}{flag.name}" for flag in changed]
+    checking = [written[name] for name in CHECK if FLAGS[name].value != FLAGS[name].default]
+    if not resume:
+        with in_one_sentence("closeup", OSError):
+            keep(folder, **written)
     _start("run", *given, "--stages=detail", *checking, *resume)
     return run
+
+
+def _written() -> dict[str, str]:
+    """Return the flags of the training by name, as the user writes them."""
+    checking = {name: FLAGS[name].serialize() for name in CHECK}
+    return {"minutes": f"--minutes={_minutes():g}"} | checking
+
+
+def _say_what_stays(folder: pathlib.Path, run: pathlib.Path) -> None:
+    """Print which of the flags that are given come too late for a finished run."""
+    before = begun(folder)  # without these flags, if an earlier version trained
+    late = [
+        text
+        for name, text in _written().items()
+        if not FLAGS[name].using_default_value and text != before.get(name)
+    ]
+    if late:
+        print(
+            f"{run} is trained and stays as it is: to train with {' '.join(late)}, name another "
+            "folder with --output_dir"
+        )
+
+
+def _make_mesh(folder: pathlib.Path, run: pathlib.Path) -> None:
+    """Start the program mesh unless its mesh is there; one that was cut off is made anew."""
+    mesh, mark = folder / "mesh", folder / MESH_BEGUN
+    if not (mesh / "mesh.json").exists():
+        with in_one_sentence("closeup", OSError):
+            check_mesh(folder)  # again: training may have taken hours
+            if mark.exists() and mesh.exists():
+                shutil.rmtree(mesh)
+            mark.touch()
+        given = [f"--data={FLAGS.data}"] if FLAGS.data is not None else []
+        _start("mesh", f"--run={run}", *given, f"--output_dir={mesh}", "--texture=4096")
+    mark.unlink(missing_ok=True)
 
 
 def _minutes() -> float:
@@ -177,9 +178,17 @@ def _training() -> str:
 
 
 def _start(program: str, *given: str) -> None:
-    """Run another program of this package, and end with it if it fails: it says why."""
+    """Run another program of this package, and end if it fails: it says why, unless killed."""
     print(shlex.join([*program_command(program), *given]), flush=True)
     done = subprocess.run([sys.executable, "-m", "jaxcloseup", program, *given])
+    if done.returncode < 0:
+        number = -done.returncode
+        reason = f"signal {number} ({signal.strsignal(number)})"
+        reason += ", perhaps for lack of memory" * (number == signal.SIGKILL)
+        sys.exit(
+            f"{program_name('closeup')}: the program {program} was ended by {reason}: go on with "
+            "the same command"
+        )
     if done.returncode:
         sys.exit(done.returncode)
 

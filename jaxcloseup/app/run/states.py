@@ -28,6 +28,7 @@ from jaxcloseup.training.state import TrainState, init_state
 
 
 FEWEST_POINTS = 100  # a capture with fewer gets random points too
+COARSE = "coarse_"  # and a stage: the name of the one that trains the coarse model before it
 
 # One program for all seeds; without it, every array program would be compiled apart.
 _init_state = jax.jit(init_state, static_argnames=("field", "optimizer"))
@@ -58,7 +59,7 @@ def train_coarse(training: Training, stage: str, keys: RunKeys) -> TrainState:
     coarse = dataclasses.replace(training, programs=programs.coarse)
     return train_stage(
         coarse,
-        f"coarse_{stage}",
+        f"{COARSE}{stage}",
         initial_state(coarse.programs, keys, stereo),
         TrainData(with_depths(coarse.programs, stereo)),
         steps=preset.coarse.steps,

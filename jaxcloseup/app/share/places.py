@@ -12,7 +12,7 @@ from jaxcloseup.geometry.cameras import pixels_to_points, points_to_pixels
 from jaxcloseup.photos.views import camera_at
 
 
-_WIDTH = 480  # pixels, about, of the photographs that are searched
+_WIDTH = 480  # pixels, about, of the photographs that are searched, if training read none larger
 _STEPS = 12  # windows along each side of a photograph
 _APART = 0.3  # of the median depth, between two places
 _ENOUGH = 0.6  # mean trust in the depth of a window

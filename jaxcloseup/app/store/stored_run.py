@@ -16,7 +16,7 @@ from jaxcloseup.app.run.corrected_poses import read_poses
 from jaxcloseup.app.run.loop import TrainingError
 from jaxcloseup.app.run.measured_exposures import read_exposures
 from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.run.states import state_shapes
+from jaxcloseup.app.run.states import COARSE, state_shapes
 from jaxcloseup.app.store.stored_config import preset_from_config
 from jaxcloseup.artifacts.checkpoints import Checkpoints
 from jaxcloseup.captures.load import DRAWN_SCENES, load_scene
@@ -53,7 +53,7 @@ class StoredRun:
     identity: Mapping[str, Any]  # its `checkpoints/run.json`
     trained: Preset  # preset of its training
     preset: Preset  # the same preset with the settings that the user changes
-    stages: list[str]  # stages that have a state
+    stages: list[str]  # stages that have a state of the preset itself
 
 
 def read_run(folder: pathlib.Path) -> StoredRun:
@@ -89,9 +89,11 @@ def read_run(folder: pathlib.Path) -> StoredRun:
         values = ", ".join(f"{name}={value}" for name, value in absent.items())
         print(f"{folder}: version {version} had no such settings; it renders with {values}")
     checkpoints = folder / "checkpoints"
+    # A coarse model's state has other shapes: only training goes on with it.
+    trained = (path for path in checkpoints.iterdir() if not path.name.startswith(COARSE))
     stages = sorted(
         path.name
-        for path in checkpoints.iterdir()
+        for path in trained
         if path.is_dir() and any(step.name.isdecimal() for step in path.iterdir())
     )
     if not stages:

@@ -100,16 +100,21 @@ def is_foreign(served: str, hosts: Sequence[str], origins: Sequence[str]) -> boo
       hosts: the request's headers `Host`.
       origins: the request's headers `Origin`; a browser sends it with every request to a socket.
     """
-    if len(hosts) != 1 or len(origins) > 1 or not _means(served, _name(f"//{hosts[0]}")):
+    if (
+        len(hosts) != 1
+        or len(origins) > 1
+        or not _means(served, _parts(f"//{hosts[0]}").hostname or "")
+    ):
         return True
-    return any(urllib.parse.urlsplit(origin).netloc != hosts[0] for origin in origins)
+    return any(_parts(origin).netloc != hosts[0] for origin in origins)
 
 
-def _name(address: str) -> str:
-    """Return the host of an address, or nothing if it is invalid."""
-    with contextlib.suppress(ValueError):
-        return urllib.parse.urlsplit(address).hostname or ""
-    return ""
+def _parts(address: str) -> urllib.parse.SplitResult:
+    """Return the parts of an address, all empty if it is invalid."""
+    try:
+        return urllib.parse.urlsplit(address)
+    except ValueError:
+        return urllib.parse.urlsplit("")
 
 
 def _means(served: str, name: str) -> bool:
