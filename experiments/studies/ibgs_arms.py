@@ -97,7 +97,7 @@ def main(_: list[str]) -> None:
 def print_arms(run: TrainedRun) -> None:
     """Train and score both arms of a run, and print them beside detail as it is."""
     programs, detail = run.programs, run.detail()
-    held_out = hold_out(programs, start_labels(programs, run.state))
+    held_out = hold_out(programs, start_labels(programs, run.state), ladder=False)
     score = functools.partial(score_views, held_out.targets)
     scores = {"field": score(functools.partial(programs.render, run.state))}
     scores["detail"] = score(with_detail(run, run.state, detail))

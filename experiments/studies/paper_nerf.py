@@ -182,7 +182,7 @@ def _work(piece: Piece, keys: RunKeys) -> None:
     if set(_STAGES) <= set(piece.scores["stages"]):
         return
     start = start_labels(programs, baseline, expected_depth=preset.labels.expected_depth)
-    targets = hold_out(programs, start).targets
+    targets = hold_out(programs, start, ladder=False).targets
     piece.clock.restart()
     piece.score("baseline", baseline, targets)
     for name, data, steps in _fine_tunings(programs, start):

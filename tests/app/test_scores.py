@@ -12,7 +12,7 @@ import pytest
 from jaxcloseup.app.methods.surfels import REDUCED
 from jaxcloseup.app.run.gate import AGREEMENT, gated, verdict, weigh_labels
 from jaxcloseup.app.score.footprints import blur_to_footprint
-from jaxcloseup.app.score.scores import score, summarize
+from jaxcloseup.app.score.scores import score, score_image, summarize
 from jaxcloseup.app.score.targets import Target
 from jaxcloseup.fields.contract import Rendering
 from jaxcloseup.io.files import write_json
@@ -82,6 +82,20 @@ def test_scores_ignore_padding_and_say_what_is_missing():
     summary = summarize({"0": result})
     assert summary["psnr_seen3"] is None
     assert summary["psnr_seen3_reason"] == result["psnr_seen3_reason"]
+
+
+def test_a_view_without_counted_pixels_says_nothing_of_what_is_resolved():
+    rng = np.random.default_rng(0)
+    truth = jnp.asarray(rng.uniform(size=(64, 64, 3)), jnp.float32)
+    counts = jnp.ones((64, 64))
+    seen = score_image(0.9 * truth, truth, counts)
+    masked = score_image(0.9 * truth, truth, 0 * counts)
+    assert masked["resolves"] is None and "no pixel" in masked["resolves_reason"]
+    assert seen["resolves"] == summarize({"0": seen, "1": masked})["resolves"] == 2
+    # Where one view of many resolves something, their mean may not.
+    blank = score_image(jnp.full_like(truth, 0.5), truth, counts)
+    summary = summarize({"0": seen} | {str(i): blank for i in range(1, 20)})
+    assert summary["resolves"] is None and "no period" in summary["resolves_reason"]
 
 
 @pytest.mark.parametrize("footprint", [2.0, 5.0])

@@ -17,6 +17,7 @@ from jaxcloseup.app.run.programs import Programs
 from jaxcloseup.app.run.step_data import LabeledData
 from jaxcloseup.detail.add import Detail
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
+from jaxcloseup.geometry.numerics import safe_divide
 from jaxcloseup.labels.config import LabelConfig
 from jaxcloseup.labels.make import PseudoSettings
 from jaxcloseup.labels.rules import label_depth
@@ -97,10 +98,11 @@ def tuned_detail(programs: Programs, state: TrainState, cameras: Camera, detail:
     reached = np.cumsum(np.take_along_axis(shares, order, axis=1), axis=1)
     counts = np.sum(reached < _ENOUGH, axis=1) + 1
     needed = [views[:count] for views, count in zip(order, counts, strict=True)]
-    count = len(np.unique(np.concatenate(needed)))
-    count = min(-(-count // _TOGETHER) * _TOGETHER, len(detail.sources.maps))
-    views = np.argsort(-shares.max(axis=0), kind="stable")[:count]
-    return refresh_detail(programs, state, detail, np.sort(views).tolist())
+    first = np.unique(np.concatenate(needed))
+    count = min(-(-len(first) // _TOGETHER) * _TOGETHER, len(detail.sources.maps))
+    others = np.argsort(-shares.max(axis=0), kind="stable")
+    views = [*first, *others[~np.isin(others, first)]][:count]
+    return refresh_detail(programs, state, detail, sorted(map(int, views)))
 
 
 def _shares(programs: Programs, state: TrainState, camera: Camera, detail: Detail) -> jax.Array:
@@ -110,7 +112,10 @@ def _shares(programs: Programs, state: TrainState, camera: Camera, detail: Detai
 
 @jax.jit
 def _shares_at(detail: Detail, camera: Camera, depth: jax.Array) -> jax.Array:
-    """Return each photograph's share in what a view gathers, `[V]`; the sum is at most 1."""
+    """Return each photograph's share in what a view gathers, `[V]`; the sum is 1, or 0 of nothing.
+
+    Pixels that no photograph shows have no part in it.
+    """
     count = len(detail.sources.maps)
     # Each photograph shows nothing but its own number, in as fine pixels as it has.
     one = jnp.ones((count, 1, 2), jnp.int32)
@@ -118,7 +123,8 @@ def _shares_at(detail: Detail, camera: Camera, depth: jax.Array) -> jax.Array:
     every = max(1, round((depth.size / _PIXELS) ** 0.5))
     pixels = pixel_grid(camera.height, camera.width)[::every, ::every]
     gathered = gather(camera, pixels, depth[::every, ::every], detail.sources, numbers)
-    return jnp.mean(gathered.mean, axis=(0, 1))
+    parts = jnp.sum(gathered.mean, axis=(0, 1))
+    return safe_divide(parts, jnp.sum(parts))
 
 
 def fine_tune(

@@ -27,7 +27,8 @@ class HeldOut(NamedTuple):
     """The views that stages are scored on."""
 
     targets: Mapping[str, Sequence[Target]]  # held-out views by split
-    # Views of the zoom ladder by rung; none where the exact scene is not known.
+    # Views of the zoom ladder by rung; none where it was not asked for, or the exact scene is not
+    # known.
     ladder: Mapping[str, Sequence[Target]]
     exact: jax.Array | None  # `[V, H, W]` exact depths of the training views, or None
 
@@ -41,8 +42,11 @@ class HeldOut(NamedTuple):
         return self.targets.get(split + REDUCED, self.targets.get(split, ()))
 
 
-def hold_out(programs: Programs, start: LabelStart) -> HeldOut:
-    """Return the views to score on. Coverage is that of `start`, so that all are scored alike."""
+def hold_out(programs: Programs, start: LabelStart, *, ladder: bool = True) -> HeldOut:
+    """Return the views to score on, with or without the zoom ladder, which takes long to draw.
+
+    Coverage is that of `start`, so that all stages are scored alike.
+    """
     scene, render = programs.scene, functools.partial(programs.render, start.state)
     exact = exact_depths(scene, scene.train.cameras) if scene.surface else None
     divisor = score_divisor(scene, programs.preset.score_width)
@@ -55,7 +59,8 @@ def hold_out(programs: Programs, start: LabelStart) -> HeldOut:
             scene, start.sources.depths, exact, render, divisor=divisor
         ).items()
     }
-    return HeldOut(targets, {} if exact is None else ladder_targets(scene, exact), exact)
+    rungs = ladder_targets(scene, exact) if ladder and exact is not None else {}
+    return HeldOut(targets, rungs, exact)
 
 
 class Scorer:

@@ -170,7 +170,7 @@ def train_baseline_stage(
     with timed(training.seconds, "gate"):
         gate = weigh(programs, start)
     settings = gated(labels, gate)
-    return Run(training, keys, output_dir, start, scorer, gate, settings, "baseline", state)
+    return Run(training, keys, output_dir, start, scorer, gate, settings, "baseline", start.state)
 
 
 def closeup_data(run: Run) -> CloseupData | LabeledData:

@@ -139,9 +139,11 @@ def score_image(
     finite, side = bool(np.isfinite(image).all()), min(truth.shape[:2])
     result: View = {}
     if finite and side >= SMALLEST_RINGS:
-        curve = np.asarray(ring_correlation(image, truth, weight=weight))
-        values["resolves"] = resolved_period(curve)
-        result[CURVE] = curve.tolist()
+        values["resolves"] = np.nan
+        if np.any(np.asarray(weight) > 0):
+            curve = np.asarray(ring_correlation(image, truth, weight=weight))
+            values["resolves"] = resolved_period(curve)
+            result[CURVE] = curve.tolist()
     for key, value in values.items():
         known = bool(np.isfinite(value))
         result[key] = float(value) if known else None
@@ -161,14 +163,15 @@ def score_image(
 
 
 _NOT_FINITE = "the rendering is not finite"
+_UNRESOLVED = "no period is resolved"
 
 
 def _why_unknown(key: str, value: float, side: int, *, finite: bool) -> str:
     """Explain why a metric is not finite, for an image whose shorter side has `side` pixels."""
     if not finite:
         return _NOT_FINITE
-    if key == "resolves":
-        return "no period is resolved"
+    if key == "resolves" and np.isposinf(value):
+        return _UNRESOLVED
     if np.isposinf(value):
         return "equals the truth"
     if "ssim" in key and side < SSIM_TAPS:
@@ -197,7 +200,9 @@ def summarize(views: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     if summary.get("resolves") is not None:
         curve = np.mean(curves, axis=0)
         period = resolved_period(curve)
-        summary |= {"resolves": period if np.isfinite(period) else None, CURVE: curve.tolist()}
+        summary |= {"resolves": period, CURVE: curve.tolist()}
+        if not np.isfinite(period):
+            summary |= {"resolves": None, "resolves_reason": _UNRESOLVED}
     return summary | {"views": views}
 
 
