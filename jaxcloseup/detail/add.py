@@ -51,6 +51,8 @@ class Detail(struct.PyTreeNode):
         learned from.
       grain: `[]` typical radius of the model's splats, world units; 0 of a model without.
       confirmed: `[]` part in [0, 1] of what the networks take to be there that is added.
+      brightest: `[]` largest color of a render, 1; infinity where photographs differ in exposure,
+        so that one that is taken darker shows what is brighter than white at the middle one.
     """
 
     shown: Pyramid
@@ -59,6 +61,7 @@ class Detail(struct.PyTreeNode):
     finer: jax.Array
     grain: jax.Array
     confirmed: jax.Array | float = 1.0
+    brightest: jax.Array | float = 1.0
 
     @property
     def map_sizes(self) -> jax.Array:
@@ -70,8 +73,8 @@ class Detailed(NamedTuple):
     """An image with detail.
 
     Attributes:
-      rgb: `[H, W, 3]` in [0, 1]; where no photograph saw a surface, half of what a render lacks in
-        opacity has the colors around it.
+      rgb: `[H, W, 3]` from 0 to the detail's `brightest`; where no photograph saw a surface, half
+        of what a render lacks in opacity has the colors around it.
       weight: `[H, W]` in [0, 1], how far the photographs' detail is trusted.
       footprint: `[H, W]` side of the finest pixel that saw the surface, in pixels of the view;
         infinity where no photograph saw it.
@@ -124,7 +127,16 @@ def add_detail(
     """
     depth = _smooth(detail.grain, camera, depth)
     gathered = gather_parts(camera, pixels, depth, detail.sources, detail.shown, SETTINGS)
-    sharper = _add(detail.weights, detail.finer, detail.confirmed, gathered, rgb, alpha, depth)
+    sharper = _add(
+        detail.weights,
+        detail.finer,
+        detail.confirmed,
+        detail.brightest,
+        gathered,
+        rgb,
+        alpha,
+        depth,
+    )
     seen = gathered[0].weight > 0
     del gathered  # 70 bytes for each pixel
     filled = _fill(camera, pixels, sharper.rgb, alpha, seen, detail.sources, detail.map_sizes)
@@ -197,6 +209,7 @@ def _add(
     weights: DetailWeights,
     finer: jax.Array,
     confirmed: jax.Array | float,
+    brightest: jax.Array | float,
     gathered: tuple[Gathered, Gathered],
     rgb: jax.Array,
     alpha: jax.Array,
@@ -213,7 +226,7 @@ def _add(
     shift = safe_divide(jnp.sum(added, axis=(0, 1)), jnp.sum(weight))
     added = added - weight[..., None] * shift[None, None]
     error = jnp.where(seen, jnp.exp(errors[1]), jnp.nan)
-    sharper = jnp.clip(jnp.clip(rgb, 0, 1) + added, 0, 1)
+    sharper = jnp.clip(jnp.clip(rgb, 0, brightest) + added, 0, brightest)
     return Detailed(sharper, weight, residual.footprint, error)
 
 

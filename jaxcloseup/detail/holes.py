@@ -143,7 +143,7 @@ def fill_holes(rgb: jax.Array, alpha: jax.Array, seen: jax.Array, empty: jax.Arr
     weight = jnp.where(seen, alpha, empty**4 + hole * jnp.sqrt(alpha))
     planes = jnp.concatenate([jnp.moveaxis(colors, -1, 0), weight[None]])
     around = jnp.moveaxis(_spread(planes), 0, -1)
-    return jnp.clip(rgb + missing[..., None] * around, 0, 1)
+    return jnp.clip(rgb + missing[..., None] * around, 0, jnp.maximum(rgb, 1))
 
 
 def _spread(planes: jax.Array) -> jax.Array:

@@ -25,6 +25,9 @@ from jaxcloseup.photos.views import Views, camera_at, pad_images, to_float
 # their renders are as fine.
 FINER_DEPTHS = 2
 MISFIT = 4  # times the median error, where a photograph has a quarter of its trust
+# Smaller errors, in steps of an int8, are rounding and noise. A plain background is reproduced
+# exactly, and would make every error of what stands before it look large.
+NOISE = 1.0
 COLOR_RIDGE = 0.01  # regularizes the affine map of a photograph's colors, see `fit_colors`
 _BLUR = 1.5  # standard deviation in pixels of errors that lower trust
 
@@ -52,6 +55,7 @@ def make_detail(
     near: float = 0.0,
     far: float = np.inf,
     grain: float = 0.0,
+    brightest: float = 1.0,
 ) -> Detail:
     """Return the detail of photographs beyond a model that renders every level of a pyramid.
 
@@ -63,11 +67,16 @@ def make_detail(
       near: smallest z-depth of a surface, world units.
       far: largest one.
       grain: typical radius of the model's splats, world units; 0 of a model without.
+      brightest: see `Detail`.
     """
-    found = render_residuals(render, views.cameras, pyramid, near=near, far=far)
+    found = render_residuals(
+        render, views.cameras, pyramid, near=near, far=far, brightest=brightest
+    )
     sources = trusted_depths(found, views.weight * reproduced(found.shown))
     finer = jnp.float32(np.log2(pyramid.sizes[0][1] / views.cameras.width))
-    return Detail(found.shown, sources, weights, finer, jnp.float32(grain))
+    return Detail(
+        found.shown, sources, weights, finer, jnp.float32(grain), brightest=jnp.float32(brightest)
+    )
 
 
 def trusted_depths(found: Residuals, trust: jax.Array) -> GatherSources:
@@ -84,6 +93,7 @@ def render_residuals(
     *,
     near: float,
     far: float,
+    brightest: float = 1.0,
     rendered: int = 0,
     enlarge: Callable[[Any, Camera, Camera], Any] | None = None,
     each: Callable[[Callable[[int], Any], Sequence[int]], Iterable[Any]] = map,
@@ -99,6 +109,7 @@ def render_residuals(
       chosen: indices of the photographs; None takes all.
       near: smallest z-depth of a surface, world units.
       far: largest one.
+      brightest: see `Detail`.
       rendered: finest level that is rendered; `enlarge` makes finer ones.
       enlarge: `(rgb, camera, finer_camera) -> rgb` of a render; not called where `rendered` is 0.
       each: like `map`; may show progress.
@@ -121,11 +132,12 @@ def render_residuals(
                 rgb, shown_by = enlarge(rgb, shown_by, camera), camera
             if not levels:
                 # The model reproduces the exposure best at the size that it learned from.
-                colors = _match(photograph, rendering.rgb, rendering.alpha)
+                colors = _match(photograph, rendering.rgb, rendering.alpha, brightest)
             if level == depth_level:
                 depth = label_depth(rendering, near=near, far=far)
-            levels.append(np.asarray(_subtract(photograph, rgb, colors)).reshape(-1, 6))
-        return np.concatenate(levels[::-1]), depth
+            residual = np.asarray(_subtract(photograph, rgb, colors, brightest))
+            levels.append(_filled(residual, photograph[..., 3] == 0, *levels[-1:]))
+        return np.concatenate([level.reshape(-1, 6) for level in levels[::-1]]), depth
 
     depths, of_views = [], np.split(values, extents.prod(-1).sum(-1).cumsum()[:-1])
     for residual, (found, depth) in zip(of_views, each(compare, rows.tolist()), strict=True):
@@ -160,22 +172,41 @@ def reproduced(shown: Pyramid, *, blur: Callable[[Any, float], Any] = blur_image
                 counts, error / np.maximum(blurred(counts.astype(np.float32)), 1e-6), 0
             )
         errors.append(error)
-        counted.append(error[counts])
+        counted.append(error[error > NOISE])  # where masked, it is 0
     known = np.concatenate(counted)
-    typical = max(float(np.median(known)) if len(known) else 0.0, 1e-6)
+    typical = float(np.median(known)) if len(known) else NOISE
     trust = [1 / (1 + (error / (MISFIT * typical)) ** 4) ** 2 for error in errors]
     return jnp.asarray(pad_images(trust, *shown.sizes[last]))
 
 
+def _filled(
+    residual: np.ndarray, masked: jax.Array, coarser: np.ndarray | None = None
+) -> np.ndarray:
+    """Return a level whose masked pixels repeat those of the coarser level, if there is one.
+
+    They are read where a coarser pixel, which trust is of, is partly masked, and beside the rim.
+    The coarser one has the mean of what the mask leaves.
+    """
+    if coarser is None or not masked.any():
+        return residual
+    rows, columns = (
+        np.arange(size) * old // size
+        for size, old in zip(masked.shape, coarser.shape, strict=False)
+    )
+    return np.where(masked[..., None], coarser[rows[:, None], columns], residual)
+
+
 @jax.jit
-def _match(photograph: jax.Array, rgb: jax.Array, alpha: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _match(
+    photograph: jax.Array, rgb: jax.Array, alpha: jax.Array, brightest: float
+) -> tuple[jax.Array, jax.Array]:
     """Return the affine change `(matrix, offset)` of a photograph's colors to those of its render.
 
     It is the inverse of the best change of the render: a blurred render predicts a photograph
     without bias, but a photograph predicts a blurred render with too little contrast.
     """
     values = to_float(photograph)
-    rgb = jnp.clip(rgb, 0, 1)
+    rgb = jnp.clip(rgb, 0, brightest)
     # Pixels that the model misses or invents do not inform about exposure.
     error = jnp.mean(jnp.abs(values[..., :3] - rgb), axis=-1)
     # A sixteenth of them says it as well, and XLA sorts slowly.
@@ -192,11 +223,11 @@ def _match(photograph: jax.Array, rgb: jax.Array, alpha: jax.Array) -> tuple[jax
 
 @jax.jit
 def _subtract(
-    photograph: jax.Array, rgb: jax.Array, change: tuple[jax.Array, jax.Array]
+    photograph: jax.Array, rgb: jax.Array, change: tuple[jax.Array, jax.Array], brightest: float
 ) -> jax.Array:
     """Return the residual and the matched colors of a photograph, int8 `[H, W, 6]`."""
     values, (matrix, offset) = to_float(photograph), change
     matched = change_colors(values[..., :3], matrix, offset)
-    both = jnp.concatenate([matched - jnp.clip(rgb, 0, 1), 2 * matched - 1], axis=-1)
+    both = jnp.concatenate([matched - jnp.clip(rgb, 0, brightest), 2 * matched - 1], axis=-1)
     both = jnp.where(values[..., 3:] > 0, both, 0)
     return jnp.round(127 * jnp.clip(both, -1, 1)).astype(jnp.int8)

@@ -196,6 +196,12 @@ def test_flags_that_come_after_training_are_said_to_change_nothing(
     (out / "source.json").write_text(json.dumps(about))
     closeup(photographs, check=False)
     assert "to train with --nocheck, name" in capsys.readouterr().out
+    run = write_run(tmp_path / "trained")
+    closeup(run, output_dir=None)
+    assert "stays as it is" not in capsys.readouterr().out
+    closeup(run, output_dir=None, minutes=30.0)
+    said = f"{run} is trained and stays as it is: to train with --minutes=30, name its capture"
+    assert said in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

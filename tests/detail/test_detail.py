@@ -235,6 +235,11 @@ def test_detail_is_kept_with_its_state_and_made_again_for_another(rendered, foun
     path.write_bytes(path.read_bytes()[:100])
     find_detail(programs, other, path)
     assert len(made) == 2
+    changed = dataclasses.replace(programs.preset.field, background=1.0)
+    changed = dataclasses.replace(programs.preset, field=changed)
+    monkeypatch.setattr(programs, "preset", changed)  # as `--set` does to a rendering
+    find_detail(programs, other, path)
+    assert len(made) == 3
 
 
 def test_damaged_detail_is_made_again(rendered, found, monkeypatch, capsys):

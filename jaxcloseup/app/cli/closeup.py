@@ -16,6 +16,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 
 from absl import flags
 
@@ -107,10 +108,12 @@ def _present(
 def _trained(source: str, kind: str, folder: pathlib.Path) -> pathlib.Path:
     """Return the folder of the run; find poses and train first, as far as that is not done."""
     if kind == "run":
+        _say_what_stays(pathlib.Path(source), {}, "name its capture or photographs instead")
         return pathlib.Path(source)
     run, capture = folder / "run", source
     if (run / "results.json").exists():
-        _say_what_stays(folder, run)
+        # An earlier version wrote none of these flags down.
+        _say_what_stays(run, begun(folder), "name another folder with --output_dir")
         return run
     if kind in ("photographs", "video"):
         flag = "images" if kind == "photographs" else "video"
@@ -137,19 +140,15 @@ def _written() -> dict[str, str]:
     return {"minutes": f"--minutes={_minutes():g}"} | checking
 
 
-def _say_what_stays(folder: pathlib.Path, run: pathlib.Path) -> None:
-    """Print which of the flags that are given come too late for a finished run."""
-    before = begun(folder)  # without these flags, if an earlier version trained
+def _say_what_stays(run: pathlib.Path, before: Mapping[str, str], instead: str) -> None:
+    """Print which of the flags that are given come too late for a run that trained with others."""
     late = [
         text
         for name, text in _written().items()
         if not FLAGS[name].using_default_value and text != before.get(name)
     ]
     if late:
-        print(
-            f"{run} is trained and stays as it is: to train with {' '.join(late)}, name another "
-            "folder with --output_dir"
-        )
+        print(f"{run} is trained and stays as it is: to train with {' '.join(late)}, {instead}")
 
 
 def _make_mesh(folder: pathlib.Path, run: pathlib.Path) -> None:

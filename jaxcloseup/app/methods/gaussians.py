@@ -28,8 +28,10 @@ def _as_gaussians(config: surfels.SurfelTrainingConfig) -> GaussianTrainingConfi
     return GaussianTrainingConfig(**values | {"distortion_weight": 0.0, "raster": raster})
 
 
+_MIN_OPACITY = 0.005  # as published; surfels are removed below 0.05
+
 PAPER_MCMC = of_gaussians(surfels.PAPER)
-PAPER = surfels.with_adaptive_density(PAPER_MCMC, AdaptiveConfig(min_opacity=0.005))
+PAPER = surfels.with_adaptive_density(PAPER_MCMC, AdaptiveConfig(min_opacity=_MIN_OPACITY))
 _QUICK = of_gaussians(surfels.QUICK)
 # The published learning rates; what is faster for surfels was not measured for volumes.
 QUICK = dataclasses.replace(
@@ -44,7 +46,11 @@ QUICK = dataclasses.replace(
     ),
     targets=TargetConfig("residual", lr_scale=5.0, control_lr_scale=5.0),
 )
-QUICK_ADAPTIVE = of_gaussians(surfels.QUICK_ADAPTIVE)
+QUICK_ADAPTIVE = of_gaussians(
+    surfels.with_adaptive_density(
+        surfels.REDUCED, AdaptiveConfig(start=200, stop=1200, min_opacity=_MIN_OPACITY)
+    )
+)
 
 METHOD = dataclasses.replace(
     surfels.METHOD,

@@ -21,7 +21,7 @@ from jaxcloseup.app.run.left_out import LeftOut, check_left_out
 from jaxcloseup.app.run.manifest import hash_data
 from jaxcloseup.app.run.photograph_sizes import describe_photographs, finest_read
 from jaxcloseup.app.run.programs import Programs
-from jaxcloseup.app.run.residuals import render_residuals, reproduced
+from jaxcloseup.app.run.residuals import brightest, render_residuals, reproduced
 from jaxcloseup.detail.add import Detail, Detailed, add_to_rendering, label_with_detail
 from jaxcloseup.detail.residuals import Residuals, trusted_depths
 from jaxcloseup.detail.weights import DetailWeights, known_weights, with_larger_errors
@@ -35,7 +35,7 @@ from jaxcloseup.photos.views import Views
 from jaxcloseup.training.state import TrainState
 
 
-_RECIPE = 16  # a change of how detail is made raises it, so that kept detail is made again
+_RECIPE = 17  # a change of how detail is made raises it, so that kept detail is made again
 
 
 def detailed(programs: Programs, detail: Detail, camera: Camera, rendering: Rendering) -> Detailed:
@@ -82,7 +82,7 @@ def find_detail(
         _hash(programs, state),
         lambda: make_detail(programs, state),
         pack=_pack,
-        unpack=functools.partial(_unpack, programs.scene),
+        unpack=functools.partial(_unpack, programs),
         level=1,  # against zlib's default level: a fifth of the time, 8% more bytes
         report=print,
     )
@@ -102,6 +102,7 @@ def make_detail(programs: Programs, state: TrainState) -> tuple[Detail, dict[str
     finer = jnp.float32(np.log2(pyramid.sizes[0][1] / scene.train.cameras.width))
     sources, weights = _sources(scene.train, found), _weights(scene)
     detail = Detail(found.shown, sources, weights, finer, _grain(programs, state))
+    detail = detail.replace(brightest=jnp.float32(brightest(programs)))
     checked = check_left_out(programs, state, detail, pyramid)
     sizes = list(map(list, pyramid.sizes))
     about = {"divisor": divisor, "sizes": sizes, **checked._asdict()}
@@ -147,9 +148,9 @@ def refresh_detail(
 
 
 def _hash(programs: Programs, state: TrainState) -> str:
-    """Return a hash of what detail depends on: the state, the photographs, this version."""
-    finest = finest_read(programs.preset, programs.scene)
-    made_by = f"{jaxcloseup.__version__} {_RECIPE} {finest} {hash_data(programs.scene)}"
+    """Return a hash of what detail depends on: state, renderer, photographs, this version."""
+    finest, field = finest_read(programs.preset, programs.scene), programs.preset.field
+    made_by = f"{jaxcloseup.__version__} {_RECIPE} {finest} {hash_data(programs.scene)} {field}"
     digest = hashlib.sha256(made_by.encode())
     for leaf in jax.tree.leaves((state.params, state.buffers, programs.exposures)):
         digest.update(np.ascontiguousarray(leaf).data)
@@ -170,8 +171,9 @@ def _pack(made: tuple[Detail, dict[str, Any]]) -> Stored:
     return Stored({name: np.asarray(array) for name, array in arrays.items()}, about)
 
 
-def _unpack(scene: Scene, stored: Stored) -> tuple[Detail, dict[str, Any]]:
+def _unpack(programs: Programs, stored: Stored) -> tuple[Detail, dict[str, Any]]:
     """Return what `_pack` packed; raise an exception for other arrays or another record."""
+    scene = programs.scene
     about, cameras = stored.record, scene.train.cameras
     sizes = tuple((int(height), int(width)) for height, width in about["sizes"])
     _check(stored, sizes, cameras)
@@ -181,6 +183,7 @@ def _unpack(scene: Scene, stored: Stored) -> tuple[Detail, dict[str, Any]]:
     cameras = shown.cameras(cameras, level)
     sources = join_maps(cameras, arrays["inverse_depth"], arrays["trust"])
     detail = Detail(shown, sources, _weights(scene), arrays["finer"], arrays["grain"])
+    detail = detail.replace(brightest=jnp.float32(brightest(programs)))
     return _as_checked(detail, LeftOut(**{name: about[name] for name in LeftOut._fields})), about
 
 

@@ -73,7 +73,7 @@ def _show_left_out(
     camera = pyramid.camera(camera_at(programs.scene.train.cameras, view), view, level)
     rendering, photograph = programs.render(state, camera), pyramid.image(view, level)
     seen = add_to_rendering(leave_out(detail, view), camera, rendering, far=programs.scene.far)
-    truth, rgb = to_float(np.asarray(photograph)), np.clip(rendering.rgb, 0, 1)
+    truth, rgb = to_float(np.asarray(photograph)), np.clip(rendering.rgb, 0, detail.brightest)
     # Holes that are filled are no detail.
     weight = np.sqrt(np.where(seen.weight > 0, truth[..., 3], 0))[..., None]
     added, missing = weight * (seen.rgb - rgb), weight * (truth[..., :3] - rgb)

@@ -44,10 +44,16 @@ def render_residuals(
         views,
         near=scene.near,
         far=scene.far,
+        brightest=brightest(programs),
         rendered=pyramid.level_near(most * scene.train.cameras.width),
         enlarge=enlarge,
         each=lambda compare, views: progress.each(compare, views, "residuals of photographs"),
     )
+
+
+def brightest(programs: Programs) -> float:
+    """Return the largest color of renders, see `Detail`."""
+    return 1.0 if programs.exposures is None else np.inf
 
 
 def enlarge(rgb: Any, camera: Camera, finer: Camera) -> np.ndarray:

@@ -132,7 +132,11 @@ def _find(
 
 
 def _boxes_in_view(bounds: Bounds, camera: Camera, near: float) -> jax.Array:
-    """Return whether anything within `reach` of boxes `[M]` may show; never a false no."""
+    """Return whether anything within `reach` of boxes `[M]` may show.
+
+    Never a false no for discs. A volumetric Gaussian far beside the image may be drawn larger than
+    its own radius; one that is missed for that had an opacity of hardly more than 1/255 there.
+    """
     fx, fy, cx, cy = camera.intrinsics
     right, down, ahead = camera.rotation.T
     offset = bounds.center - camera.position[None]

@@ -32,7 +32,8 @@ def scale_by_selective_adam(
 ) -> optax.GradientTransformation:
     """Return Adam (Kingma and Ba 2015) that updates each surfel only in steps that see it.
 
-    A surfel is seen where its color has a gradient. Each counts its own steps, which correct the
+    A surfel is seen where its color or its place has a gradient: the color of one that is black
+    has none, since it is held at 0. Each counts its own steps, which correct the
     bias of its moments, so that surfels may be added at any time.
     """
 
@@ -44,8 +45,8 @@ def scale_by_selective_adam(
         gradients: Surfels, state: SelectiveAdamState, params: Surfels | None = None
     ) -> tuple[Surfels, SelectiveAdamState]:
         del params
-        # Priors have a gradient for every surfel, colors only for those in sight.
-        seen = jnp.any(gradients.sh != 0, axis=(1, 2))
+        # Priors have gradients of opacities and scales for every surfel, of these for none.
+        seen = jnp.any(gradients.sh != 0, axis=(1, 2)) | jnp.any(gradients.means != 0, axis=1)
         count = state.count + seen.astype(jnp.int32)
 
         def rows(values: jax.Array, like: jax.Array) -> jax.Array:

@@ -14,16 +14,23 @@ def test_each_surfel_has_the_steps_of_adam_when_it_is_seen():
     rng = np.random.default_rng(0)
     seen = rng.random((12, COUNT)) < 0.5
     seen[:, 0], seen[:, 1] = True, False
-    gradients = [
+    drawn = [
         jax.tree.map(lambda leaf: rng.normal(size=leaf.shape).astype(np.float32), params)
         for _ in seen
     ]
+    gradients = []
     ours = scale_by_selective_adam()
     state, taken = ours.init(params), []
     update = jax.jit(ours.update)
-    for now, gradient in zip(seen, gradients, strict=True):
-        # A prior has a gradient everywhere, but a surfel out of sight has none of its color.
-        gradient = gradient.replace(sh=np.where(now[:, None, None], gradient.sh, 0))
+    for now, gradient in zip(seen, drawn, strict=True):
+        # A prior has gradients everywhere, but a surfel out of sight has none of color and place.
+        # One that is black is seen, too, and has none of its color.
+        colored = now & (np.arange(COUNT) % 3 > 0)
+        gradient = gradient.replace(
+            sh=np.where(colored[:, None, None], gradient.sh, 0),
+            means=np.where(now[:, None], gradient.means, 0),
+        )
+        gradients.append(gradient)
         moved, state = update(gradient, state)
         taken.append(moved)
     np.testing.assert_array_equal(state.count, seen.sum(0))
