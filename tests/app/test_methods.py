@@ -64,6 +64,17 @@ def moved(scene, change):
     )
 
 
+def test_means_learn_for_all_of_stage_1():
+    """A preset that became longer once left three quarters of its steps at their last rate."""
+    presets = [preset for method in METHODS.values() for preset in method.presets.values()]
+    stages = [(preset.field, preset.baseline_steps) for preset in presets]
+    stages += [(preset.coarse.field, preset.coarse.steps) for preset in presets if preset.coarse]
+    shares = [
+        field.means_lr_steps / steps for field, steps in stages if hasattr(field, "means_lr_steps")
+    ]
+    assert len(shares) > 10 and min(shares) > 0.9 and max(shares) == 1
+
+
 def test_cameras_in_one_place_have_the_size_of_what_they_see(scene):
     for place in np.random.default_rng(0).uniform(-3, 3, (8, 3)):
         here = moved(scene, lambda old, place=place: jnp.broadcast_to(place, old.shape))

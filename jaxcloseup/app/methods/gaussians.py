@@ -40,7 +40,6 @@ QUICK = dataclasses.replace(
         _QUICK.field,
         sh_lr=2.5e-3,
         scale_lr=5e-3,
-        means_lr_steps=1800,
         max_scale=0.5,
         surfels_per_target=0,
     ),
