@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from tiny_runs import TINY, TINY_SURFELS
 
+from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.sweep.arm_training import order_arms
 from jaxcloseup.app.sweep.named_arms import make_arm
 from jaxcloseup.labels.config import pseudo_settings
@@ -62,6 +63,14 @@ def test_names_change_settings():
     both = make_arm("mask+lr_scale=2", TINY).settings
     mask = make_arm("mask", TINY).settings
     chex.assert_trees_all_equal(both, mask.replace(lr_scale=jnp.float32(2)))
+
+
+def test_labels_without_a_mask_need_no_agreement_of_depth_either():
+    quick = METHODS["ngp"].presets["quick"]
+    names = ("labels", "mask", "labels+depth_tolerance=0.05")
+    arms = [make_arm(name, quick).labels for name in names]
+    assert [arm.depth_tolerance for arm in arms] == [np.inf, 0.02, 0.05]
+    assert [arm.use_mask for arm in arms] == [False, True, False]
 
 
 def test_labels_with_detail_are_made_before_the_first_step():

@@ -21,6 +21,7 @@ from tiny_runs import TINY, TINY_MIP, TINY_SURFELS
 from jaxcloseup.app import methods
 from jaxcloseup.app.cli import render, run, sweep
 from jaxcloseup.app.methods import registry
+from jaxcloseup.app.methods.method import WindowConfig
 from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.methods.settings import with_settings
 from jaxcloseup.app.methods.shared import splat_training
@@ -126,6 +127,23 @@ def test_the_smoothing_filter_is_that_of_the_finest_photographs(capture_folder, 
         np.testing.assert_allclose(seen[-1].intrinsics, expected, rtol=1e-6)
     make_field(TINY_SURFELS.field, scene, 1)
     assert seen[-1] is None
+
+
+def test_the_smoothing_filter_is_no_finer_than_what_steps_read(capture_folder):
+    """Flags reduce photographs after the preset is made, and a short training reads no large ones.
+
+    A step reads 6 x 8 pixels, of 5 photographs of 24 x 32.
+    """
+    scene = load_scene(str(capture_folder), downscale=4)
+    for windows, steps, divisor in (
+        (None, 20, 4),
+        (WindowConfig(), 20, 2),
+        (WindowConfig(), 80, 1),
+    ):
+        preset = dataclasses.replace(TINY_MIP, windows=windows, baseline_steps=steps)
+        assert preset.field.smoothed_at == 1
+        assert Programs(preset, scene).preset.field.smoothed_at == divisor
+    assert Programs(TINY_SURFELS, scene).preset == TINY_SURFELS
 
 
 def test_refinement_and_exports_keep_the_shapes_that_the_filter_made(capture_folder, tmp_path):

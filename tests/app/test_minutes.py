@@ -13,6 +13,7 @@ from jaxcloseup.app.methods.method import CoarseConfig, WindowConfig
 from jaxcloseup.app.methods.settings import with_settings
 from jaxcloseup.app.run import minutes
 from jaxcloseup.app.run.programs import Programs
+from jaxcloseup.app.run.read_photographs import ReadPhotographs
 from jaxcloseup.captures.load import load_scene
 
 
@@ -62,6 +63,25 @@ def test_steps_are_timed_on_the_scene(capture_folder, monkeypatch):
     assert reading == before == 0 and 0 < step < 5
     assert fitted.baseline_steps >= 1
     assert given[0] == f"baseline_steps={fitted.baseline_steps}"
+
+
+def test_reading_photographs_is_no_part_of_the_time(capture_folder, monkeypatch):
+    """A method without a coarse model reads finer photographs, too."""
+    scene = load_scene(str(capture_folder), downscale=2)
+    preset = dataclasses.replace(TINY, downscale=2, windows=WindowConfig(finest=1))
+    programs, read = Programs(preset, scene), ReadPhotographs.pyramid
+
+    def read_slowly(self, finest=1):
+        if not self._pyramids:
+            time.sleep(0.2)
+        return read(self, finest)
+
+    monkeypatch.setattr(ReadPhotographs, "pyramid", read_slowly)
+    monkeypatch.setattr(minutes, "initial_state", lambda *_: None)
+    monkeypatch.setattr(minutes, "_steps", lambda *_: (None, 0.01))
+    start = time.perf_counter()
+    reading, *_ = minutes._time_steps(programs)
+    assert 0.2 <= reading < time.perf_counter() - start
 
 
 def test_compiling_is_no_part_of_the_time():

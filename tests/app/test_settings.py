@@ -44,6 +44,8 @@ def test_flags_override_the_preset(parsed_flags):
     [
         ("ngp", "compute_dtype=bfloat16", "has no setting compute_dtype: .*--set=help lists"),
         ("ngp", "grid.levels=0", "grid.levels must be between 1 and 64"),
+        ("zipnerf", "points=0", "points must be between 1 and 2147483647"),
+        ("zipnerf", "proposal_points=0", "proposal_points must be between 1 and 2147483647"),
         ("nerf", "depth_share=2", "depth_share must be between 0 and 1"),
         ("nerf", "capacity=500", "method nerf has no setting capacity: --set=help lists all"),
         ("surfels", "compute_dtype=bfloat16", "method surfels has no setting compute_dtype"),

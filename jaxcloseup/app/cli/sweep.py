@@ -180,10 +180,13 @@ def _check_flags(preset: "Preset") -> None:
         values = getattr(FLAGS, flag)
         if not values or len(set(values)) < len(values):
             raise ValueError(f"--{flag}={','.join(values)} must name one or more, each once")
-    pooled = LABEL_RULES[preset.train.label_rule].loss is pool_label_loss
+    train, own = preset.train, preset.labels.label_loss_weight
+    # As in `closeup_step`; arms that train in turn take `labeled_step`, which adds both losses.
+    pools = train.num_label_rays is not None
+    pools &= LABEL_RULES[train.label_rule].loss is pool_label_loss
     for name in FLAGS.arms:
-        labels = make_arm(name, preset).labels
-        if pooled and 0 < labels.label_loss_weight != preset.labels.label_loss_weight:
+        arm = make_arm(name, preset)
+        if pools and not arm.in_turn and 0 < arm.labels.label_loss_weight != own:
             raise ValueError(
                 f"--arms={name}: this preset pools the losses of photographs and labels, so that "
                 "only label_loss_weight=0 makes a difference"

@@ -37,11 +37,7 @@ _QUICK = of_gaussians(surfels.QUICK)
 QUICK = dataclasses.replace(
     _QUICK,
     field=dataclasses.replace(
-        _QUICK.field,
-        sh_lr=2.5e-3,
-        scale_lr=5e-3,
-        max_scale=0.5,
-        surfels_per_target=0,
+        _QUICK.field, sh_lr=2.5e-3, scale_lr=5e-3, max_scale=0.5, surfels_per_target=0
     ),
     targets=TargetConfig("residual", lr_scale=5.0, control_lr_scale=5.0),
 )

@@ -11,7 +11,10 @@ _MOST = 1024  # a divisor that no photograph is reduced by: the filter is that o
 
 
 def with_filters(preset: Preset) -> Preset:
-    """Return the preset with both filters, in space for photographs as large as steps read."""
+    """Return the preset with both filters, in space for photographs as large as steps read.
+
+    Where settings or a scene have steps read smaller photographs, `bound_filter` follows.
+    """
     reduced = preset.downscale or _MOST
     finest = reduced if preset.windows is None else preset.windows.finest
     coarse = preset.coarse

@@ -96,10 +96,10 @@ class _Times(NamedTuple):
 def _time_steps(programs: Programs) -> _Times:
     """Time everything that a run does until the end of stage 1."""
     preset, keys, reading, before = programs.preset, run_keys(0), 0.0, 0.0
-    if preset.coarse is not None:
-        # First, because matching reads a capture's finest photographs too; without exposures,
-        # which come from matching.
-        finest = finest_read(preset, programs.scene)
+    finest = finest_read(preset, programs.scene)
+    if finest < programs.scene.metadata.get("downscale", 1):
+        # First, because matching and steps read a capture's finest photographs too; without
+        # exposures, which come from matching.
         _, reading = _timed(lambda: programs.read.pyramid(finest))
     stereo, matching = _timed(lambda: programs.stereo)
     if preset.coarse is None:

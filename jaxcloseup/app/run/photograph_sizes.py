@@ -1,5 +1,6 @@
 """At which sizes a run reads its photographs, and how programs say it."""
 
+import dataclasses
 import math
 
 from jaxcloseup.app.methods.method import Preset
@@ -25,9 +26,19 @@ def finest_read(preset: Preset, scene: Scene) -> int:
     return max(preset.windows.finest, math.ceil(times - 0.5))
 
 
+def bound_filter(preset: Preset, scene: Scene) -> Preset:
+    """Return the preset whose filter in space is no finer than the photographs that steps read."""
+    divisor = getattr(preset.field, "smoothed_at", None)
+    if divisor is None:
+        return preset
+    bounded = max(divisor, finest_read(preset, scene))
+    return dataclasses.replace(preset, field=dataclasses.replace(preset.field, smoothed_at=bounded))
+
+
 def describe_training(preset: Preset, scene: Scene) -> str:
     """Return in one line what a run reads: photographs, their sizes, and why these."""
-    size, divisor = scene.train.cameras, scene.metadata.get("downscale", 1)
+    size, metadata = scene.train.cameras, scene.metadata
+    divisor = metadata.get("downscale", 1) * metadata.get("zoom", 1)
     text = f"{scene.name}: {len(scene.train)} training photographs of {size.width} x {size.height}"
     if divisor > 1:
         text += f", 1 / {divisor} of their size"

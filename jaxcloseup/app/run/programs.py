@@ -23,7 +23,7 @@ from jaxcloseup.app.run.devices import (
     one_copy,
     place,
 )
-from jaxcloseup.app.run.photograph_sizes import describe_photographs, finest_read
+from jaxcloseup.app.run.photograph_sizes import bound_filter, describe_photographs, finest_read
 from jaxcloseup.app.run.read_photographs import ReadPhotographs
 from jaxcloseup.app.run.step_data import ArmsData, StepData
 from jaxcloseup.app.run.stereo_depths import StereoDepths
@@ -67,9 +67,9 @@ class Programs:
 
         `read` is what other programs of the scene made of its photographs.
         """
-        self.preset, self.scene, self.method = preset, scene, METHODS[preset.method]
+        self.preset, self.method = bound_filter(preset, scene), METHODS[preset.method]
         self.optimizer = self.method.make_optimizer(preset.field, scene)
-        self.growth = 1
+        self.scene, self.growth = scene, 1
         self._growing = threading.Lock()
         self._width = width or scene.train.cameras.width
         self.taken: Taken | None = None  # how all views are taken; None: each as is known of it

@@ -18,7 +18,7 @@ _WARPS = ("label=warp",)
 _FIXED_POSES = (*_WARPS, "fixed_anchors=true", "magnification=4:4", "max_angle=0")
 NAMED_ARMS: dict[str, tuple[str, ...]] = {
     "control": (*_WARPS, "label_loss_weight=0"),
-    "labels": ("use_mask=false", *_FIXED_POSES),
+    "labels": ("use_mask=false", "depth_tolerance=inf", *_FIXED_POSES),
     "mask": _FIXED_POSES,
     "diverse": (),
 }

@@ -86,7 +86,8 @@ def frustum_samples(
     frustum, though not on average over turns, and a single point has no variance along the ray.
 
     Args:
-      key: consumed, turns each frustum's points about its ray; None does not.
+      key: consumed, turns each frustum's points about its ray; None does not, and has a single
+        point on the ray.
       rays: `[R]`.
       edges: `[R, S + 1]` ascending z-depths.
       count: number of points, N.
@@ -108,11 +109,13 @@ def frustum_samples(
     if key is not None:
         angles = angles + 2 * jnp.pi * jax.random.uniform(key, middle.shape, edges.dtype)
     away = RADIUS * rays.pixel[:, None, None] * depth / 2**0.5  # [R, S, N]
+    # A single point beside the ray, always on one side, would move all that is seen.
+    beside = jnp.zeros_like(away) if count == 1 and key is None else away
     first, second = _across(rays.unit)
     turned = first[..., None, None] * jnp.cos(angles)[None]
     turned += second[..., None, None] * jnp.sin(angles)[None]
     along = rays.origins.T[..., None, None] + rays.directions.T[..., None, None] * depth[None]
-    return along + turned * away[None], 0.5 * away
+    return along + turned * beside[None], 0.5 * away
 
 
 def _across(unit: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -194,8 +194,10 @@ class ZipNerfConfig:
     num_coarse: int = setting(64, "intervals per ray of the first proposal", low=1)
     num_middle: int = setting(64, "intervals per ray of the second proposal; 0 leaves it out")
     num_fine: int = setting(32, "intervals per ray that are rendered", low=1)
-    proposal_points: int = setting(6, "Gaussians of each interval of a proposal; the paper has 6")
-    points: int = setting(6, "Gaussians of each interval that is rendered; the paper has 6")
+    proposal_points: int = setting(
+        6, "Gaussians of each interval of a proposal; the paper has 6", low=1
+    )
+    points: int = setting(6, "Gaussians of each interval that is rendered; the paper has 6", low=1)
     spacing: float = setting(
         -1.5, "exponent of the first round's spacing, see `spaced`", low=-100, high=1
     )

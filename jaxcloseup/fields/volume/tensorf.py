@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 from flax import struct
 
 from jaxcloseup.fields.contract import RadianceField
@@ -76,10 +77,7 @@ def tensorf_field(
 
     def adapt(key: jax.Array, state: Any) -> Any:
         del key
-        for i, (old, new) in enumerate(zip(config.sizes, config.sizes[1:], strict=False)):
-            due = state.step == (i + 1) * config.grow_every
-            state = jax.lax.cond(due, lambda s, o=old, n=new: _grown(s, o, n), lambda s: s, state)
-        return state
+        return _grow_when_due(state, config)
 
     field = interval_field(
         IntervalConfig(config.spacing, config.background, config.chunk),
@@ -173,37 +171,50 @@ def _mean(values: jax.Array, inside: jax.Array) -> jax.Array:
     return jnp.sum(jnp.where(counted, values, 0)) / jnp.sum(counted).astype(values.dtype)
 
 
-def _grown(state: Any, old: int, new: int) -> Any:
-    """Return the state with `new` instead of `old` vertices, and an optimizer without memory."""
+def _grow_when_due(state: Any, config: TensorfConfig) -> Any:
+    # The step says how large the grid is, so that the next step makes up for a skipped one.
+    growths = state.step // config.grow_every
+    vertices = jnp.asarray(config.sizes, jnp.int32)[jnp.minimum(growths, config.growths)]
+
+    def follow(state: Any) -> Any:
+        due = state.buffers.vertices != vertices
+        return jax.lax.cond(due, lambda s: _grown(s, vertices), lambda s: s, state)
+
+    # Of a batch of states, `follow` computes the growth whether it is due or not; they share their
+    # step, after which all have grown.
+    return jax.lax.cond(growths <= config.growths, follow, lambda s: s, state)
+
+
+def _grown(state: Any, vertices: jax.Array) -> Any:
+    """Return the state with so many vertices, and with an Adam that begins anew."""
+    size = state.params["density"]["lines"].shape[1]
+    take = _resampling(size, state.buffers.vertices, vertices)
 
     def grow(factors: dict[str, jax.Array]) -> dict[str, jax.Array]:
-        size = factors["lines"].shape[1]
-        take = _resampling(size, old, new).astype(factors["lines"].dtype)
-        lines = jnp.einsum("ni,mic->mnc", take, factors["lines"], precision="highest")
-        planes = jnp.einsum("ni,kj,mijc->mnkc", take, take, factors["planes"], precision="highest")
+        each = take.astype(factors["lines"].dtype)
+        lines = jnp.einsum("ni,mic->mnc", each, factors["lines"], precision="highest")
+        planes = jnp.einsum("ni,kj,mijc->mnkc", each, each, factors["planes"], precision="highest")
         return {"planes": planes, "lines": lines}
 
-    structure: Any = jax.tree.structure(state.params)
-
-    def is_like_params(part: Any) -> bool:
-        return bool(jax.tree.structure(part) == structure)
+    def is_adam(part: Any) -> bool:
+        return isinstance(part, optax.ScaleByAdamState)
 
     params = state.params | {name: grow(state.params[name]) for name in ("density", "color")}
-    # Moments of other vertices say nothing of these; counts of steps and rates stay.
+    # Moments of other vertices say nothing of these. Adam's count, which corrects the bias of
+    # moments that begin at 0, begins anew with them; that of the learning rate's decay goes on.
     opt_state = jax.tree.map(
-        lambda part: jax.tree.map(jnp.zeros_like, part) if is_like_params(part) else part,
+        lambda part: jax.tree.map(jnp.zeros_like, part) if is_adam(part) else part,
         state.opt_state,
-        is_leaf=is_like_params,
+        is_leaf=is_adam,
     )
-    buffers = TensorfBuffers(jnp.asarray(new, jnp.int32))
-    return state.replace(params=params, buffers=buffers, opt_state=opt_state)
+    return state.replace(params=params, buffers=TensorfBuffers(vertices), opt_state=opt_state)
 
 
-def _resampling(size: int, old: int, new: int) -> jax.Array:
+def _resampling(size: int, old: jax.Array, new: jax.Array) -> jax.Array:
     """Return the matrix `[size, size]` that interpolates `old` vertices to `new`, same ends."""
-    matrix = np.zeros((size, size))
-    at = np.arange(new) * (old - 1) / (new - 1)
-    low = np.minimum(at.astype(int), old - 2)
-    matrix[np.arange(new), low] = 1 - (at - low)
-    matrix[np.arange(new), low + 1] = at - low
-    return jnp.asarray(matrix)
+    index = jnp.arange(size, dtype=jnp.int32)
+    row, column = index[:, None], index[None]
+    low, rest = jnp.divmod(row * (old - 1), new - 1)
+    share = rest / (new - 1)
+    matrix = jnp.where(column == low, 1 - share, jnp.where(column == low + 1, share, 0))
+    return jnp.where(row < new, matrix, 0)

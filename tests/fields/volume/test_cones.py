@@ -100,6 +100,17 @@ def test_a_single_point_has_its_frustums_mean_depth():
             assert abs(axis.mean()) < 0.1 * across**0.5
 
 
+def test_a_single_point_that_nothing_turns_lies_on_its_ray():
+    """A rendering without a key would otherwise be that of rays beside its own."""
+    slanted = rays()
+    sample = jax.jit(frustum_samples, static_argnums=3)
+    points, deviation = sample(None, slanted, np.float32(EDGES), 1)
+    depth = np.asarray(points)[2, 0, :, 0] - slanted.origins[0, 2]
+    on_ray = slanted.origins.T + slanted.directions.T * depth
+    np.testing.assert_allclose(points[:, 0, :, 0], on_ray, atol=1e-6)
+    np.testing.assert_allclose(deviation[0, :, 0], RADIUS * PIXEL * depth / 8**0.5, rtol=1e-5)
+
+
 def test_weights_widen_as_the_oracle_says():
     weights = np.random.default_rng(3).dirichlet(np.ones(6), 2)
     ours = jax.jit(samplers.widen)(np.float32(weights))

@@ -3,9 +3,11 @@
 import dataclasses
 import functools
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import plane
 import pytest
 import reference_volume as reference
@@ -35,7 +37,8 @@ from jaxcloseup.fields.volume.rays import Extent
 from jaxcloseup.fields.volume.tensorf import TensorfBuffers, factor_products, tensorf_field
 from jaxcloseup.fields.volume.zipnerf import zipnerf_field
 from jaxcloseup.geometry.cameras import Camera
-from jaxcloseup.training.state import TrainState
+from jaxcloseup.training.parallel import in_a_loop
+from jaxcloseup.training.state import DrawLoss, TrainState, init_state, update_state
 from jaxcloseup.training.steps import train_step
 
 
@@ -149,6 +152,10 @@ PENALTIES = {
 }
 BUFFERS = {"tensorf": TensorfBuffers(np.int32(VERTICES))}
 PIXELS = np.array([[2.5, 3.5], [6.5, 1.5], [4.0, 4.25]])
+
+
+def zeros_like(tree):
+    return jax.tree.map(jnp.zeros_like, tree)
 
 
 def camera():
@@ -316,12 +323,13 @@ def test_a_grid_that_grows_shows_the_same_scene():
         shapes, _ = jax.eval_shape(grown.init, jax.random.key(0), *[jnp.zeros((1, 3))] * 2)
         numbers = np.random.default_rng(5)
         params = jax.tree.map(lambda x: numbers.normal(size=x.shape), shapes)
-        moments = {"mu": jax.tree.map(np.ones_like, params), "count": np.int32(7), "rate": 0.5}
+        memory = optax.adam(optax.constant_schedule(0.1)).init(params)
+        memory = jax.tree.map(np.ones_like, memory)
         x = numbers.uniform(-1, 1, (3, 20))
 
         @jax.jit
         def products(step):
-            state = TrainState(step, params, TensorfBuffers(np.int32(3)), moments, None)
+            state = TrainState(step, params, TensorfBuffers(np.int32(3)), memory, None)
             after = grown.adapt(None, state)
             seen = [
                 factor_products(s.params["color"], s.buffers.vertices, x) for s in (state, after)
@@ -332,5 +340,33 @@ def test_a_grid_that_grows_shows_the_same_scene():
             after, before, now = products(np.int32(step))
             np.testing.assert_allclose(now, before, atol=1e-12)
             assert after.buffers.vertices == (5 if step == 4 else 3)
-            assert np.all(after.opt_state["mu"]["color"]["lines"] == (0 if step == 4 else 1))
-            assert after.opt_state["count"] == 7 and after.opt_state["rate"] == 0.5
+            adam, decay = after.opt_state
+            chex.assert_trees_all_equal(adam, memory[0] if step == 3 else zeros_like(memory[0]))
+            assert decay.count == 1
+
+
+def test_a_skipped_step_delays_a_growth_and_changes_nothing_else():
+    """Grids grow at steps 2 and 4; gradients are 0, so that growths alone change parameters."""
+    grows, optimizer = field("tensorf"), optax.adam(0.1)
+    draws = DrawLoss(
+        draw=lambda keys, loss: loss,
+        gradient=lambda params, buffers, loss: ((loss, {}), zeros_like(params)),
+        cameras=lambda drawn: (),
+    )
+    bound = {"field": grows, "optimizer": optimizer, "draws": 1, "spread": in_a_loop}
+    step = jax.jit(lambda state, loss: update_state(state, draws, loss, **bound)[0])
+    points = jnp.zeros((1, 3))
+    start = init_state(jax.random.key(0), points, points, field=grows, optimizer=optimizer)
+
+    def train(*losses):
+        state, vertices = start, []
+        for loss in losses:
+            state = step(state, jnp.float32(loss))
+            vertices.append(int(state.buffers.vertices))
+        return state, vertices
+
+    with jax.numpy_dtype_promotion("standard"):
+        whole, prompt = train(0, 0, 0, 0, 0)
+        late, delayed = train(0, np.nan, 0, np.nan, 0)
+    assert prompt == [3, 4, 4, 6, 6] and delayed == [3, 3, 4, 4, 6]
+    chex.assert_trees_all_equal(late.params, whole.params)
