@@ -115,8 +115,8 @@ def _size(frame: Frame) -> tuple[int, int]:
 
 def _resize(frame: Frame, factors: Sequence[float]) -> Frame:
     (factor,) = factors
-    stored = size_of_image(frame.file) or _size(frame)
-    return frame._replace(size=(round(factor * stored[0]), round(factor * stored[1])))
+    width, height = _size(frame)
+    return frame._replace(size=(round(factor * width), round(factor * height)))
 
 
 def _zoom(frame: Frame, factors: Sequence[float]) -> Frame:

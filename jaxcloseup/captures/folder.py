@@ -110,6 +110,7 @@ def _load(listing: Listing, reading: Reading) -> Scene:
     names = {split: unique_names(paths) for split, paths in files.items()}
     metadata = {
         "downscale": reading.downscale,
+        "zoom": reading.zoom,
         "files": files,
         "sizes": {split: [photo.size for photo in part] for split, part in parts.items()},
         "applied_transform": transform,

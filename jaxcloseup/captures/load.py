@@ -71,9 +71,9 @@ def load_scene(
 
     Returns:
       The scene, float32, in coordinates of its own, which `placement` maps to those of a folder's
-      files. For a folder, `metadata` holds path, downscale, format, split; files and sizes (width,
-      height) by split; applied_transform `[3, 4]`, applied_scale; up `[3]` or None; notes on what
-      was read; times_nearer of each `test` view, if the split knows; for `zoom` crops' corners.
+      files. For a folder, `metadata` holds path, downscale, zoom, format, split; files and sizes
+      (width, height) by split; applied_transform `[3, 4]`, applied_scale; up `[3]` or None; notes
+      on what was read; times_nearer of `test` views, if the split knows; corners of `zoom`'s crops.
 
     Raises:
       SceneError: one sentence that names the file and the field and says what to do.

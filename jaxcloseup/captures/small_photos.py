@@ -23,5 +23,6 @@ def read_small(frame: Frame, reading: Reading, side: int) -> Photo:
     if frame.distortion:
         lens = tuple(photo.intrinsics(reading.half_pixel).tolist())
         remap = undistortion_map(frame.distortion, lens, *photo.size)
-        photo = photo._replace(rgb=undistort(photo.rgb, photo.mask, remap)[0])
+        rgb, mask = undistort(photo.rgb, photo.mask, remap)
+        photo = photo._replace(rgb=rgb, mask=mask)
     return photo._replace(frame=frame)

@@ -6,6 +6,7 @@ import pathlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import cv2
 import numpy as np
 
 from jaxcloseup.captures.contents import list_photographs
@@ -19,6 +20,7 @@ from jaxcloseup.io.cache import Stored, cache_path, cached, content_hash, hash_f
 from jaxcloseup.photos.scene import SceneError
 
 
+_SOURCES = ("checks/*.py", "captures/*.py")  # any change may change what is found
 _MOST = 120  # photographs that are checked; of more, so many evenly spread ones
 _log = logging.getLogger(__name__)
 
@@ -69,9 +71,10 @@ def check_capture(
     files = [file for frame in frames for file in (frame.file, frame.mask) if file]
     stats = [(str(file), (s := file.stat()).st_size, s.st_mtime_ns) for file in files]
     given = [(f.listed, f.camtoworld.tolist(), f.size, _lens(f), f.turns) for f in frames], names
-    code = hash_files(sorted(pathlib.Path(__file__).parent.glob("*.py")))
+    folder = pathlib.Path(__file__).parents[1]
+    code = hash_files(file for pattern in _SOURCES for file in sorted(folder.glob(pattern)))
     points = content_hash(np.ascontiguousarray(listed.points))
-    key = content_hash(repr([code, reading, stats, given, points]).encode())
+    key = content_hash(repr([code, cv2.__version__, reading, stats, given, points]).encode())
     return cached(
         cache_path("checks", f"{key}.check"),
         key,

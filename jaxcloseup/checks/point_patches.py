@@ -49,7 +49,7 @@ def fit_points(points: np.ndarray, gray: Sequence[np.ndarray], cameras: Cameras)
     Each point is seen by the photographs nearest to it that have it inside of their image. A patch
     around its projection into one, taken as parallel to the image, is looked up in another. Points
     on surfaces look alike (a normalized correlation of at least 0.75); others do so by chance,
-    which the same points, moved by a tenth of their distance, measure.
+    which the same points measure, moved by a tenth of their distance to the nearest photograph.
 
     Args:
       points: `[P, 3]` world points.
@@ -61,8 +61,12 @@ def fit_points(points: np.ndarray, gray: Sequence[np.ndarray], cameras: Cameras)
         return PointsFit(0.0, 0.0, 0, 0, 0.0)
     share, textured = _alike(some, gray, cameras)
     shown = float((_in_view(some, cameras, margin=0.0)[0].sum(1) >= 2).mean())
-    middle = np.median(cameras.camtoworld[:, :, 3], 0)
-    moved = [_alike(middle + (1 + by) * (some - middle), gray, cameras) for by in (-_MOVED, _MOVED)]
+    # Along its ray a point moves in other photographs wherever it lies; from the middle of all
+    # cameras, which in an orbit is that of the subject, it would hardly move.
+    first, _, rows = _views(some, cameras)
+    rows, pair = np.unique(rows, return_index=True)
+    eye = cameras.camtoworld[first[pair], :, 3]
+    moved = [_alike(eye + (1 + by) * (some[rows] - eye), gray, cameras) for by in (-_MOVED, _MOVED)]
     return PointsFit(share, float(np.mean([m for m, _ in moved])), textured, len(some), shown)
 
 

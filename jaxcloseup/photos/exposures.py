@@ -32,6 +32,7 @@ _LEAST = 0.05  # residual of log light below which all count alike
 _ROUNDS = 10  # of reweighting
 _HELD = 1.0  # weight of what is expected in each gain, in points
 _WIDTHS = 0.2, 0.35, 0.5, 10.0  # candidates for `Metering.width`
+_BLACK = 3e-4  # light of colors of 1 / 255, below which a photograph shows nothing
 _BETTER = 0.7  # share of the error left out one by one that a slope must leave, to be believed
 
 
@@ -181,17 +182,24 @@ def fit_metering(
     """Fit how a camera chose exposures, at the width that predicts left-out photographs best.
 
     A slope is 0, so that the middle is predicted, unless left-out photographs confirm it.
+    Photographs that are black or fully masked do not count.
 
     Args:
       log_gains: `[V, 3]`.
       photographs: colors `[H, W, 3]` and weights `[H, W]` of each, as they were taken.
     """
     metered = jax.jit(meter)
+    seen = np.array(
+        [[np.asarray(metered(*image, width)) for image in photographs] for width in _WIDTHS],
+        np.float64,
+    )
+    # Logarithms of no light lie so far from the others that they alone would make the slope.
+    lit = (seen > np.log(_BLACK)).all(axis=(0, 2))
+    if not lit.any():
+        return Metering(jnp.float32(_WIDTHS[0]), jnp.zeros(3), jnp.zeros(2))
     found = []
-    for width in _WIDTHS:
-        seen = np.stack([np.asarray(metered(*image, width)) for image in photographs])
-        content = seen.astype(np.float64) - log_gains
-        found.append((_fit(content, log_gains), width, content.mean(axis=0)))
+    for width, contents in zip(_WIDTHS, seen[:, lit] - log_gains[lit], strict=True):
+        found.append((_fit(contents, log_gains[lit]), width, contents.mean(axis=0)))
     fit, width, content = min(found, key=lambda one: one[0].error)
     return Metering(*(jnp.asarray(a, jnp.float32) for a in (width, content, fit.slopes)))
 

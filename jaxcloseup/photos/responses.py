@@ -14,7 +14,8 @@ from jaxcloseup.photos.exposures import USABLE, solve_gains
 LEVELS = 256  # colors at which a curve says what light they stand for, from black to white
 _KNOTS = 6  # colors, from black to white, between which slopes are linear
 _PAIRINGS = 8  # other photographs that each is compared with
-_MOST = 60_000  # points of photographs that are compared
+_PHOTOGRAPHS = 200  # of a camera that are compared, at most
+_MOST = 60_000  # of their colors, about; so 300 points stay, however many photographs show them
 _FEWEST = 200  # points and pairs that tell something
 _LEAST = 0.05  # residual of log light below which all count alike
 _APART = 0.1  # least difference of log gains whose pair tells a slope
@@ -44,9 +45,12 @@ def fit_response(logs: np.ndarray) -> np.ndarray | None:
       logs: `[V, P, 3]` log light of points as sRGB encodes it; NaN where a photograph of the camera
         does not show a point.
     """
-    step = max(1, logs.shape[0] * logs.shape[1] // _MOST)
-    logs = np.asarray(logs[:, ::step], np.float64)
-    logs = logs[:, np.isfinite(logs[..., 0]).sum(axis=0) > 1]
+    # At random, because exposures may repeat in a sequence.
+    logs = logs[np.sort(np.random.default_rng(2).permutation(len(logs))[:_PHOTOGRAPHS])]
+    shown = np.isfinite(logs[..., 0])
+    shared = shown.sum(axis=0) > 1
+    step = max(1, shown[:, shared].sum() // _MOST)
+    logs = np.asarray(logs[:, shared][:, ::step], np.float64)
     if logs.shape[1] < _FEWEST:
         return None
     half = np.random.default_rng(0).random(logs.shape[1]) < 0.5

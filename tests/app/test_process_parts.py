@@ -5,15 +5,17 @@ import pathlib
 import re
 import sys
 import warnings
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 from absl import flags
 from posing import run_process, write_noise
+from textured_corner import texture
 from wrong_input import HEIC, put
 
-from jaxcloseup.app.process import capture_stages, solver_process
+from jaxcloseup.app.process import capture_stages, solver_process, video_frames
 from jaxcloseup.app.process.from_above import draw_cameras
 from jaxcloseup.app.process.pairs import (
     choose_pairing,
@@ -22,7 +24,7 @@ from jaxcloseup.app.process.pairs import (
     similarity,
 )
 from jaxcloseup.app.process.photo_folder import copy_photographs, list_files
-from jaxcloseup.app.process.video_frames import choose_frames
+from jaxcloseup.app.process.video_frames import choose_frames, extract_frames
 from jaxcloseup.app.run import manifest
 from jaxcloseup.artifacts.video import write_video
 from jaxcloseup.captures.load import SceneError, load_scene
@@ -113,6 +115,44 @@ def test_frames_are_sharp_and_evenly_spread():
         near = np.flatnonzero(np.abs(path / part - i - 0.5) <= 0.25)
         assert sharpness[frame] == sharpness[near].max()
     assert choose_frames(sharpness, motion, 400) == list(range(400))
+
+
+@pytest.mark.parametrize(
+    ("aspect", "size"),
+    [("4:3", (85, 48)), ("8:9", (64, 54)), ("1:1", (64, 48)), ("0:0", (64, 48)), ("9:1", (64, 48))],
+)
+def test_frames_of_a_video_have_square_pixels(tmp_path, aspect, size):
+    """Of the given aspect in the file; none is given, or none that a camera has, in the last."""
+    picture, chroma = texture(0)[:48, :, 0], np.full((2, 48, 64), 128, np.uint8).tobytes()
+    with open(tmp_path / "video.y4m", "wb") as file:
+        file.write(f"YUV4MPEG2 W64 H48 F25:1 Ip A{aspect} C444\n".encode())
+        for i in range(0, 40, 4):
+            file.write(b"FRAME\n" + picture[:, i : i + 64].tobytes() + chroma)
+    (tmp_path / "out").mkdir()
+    copied, count = extract_frames(tmp_path / "video.y4m", 3, tmp_path / "out")
+    assert count == 10 and len(copied) == 3
+    for copy in copied:
+        assert copy.size == size
+        shown = cv2.imread(str(tmp_path / "out" / copy.name))
+        assert shown.shape == (*size[::-1], 3)
+
+
+@pytest.mark.parametrize(("degrees", "shape"), [(0, (40, 60)), (90, (60, 40)), (180, (40, 60))])
+def test_pixels_of_a_turned_video_are_turned_with_it(monkeypatch, degrees, shape):
+    """The file says how wide pixels are as stored; the reader turns frames upright."""
+    stored = np.zeros((40, 30, 3), np.uint8)
+    given = {
+        cv2.CAP_PROP_SAR_NUM: 2.0,
+        cv2.CAP_PROP_SAR_DEN: 1.0,
+        cv2.CAP_PROP_ORIENTATION_META: degrees,
+    }
+    upright = np.rot90(stored, degrees // 90)
+    opened = SimpleNamespace(
+        get=given.get, grab=lambda: True, retrieve=lambda: (True, upright), release=lambda: None
+    )
+    monkeypatch.setattr(video_frames, "open_video", lambda _: opened)
+    ((_, frame),) = video_frames._frames(pathlib.Path("video.mp4"), [0])
+    assert frame.shape == (*shape, 3)
 
 
 def test_pairs():

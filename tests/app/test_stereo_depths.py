@@ -14,6 +14,7 @@ from PIL.ExifTags import IFD, Base
 from textured_corner import SMALL_LENS, corner_views
 
 from jaxcloseup.app.methods.method import StereoTraining
+from jaxcloseup.app.run import measured_exposures
 from jaxcloseup.app.run.measured_exposures import (
     NAME,
     held_out_gains,
@@ -40,13 +41,17 @@ pytestmark = pytest.mark.skipif(
 )
 
 
+def scene_of(views, **metadata):
+    none = np.zeros((0, 3), np.float32)
+    names = {"train": [str(view) for view in range(len(views))]}
+    return Scene("corner", views, None, None, none, none, 2.5, 6.0, names, metadata)
+
+
 @pytest.fixture(scope="module")
 def stereo():
     views, _ = corner_views()
-    none = np.zeros((0, 3), np.float32)
-    names = {"train": [str(view) for view in range(len(views))]}
-    scene = Scene("corner", views, None, None, none, none, 2.5, 6.0, names)
-    return match_photographs(scene, photograph_pyramid(views), StereoTraining(), MATCHING)
+    pyramid = photograph_pyramid(views)
+    return match_photographs(scene_of(views), pyramid, StereoTraining(), MATCHING)
 
 
 def test_training_begins_with_points_on_the_walls(stereo):
@@ -88,13 +93,17 @@ def log_gains(stereo):
 
 
 @pytest.fixture(scope="module")
-def exposures(stereo, log_gains):
+def taken(stereo, log_gains):
+    """The same as taken with these exposures."""
     gains = jnp.exp(jnp.asarray(log_gains, jnp.float32))[:, None, None]
     light = change_exposure(0.5 * stereo.views.rgb.astype(jnp.float32) / 255, gains)
-    taken = jnp.round(255 * jnp.clip(light, 0, 1)).astype(jnp.uint8)
-    names = {"train": [str(view) for view in range(len(log_gains))]}
-    scene = SimpleNamespace(metadata={}, names=names)
-    return measure_exposures(stereo._replace(views=stereo.views.replace(rgb=taken)), scene)
+    rgb = jnp.round(255 * jnp.clip(light, 0, 1)).astype(jnp.uint8)
+    return stereo._replace(views=stereo.views.replace(rgb=rgb))
+
+
+@pytest.fixture(scope="module")
+def exposures(taken):
+    return measure_exposures(taken, scene_of(taken.views))
 
 
 def test_known_exposures_are_recovered(exposures, log_gains):
@@ -102,9 +111,32 @@ def test_known_exposures_are_recovered(exposures, log_gains):
     np.testing.assert_allclose(exposures.log_gains, log_gains, atol=0.02)
 
 
+def test_masks_do_not_move_the_middle_that_a_camera_meters(taken, monkeypatch):
+    """The first photograph is padded at its right and bottom, and all are masked there."""
+    given = []
+
+    def spy(log_gains, images):
+        given.append(images)
+        return fit(log_gains, images)
+
+    fit = measured_exposures.fit_metering
+    monkeypatch.setattr(measured_exposures, "fit_metering", spy)
+    height, width = taken.views.weight.shape[1:]
+    sizes = [(width - 8, height - 6), *[(width, height)] * (len(taken.views) - 1)]
+    weight = taken.views.weight.at[:, :, 50:].set(0).at[:, 40:].set(0)
+    masked = taken.views.replace(weight=weight)
+    half = masked.replace(cameras=masked.cameras.replace(height=height // 2, width=width // 2))
+    for scene in (
+        scene_of(masked, sizes={"train": sizes}),
+        # Training reads photographs of half the size.
+        scene_of(half, sizes={"train": [(w // 2, h // 2) for w, h in sizes]}),
+    ):
+        assert measure_exposures(taken._replace(views=masked), scene)
+        assert [weight.shape[::-1] for _, weight in given.pop()] == sizes
+
+
 def test_photographs_of_one_exposure_stay_as_they_are(stereo):
-    names = {"train": [""] * len(stereo.views)}
-    assert measure_exposures(stereo, SimpleNamespace(metadata={}, names=names)) is None
+    assert measure_exposures(stereo, scene_of(stereo.views)) is None
 
 
 def test_a_camera_s_curve_is_recovered_with_its_exposures(stereo, log_gains):
@@ -113,11 +145,10 @@ def test_a_camera_s_curve_is_recovered_with_its_exposures(stereo, log_gains):
     gained = light * jnp.exp(jnp.asarray(log_gains, jnp.float32))[:, None, None]
     colors = 0.55 + 0.25 * jnp.log10(gained)  # as cameras write video that is to be graded
     taken = jnp.round(255 * jnp.clip(colors, 0, 1)).astype(jnp.uint8)
-    names = {"train": [str(view) for view in range(len(log_gains))]}
-    scene = SimpleNamespace(metadata={}, names=names)
     views = stereo.views.replace(rgb=taken)
+    scene = scene_of(views)
     found = measure_exposures(stereo._replace(views=views), scene)
-    curves = found.train_curves(names["train"])
+    curves = found.train_curves(scene.names["train"])
     middle = to_light(at_middle_exposure(views, found.log_gains, curves).rgb)
     counts = (stereo.maps.confidence > 0) & (taken > 12).all(-1) & (taken < 243).all(-1)
     x, y = (np.log(np.asarray(image)[np.asarray(counts)].ravel()) for image in (middle, light))
@@ -125,7 +156,7 @@ def test_a_camera_s_curve_is_recovered_with_its_exposures(stereo, log_gains):
     error = np.abs(design @ np.linalg.lstsq(design, y, rcond=None)[0] - y)
     assert np.median(error) < 0.02
     straight = dataclasses.replace(found, curves={}, cameras={})
-    assert straight.train_curves(names["train"]) is None
+    assert straight.train_curves(scene.names["train"]) is None
 
 
 def test_held_out_photographs_get_the_exposure_of_their_files(tmp_path):

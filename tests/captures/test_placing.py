@@ -126,9 +126,11 @@ def test_files_have_the_coordinates_of_the_capture(tmp_path, moved):
     np.testing.assert_allclose(sizes, 1 / scene.placement.scale, rtol=1e-5)
 
 
-def test_a_camera_path_is_in_the_coordinates_of_the_capture(tmp_path, moved):
+@pytest.mark.parametrize("applied_scale", [1.0, 2.5])
+def test_a_camera_path_is_in_the_coordinates_of_the_capture(tmp_path, moved, applied_scale):
     """So is one that was made beside a run's files, whose offset the run's transform adds."""
     scene, poses, _, _ = moved
+    scene.metadata["applied_scale"] = applied_scale
     write_dataparser_transforms(tmp_path, scene)
     transform = camera_files.read_camera_transform(tmp_path / "dataparser_transforms.json")
     for offset in (np.zeros(3), scene.placement.offset):

@@ -103,6 +103,7 @@ MISTAKES = {
         ),
         ("size=2",),
     ),
+    "stale size": (lambda fields: fields.update(w=2 * WIDTH, h=2 * HEIGHT), ("size=0.5",)),
     "reverse": (
         lambda fields: [
             frame.update(transform_matrix=pose)

@@ -16,7 +16,8 @@ from jaxcloseup.captures.contents import list_photographs
 from jaxcloseup.captures.corrections import correct_frames
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.captures.photo import Reading
-from jaxcloseup.captures.photo_reading import MAX_CONCURRENT
+from jaxcloseup.captures.photo_reading import MAX_CONCURRENT, read_photos
+from jaxcloseup.captures.small_photos import read_small
 from jaxcloseup.captures.world_frames import Frame
 from jaxcloseup.checks import check, evidence
 from jaxcloseup.checks.check import check_capture
@@ -83,6 +84,41 @@ def test_masks_of_ones_are_understood(write):
         cv2.imwrite(str(folder / f"masks/{i:02d}.png"), mask)
     found = check_capture(folder)
     assert found.verdict == "fits" and not any("constant" in note for note in found.notes)
+
+
+def test_masks_are_undistorted_with_their_photographs(write):
+    folder = write(**SIZE, k1=-0.2)
+    (folder / "masks").mkdir()
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[:100, :90] = 255
+    for i in range(len(poses())):
+        cv2.imwrite(str(folder / f"masks/{i:02d}.png"), mask)
+    frame = list_photographs(folder).frames[0]
+    small = read_small(frame, Reading(), WIDTH)
+    (right,) = read_photos({"train": [frame]}, Reading())["train"]
+    np.testing.assert_array_equal(small.rgb, right.rgb)
+    np.testing.assert_array_equal(small.mask, right.mask)
+    assert (small.mask != mask).any()
+
+
+def test_the_key_holds_the_code_that_reads_and_compares(write, monkeypatch):
+    hashed = []
+
+    def spy(files):
+        files = list(files)
+        hashed.extend(f"{file.parent.name}/{file.stem}" for file in files)
+        return hash_files(files)
+
+    hash_files = check.hash_files
+    monkeypatch.setattr(check, "hash_files", spy)
+    monkeypatch.setattr(check, "cached", lambda path, key, *_, **__: key)
+    folder = write()
+    key = check_capture(folder)
+    assert {"checks/judge", "checks/mistakes"} < set(hashed)
+    readers = ("sift", "small_photos", "distortion", "photo_reading", "photo_masks", "corrections")
+    assert {f"captures/{name}" for name in readers} < set(hashed)
+    monkeypatch.setattr(cv2, "__version__", "0.1")
+    assert check_capture(folder) != key
 
 
 def test_the_key_holds_a_files_lens_but_no_photograph_twice(write, monkeypatch):

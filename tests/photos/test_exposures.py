@@ -183,6 +183,25 @@ def test_the_camera_s_choice_is_learned():
         np.testing.assert_allclose(predicted, np.exp(gain), rtol=0.02)
 
 
+@pytest.mark.parametrize("color", [0.0, 0.5, 1 / 255], ids=["black", "masked", "capped"])
+def test_photographs_that_show_nothing_are_no_evidence_of_a_choice(color):
+    """Their light has no logarithm, and would outweigh all others."""
+    gains, taken, _ = camera_that_meters(-0.8)
+    rgb, weight = jnp.full((12, 16, 3), color), jnp.full((12, 16), float(color != 0.5))
+    if color == 1 / 255:  # noise of the sensor
+        rgb = rgb.at[::2].set(0)
+    found = fit_metering(np.concatenate([gains, np.zeros((1, 3))]), [*taken, (rgb, weight)])
+    jax.tree.map(np.testing.assert_array_equal, found, fit_metering(gains, taken))
+
+
+@pytest.mark.filterwarnings("error")
+def test_photographs_of_which_none_shows_anything_say_nothing_of_a_choice():
+    gains, taken, contents = camera_that_meters(-0.8)
+    metering = fit_metering(gains, [(jnp.zeros_like(rgb), weight) for rgb, weight in taken])
+    image = jnp.asarray(contents[0], jnp.float32)
+    np.testing.assert_array_equal(predict_gain(metering, image, taken[0][1]), 1)
+
+
 @pytest.mark.filterwarnings("error")
 def test_one_photograph_says_nothing_of_a_choice():
     gains, taken, _ = camera_that_meters(-0.8)

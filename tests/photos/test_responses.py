@@ -19,15 +19,15 @@ def srgb(light):
     return np.interp(light, SRGB, np.linspace(0, 1, LEVELS))
 
 
-def take(response, *, noise=0.0, seed=0):
+def take(response, *, noise=0.0, seed=0, views=VIEWS, share=0.3):
     """Return log gains `[V, 1]`, and log light `[V, P, 3]` that sRGB reads from bytes."""
     rng = np.random.default_rng(seed)
-    gains = rng.uniform(-0.7, 0.7, (VIEWS, 1))
+    gains = rng.uniform(-0.7, 0.7, (views, 1))
     light = gains[:, None] + rng.uniform(np.log(0.02), np.log(0.9), (POINTS, 3))
     colors = np.rint(255 * np.clip(response(np.exp(light)), 0, 1)) / 255
     logs = np.log(np.interp(colors, np.linspace(0, 1, LEVELS), SRGB).clip(1e-6))
     logs = logs + noise * rng.standard_normal(logs.shape)
-    shown = ((colors > 0.03) & (colors < 0.97)).all(-1) & (rng.random(logs.shape[:2]) < 0.3)
+    shown = ((colors > 0.03) & (colors < 0.97)).all(-1) & (rng.random(logs.shape[:2]) < share)
     return gains - gains.mean(), np.where(shown[..., None], logs, np.nan)
 
 
@@ -49,6 +49,14 @@ def test_curve_and_gains_are_recovered(noise, bound):
     found = solve_gains(straight)
     scale = (found * gains).sum() / (3 * (gains**2).sum())
     np.testing.assert_allclose(found, scale * gains.repeat(3, 1), atol=bound)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5])
+def test_many_photographs_tell_a_curve_too(share):
+    """Whether most show few of the points, or each shows most of them."""
+    logs = take(shoulder, views=1000, share=share)[1]
+    few = fit_response(take(shoulder)[1])
+    np.testing.assert_allclose(fit_response(logs)[64:], few[64:], rtol=0.1)
 
 
 def test_a_curve_has_a_slope_of_1_and_keeps_the_mean():

@@ -21,6 +21,7 @@ _LEAST_MOTION = 0.1  # widths of a frame in the whole video; a tripod has less
 _ENOUGH = 3  # frames to compare in the middle of a part
 _BLURRED = 0.5  # share of the sharpness of frames nearby
 _QUALITY = 95  # of JPEG files
+_WIDEST = 4.0  # times that a pixel is wider than high, or higher; anamorphic lenses have 2
 
 
 def choose_frames(sharpness: np.ndarray, motion: np.ndarray, count: int) -> list[int]:
@@ -144,9 +145,13 @@ def open_video(video: pathlib.Path) -> cv2.VideoCapture:
 def _frames(
     video: pathlib.Path, chosen: Sequence[int] | None = None
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield indices and frames of a video, uint8 BGR `[H, W, 3]`: the chosen ones, or all."""
+    """Yield indices and frames of a video, uint8 BGR `[H, W, 3]`: the chosen ones, or all.
+
+    Frames are enlarged along one side where the video's pixels are not square.
+    """
     opened = open_video(video)
     try:
+        across, down = _stretch(opened)
         for index in itertools.count():
             if (chosen is not None and index > chosen[-1]) or not opened.grab():
                 return
@@ -154,9 +159,20 @@ def _frames(
                 good, frame = opened.retrieve()
                 if not good:
                     return
-                yield index, frame
+                size = round(across * frame.shape[1]), round(down * frame.shape[0])
+                yield index, cv2.resize(frame, size, interpolation=cv2.INTER_CUBIC)
     finally:
         opened.release()
+
+
+def _stretch(opened: cv2.VideoCapture) -> tuple[float, float]:
+    """Return factors of a frame's width and height, at least 1, that make its pixels square."""
+    ratio = opened.get(cv2.CAP_PROP_SAR_NUM) / (opened.get(cv2.CAP_PROP_SAR_DEN) or 1)
+    if not 1 / _WIDEST <= ratio <= _WIDEST:  # as files that do not say it have 0
+        return 1.0, 1.0
+    if opened.get(cv2.CAP_PROP_ORIENTATION_META) % 180:  # frames are turned, the ratio is not
+        ratio = 1 / ratio
+    return max(1.0, ratio), max(1.0, 1 / ratio)
 
 
 def _reduced(gray: np.ndarray, width: int) -> np.ndarray:

@@ -25,7 +25,7 @@ from jaxcloseup.photos.exposures import (
 from jaxcloseup.photos.responses import LEVELS, fit_response, straighten
 from jaxcloseup.photos.scene import Scene
 from jaxcloseup.photos.stated_exposures import StatedExposure, fit_cameras, gains_of_files
-from jaxcloseup.photos.views import camera_at, to_float
+from jaxcloseup.photos.views import Views, camera_at, to_float, unpadded
 
 
 Stated = Mapping[str, Sequence[StatedExposure | None]]  # of each photograph, by split
@@ -68,8 +68,9 @@ def measure_exposures(stereo: StereoDepths, scene: Scene) -> Exposures | None:
             same = jnp.zeros((len(views), 3), jnp.float32)
             views = at_middle_exposure(views, same, stack_curves(curves, took))
         log_gains, offsets = _solve(logs, stated["train"])
-        unpadded = [_crop(*photograph(view)) for view in range(len(views))]
-        metering = fit_metering(log_gains, unpadded)
+        # A camera meters around the middle of what it takes, which padding would move.
+        whole = unpadded(views, _sizes(views, scene))
+        metering = fit_metering(log_gains, [(to_float(each.rgb), each.weight) for each in whole])
         held_out = held_out_gains(scene, stated, offsets)
     print(_describe(log_gains, metering.slopes, held_out, curves))
     gains = jnp.asarray(log_gains, jnp.float32)
@@ -140,11 +141,11 @@ def held_out_gains(
     }
 
 
-def _crop(rgb: jax.Array, weight: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return a photograph without the padding at its right and bottom, which has no middle."""
-    used = np.asarray(weight) > 0
-    height, width = (int(np.max(np.nonzero(used.any(axis))[0], initial=0)) + 1 for axis in (1, 0))
-    return rgb[:height, :width], weight[:height, :width]
+def _sizes(views: Views, scene: Scene) -> list[tuple[int, int]]:
+    """Return width and height of each training photograph in `views`, without its padding."""
+    matched, read = views.cameras, scene.train.cameras
+    x, y = matched.width / read.width, matched.height / read.height
+    return [(round(x * width), round(y * height)) for width, height in scene.sizes("train")]
 
 
 def write_exposures(
