@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import PIL.Image
+import pytest
 from tiny_runs import TINY, programs_of
 
 from experiments.studies import (
@@ -22,6 +23,8 @@ from experiments.studies import (
 )
 from experiments.studies.pictures import write_rows
 from experiments.studies.tables import finished_runs, format_gain
+from jaxcloseup.app.cli.closeup_folder import check_folder, check_source
+from jaxcloseup.app.methods.method import TargetConfig
 from jaxcloseup.app.methods.registry import METHODS
 from jaxcloseup.app.methods.settings import with_settings
 from jaxcloseup.labels.config import LabelConfig
@@ -31,7 +34,7 @@ LEVELS = {"baseline": 20.0, "control": 21.0, "closeup": 21.5, "detail": 23.0}
 LEVELS |= {"test_time_control": 21.25, "test_time": 22.25}
 
 
-def write_run(folder, scene, gate=None):
+def write_run(folder, scene, gate=None, label="warp"):
     """Write results whose second view is 2 dB better, ordinary views 10 dB more."""
 
     def scores(level):
@@ -43,7 +46,8 @@ def write_run(folder, scene, gate=None):
         for stage, level in LEVELS.items()
     }
     folder.mkdir()
-    results = {"scene": scene, "stages": stages, "gate": gate}
+    config = {"labels": {"label": label}, "targets": None}
+    results = {"scene": scene, "stages": stages, "gate": gate, "config": config}
     (folder / "results.json").write_text(json.dumps(results))
     return str(folder)
 
@@ -66,6 +70,23 @@ def test_what_closeups_made_is_compared_but_for_times(tmp_path):
     assert interruptions.differing(one, other) == expected == interruptions.differing(other, one)
 
 
+def test_interrupted_closeups_begin_with_the_settings_of_finished_ones(tmp_path):
+    source, whole, folder = (tmp_path / name for name in ("photographs", "whole", "0"))
+    for path, text in {
+        source / "a.jpg": "a",
+        whole / "run" / "checkpoints" / "run.json": "{}",
+        whole / "source.json": json.dumps({"source": str(source), "files": [["a.jpg", 1]]}),
+        whole / "share" / "index.html": "a page",
+    }.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    interruptions.begin(whole, folder)
+    check_folder(str(source), "photographs", folder, mesh=False)  # closeup goes on in it
+    check_source(str(source), "photographs", folder)
+    files = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+    assert files == {"run/checkpoints/run.json", "source.json"}
+
+
 def test_tables_of_default_runs(tmp_path, capsys):
     runs = [write_run(tmp_path / "a", "bench"), write_run(tmp_path / "b", "/data/plush")]
     default_runs.print_all(finished_runs(runs, tmp_path, ()))
@@ -83,6 +104,9 @@ def test_a_closed_gate_is_said(tmp_path, capsys):
     folder = write_run(tmp_path / "a", "bench", gate={"weight": 0.0})
     default_runs.print_all(finished_runs([folder], tmp_path, ()))
     assert "| bench | the gate admits no labels |" in capsys.readouterr().out
+    folder = write_run(tmp_path / "b", "bench", gate={"weight": 0.0}, label="residual")
+    default_runs.print_all(finished_runs([folder], tmp_path, ()))  # labels that it does not govern
+    assert "| bench | +0.500 (+0.500 to +0.500) |" in capsys.readouterr().out
 
 
 def test_the_table_of_few_photographs(tmp_path, capsys):
@@ -101,10 +125,12 @@ def test_the_table_of_methods_has_means_of_drawn_scenes(capsys):
         return {"arms": {"control": scores}, "core_seconds": 60 * psnr, "peak_bytes": None}
 
     found = {"ngp": {"room": record(20.0), "table": record(22.0), "plush": record(30.0)}}
+    found["nerf"] = {"room": record(21.0), "plush": record(29.0)}  # it failed on the other
     methods_table.print_methods(found, "control")
     out = capsys.readouterr().out
     assert "| method | 2 drawn scenes: close-ups / ordinary |" in out
     assert "| ngp | 21.00 / 26.00 | 2.0 / - | 30.00 / 35.00 | 2.0 / - | 24.0 |" in out
+    assert "| nerf | - / - | - / - | 29.00 / 34.00 | 2.0 / - | - |" in out
 
 
 def test_gains_have_an_interval_over_views():
@@ -228,6 +254,34 @@ def test_the_papers_nerf_is_trained_piece_by_piece(capture_folder, tmp_path, cap
     assert [path.name for path in tmp_path.glob("checkpoints/*/")] == ["baseline"]
     paper_nerf.print_scores(stages)
     assert f"| test_time | {stages['test_time']['test']['psnr']:.2f} |" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("lr_scale", "targets", "control", "test_time_control"),
+    [(1.0, None, None, 1.0), (3.0, None, 3.0, 3.0), (3.0, 5.0, 3.0, 5.0)],
+)
+def test_controls_of_the_papers_nerf_learn_as_fast_as_those_of_a_run(
+    monkeypatch, lr_scale, targets, control, test_time_control
+):
+    labels = LabelConfig(lr_scale=lr_scale)
+    targets = targets and TargetConfig("warp", lr_scale=7.0, control_lr_scale=targets)
+    preset = dataclasses.replace(TINY, labels=labels, targets=targets)
+    scene = SimpleNamespace(test=SimpleNamespace(cameras=None))
+    programs = SimpleNamespace(preset=preset, photographs=None, scene=scene)
+    prepared = SimpleNamespace(data=None, steps=2)
+    monkeypatch.setattr(paper_nerf, "prepare_target_views", lambda *_: prepared)
+    start = SimpleNamespace(sources=None)
+    found = {name: data for name, data, _ in paper_nerf._fine_tunings(programs, start)}
+    assert found["control"].lr_scale == control
+    assert found["test_time_control"].lr_scale == test_time_control
+
+
+def test_exports_are_not_compared_where_photographs_are_masked():
+    export_formats = pytest.importorskip("experiments.studies.export_formats", exc_type=ImportError)
+    truth = np.full((4, 6, 3), 0.5, np.float32)
+    image, weight = truth + np.float32(0.1), np.ones((4, 6), np.float32)
+    image[:, :3], weight[:, :3] = 1, 0
+    assert export_formats._psnr([image], [truth], [weight]) == pytest.approx(20, abs=1e-3)
 
 
 def test_a_piece_ends_before_a_part_that_would_not_fit():

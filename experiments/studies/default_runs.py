@@ -26,6 +26,7 @@ from experiments.studies.tables import (
     print_table,
     score,
 )
+from jaxcloseup.app.report.headline import used_labels
 from jaxcloseup.app.score.metrics_text import REDUCED
 
 
@@ -108,7 +109,7 @@ def print_labels(runs: Mapping[str, Results]) -> None:
     for name, results in runs.items():
         if not {"closeup", "test_time", "test_time_control"} <= set(results["stages"]):
             continue
-        if (results["gate"] or {}).get("weight") == 0:
+        if not used_labels(results):
             row = [name, "the gate admits no labels", ""]
         else:
             gained, far = (gains(results, s, "closeup", "control") for s in (CLOSEUPS, ORDINARY))

@@ -27,7 +27,8 @@ from jaxcloseup.io.files import read_object
 
 
 FLAGS = flags.FLAGS
-_SETTINGS = pathlib.Path("run", "checkpoints", "run.json")
+# What begins a closeup: the settings of its training, and what says that the folder is its own.
+_BEGUN = ("run/checkpoints/run.json", "source.json")
 _MADE = ("closeups/*", "dolly.*", "share/**/*", "capture/sparse/**/*", "capture/images/*")
 _MADE += ("run/results.json", "run/exposures.json", "run/poses.json", "run/splats/*")
 _TIMES = ("time", "seconds", "minutes", "compil", "memory")  # in names of what is never the same
@@ -57,13 +58,23 @@ def main(_: list[str]) -> None:
             break
         if folder.exists():
             continue
-        (folder / _SETTINGS.parent).mkdir(parents=True)
-        shutil.copy(whole / _SETTINGS, folder / _SETTINGS)
+        begin(whole, folder)
         moments = [*_interrupted(folder, rng)]
         end = ", ".join(differing(whole, folder)) or "the same"
         rows += [[str(number), *moment, end] for moment in moments]
         print(f"closeups {number}: {len(moments)} interruptions, {end}", flush=True)
     print_table("Interruptions", ["closeups", "by", "after (s)", "while", "the end"], rows)
+
+
+def begin(whole: pathlib.Path, folder: pathlib.Path) -> None:
+    """Begin close-ups in a new folder, with the settings of finished ones.
+
+    Raises:
+      OSError: a file of theirs is missing, or the folder cannot be written.
+    """
+    for name in _BEGUN:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(whole / name, folder / name)
 
 
 def _interrupted(folder: pathlib.Path, rng: np.random.Generator) -> Iterator[list[str]]:

@@ -20,6 +20,7 @@ from jaxcloseup.io.files import read_object
 
 FLAGS = flags.FLAGS
 Record = Mapping[str, Any]  # of a method on a scene
+_FAILED: Record = {"arms": {}, "core_seconds": None}
 
 
 def define_flags() -> None:
@@ -46,21 +47,24 @@ def print_methods(methods: Mapping[str, Mapping[str, Record]], arm: str) -> None
     for method, scenes in methods.items():
         row = [method]
         for group in groups.values():
-            records = [scenes[name] for name in group if name in scenes]
+            records = [scenes.get(name, _FAILED) for name in group]
             row += [_pair(records, arm, "psnr", "{:.2f}".format)]
             row += [_pair(records, arm, "depth", lambda value: f"{100 * value:.1f}")]
-        seconds = [scene["core_seconds"] for scene in scenes.values() if scene["core_seconds"]]
-        rows.append([*row, f"{np.mean(seconds) / 60:.1f}" if seconds else "-"])
+        seconds = [scenes.get(name, _FAILED)["core_seconds"] for name in names]
+        rows.append([*row, f"{np.mean(seconds) / 60:.1f}" if all(seconds) else "-"])
     print_table(f"Methods, {arm}", [*header, "core-minutes"], rows)
 
 
 def _pair(records: Sequence[Record], arm: str, metric: str, write: Callable[[float], str]) -> str:
-    """Format the means over scenes of a metric of close-ups and of ordinary views."""
+    """Format the means over scenes of a metric of close-ups and of ordinary views.
+
+    It is "-" unless all scenes have it, because scenes are not equally hard.
+    """
     texts = []
     for split in (CLOSEUPS, ORDINARY):
         scores = [record["arms"].get(arm, {}).get(split, {}) for record in records]
         known = [one[metric] for one in scores if one.get(metric) is not None]
-        texts.append(write(float(np.mean(known))) if known else "-")
+        texts.append(write(float(np.mean(known))) if len(known) == len(records) else "-")
     return " / ".join(texts)
 
 

@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NoReturn
 
 import jax
+import jax.numpy as jnp
 from absl import flags
 
 from experiments.studies.tables import CLOSEUPS, ORDINARY, format_gain, gains, pair, print_table
@@ -195,8 +196,9 @@ def _work(piece: Piece, keys: RunKeys) -> None:
 def _fine_tunings(programs: Programs, start: LabelStart) -> Iterator[tuple[str, StepData, int]]:
     """Yield name, data and number of steps of the stages that continue the baseline."""
     preset, photographs = programs.preset, programs.photographs
-    settings = pseudo_settings(preset.labels)
-    yield "control", TrainData(photographs), preset.closeup_steps
+    settings, scale = pseudo_settings(preset.labels), preset.labels.lr_scale
+    control = TrainData(photographs, None if scale == 1 else jnp.float32(scale))
+    yield "control", control, preset.closeup_steps
     yield "closeup", CloseupData(photographs, start.sources, settings), preset.closeup_steps
     if programs.scene.test is None:
         return
@@ -204,7 +206,9 @@ def _fine_tunings(programs: Programs, start: LabelStart) -> Iterator[tuple[str, 
     prepared = prepare_target_views(
         programs, start, programs.scene.test.cameras, labels, pseudo_settings(labels), _no_detail
     )
-    yield "test_time_control", TrainData(photographs), prepared.steps
+    rate = preset.targets.control_lr_scale if preset.targets else labels.lr_scale
+    control = TrainData(photographs, jnp.float32(rate))
+    yield "test_time_control", control, prepared.steps
     yield "test_time", prepared.data, prepared.steps
 
 

@@ -29,6 +29,7 @@ from experiments.studies.pictures import render_detailed
 from experiments.studies.tables import print_table
 from experiments.studies.trained_run import open_run
 from jaxcloseup.app import progress
+from jaxcloseup.app.run.exposed import expose, how_taken
 from jaxcloseup.app.score.targets import score_divisor
 from jaxcloseup.artifacts.images import to_uint8
 from jaxcloseup.captures.load import load_scene
@@ -37,7 +38,7 @@ from jaxcloseup.io.files import read_object
 from jaxcloseup.metrics.image_metrics import psnr, quantize
 from jaxcloseup.metrics.resolution import resolved_period, ring_correlation
 from jaxcloseup.photos.scene import Scene
-from jaxcloseup.photos.views import Views, camera_at, to_float
+from jaxcloseup.photos.views import Photograph, Views, camera_at, to_float
 
 
 FLAGS = flags.FLAGS
@@ -182,39 +183,42 @@ def _train(capture: pathlib.Path, run: pathlib.Path) -> dict[str, Any]:
     return read_object(record)
 
 
-def _closeups(scene: Scene) -> Iterator[tuple[Camera, np.ndarray]]:
-    """Return cameras of about `_SHOWN` pixels' width with their true images `[H, W, 3]`.
+def _closeups(scene: Scene) -> Iterator[tuple[str, Photograph]]:
+    """Return close-ups of about `_SHOWN` pixels' width with their names in the captures.
 
     Cameras are in the coordinates of the capture's files, from which each run moves its scene.
     """
     if scene.surface is not None:
-        for camera in _views(scene, _SHOWN)["test"]:
-            yield camera, _draw(scene, camera)
+        for i, camera in enumerate(_views(scene, _SHOWN)["test"]):
+            weight = np.ones((camera.height, camera.width), np.float32)
+            yield f"{i:02d}", Photograph(camera, _draw(scene, camera), weight)
         return
     assert scene.photographs_at is not None
-    divisor = score_divisor(scene, _SHOWN)
-    for photograph in scene.photographs_at(divisor or scene.metadata["downscale"], "test"):
+    divisor = score_divisor(scene, _SHOWN) or scene.metadata["downscale"]
+    photographs = scene.photographs_at(divisor, "test")
+    for name, photograph in zip(scene.names["test"], photographs, strict=True):
         poses = scene.placement.poses_to_capture(np.asarray(photograph.camera.camtoworld))
-        yield photograph.camera.replace(camtoworld=poses), np.asarray(to_float(photograph.rgb))
+        yield name, photograph._replace(camera=photograph.camera.replace(camtoworld=poses))
 
 
-def _score(folder: pathlib.Path, closeups: Iterator[tuple[Camera, np.ndarray]]) -> list[str]:
+def _score(folder: pathlib.Path, closeups: Iterator[tuple[str, Photograph]]) -> list[str]:
     """Return PSNR and the finest resolved period of close-ups, field alone and with detail."""
     run, resolved = open_run(folder, "baseline"), jax.jit(ring_correlation)
     errors: dict[str, list[float]] = {"field": [], "detail": []}
     curves: dict[str, list[np.ndarray]] = {"field": [], "detail": []}
     placement = run.programs.scene.placement
-    for camera, photograph in closeups:
+    for name, (camera, rgb, weights) in closeups:
         pose = placement.poses_to_scene(np.asarray(camera.camtoworld))
         camera = camera.replace(camtoworld=jnp.asarray(pose, jnp.float32))
-        truth = quantize(jnp.asarray(photograph))
-        sharp = render_detailed(run, camera).rgb
-        plain = run.programs.render(run.state, camera).rgb
-        for name, image in (("field", plain), ("detail", sharp)):
-            errors[name].append(float(psnr(quantize(image), truth)))
-            curves[name].append(np.asarray(resolved(quantize(image), truth)))
-    values = [f"{np.mean(errors[name]):.2f}" for name in errors]
-    periods = [f"{resolved_period(np.mean(curves[name], axis=0)):.1f}" for name in curves]
+        truth, weight = quantize(to_float(rgb)), to_float(weights)
+        taken = how_taken(run.programs, "test", name)
+        seen = run.programs.render(run.state, camera)
+        for kind, found in (("field", seen.rgb), ("detail", render_detailed(run, camera).rgb)):
+            image = quantize(expose(run.programs, found, seen, taken))
+            errors[kind].append(float(psnr(image, truth, weight=weight)))
+            curves[kind].append(np.asarray(resolved(image, truth, weight=weight)))
+    values = [f"{np.mean(found):.2f}" for found in errors.values()]
+    periods = [f"{resolved_period(np.mean(found, axis=0)):.1f}" for found in curves.values()]
     return [" / ".join(values), " / ".join(periods)]
 
 

@@ -61,9 +61,11 @@ def write_colmap(
     for number, view in enumerate(views, 1):
         lens = f"PINHOLE {view.width} {view.height} {_numbers(view.intrinsics)}"
         camera = lenses.setdefault(lens, len(lenses) + 1)
-        rotation = view.camtoworld[:, :3].T
-        shift = -rotation @ view.camtoworld[:, 3]
-        pose = _numbers([*_quaternion(rotation), *shift])
+        quaternion = _quaternion(view.camtoworld[:, :3].T)
+        # Readers turn it back by the quaternion. The rotation, of float32, differs from that by
+        # little, but far from the origin by too much.
+        shift = -_matrix(quaternion) @ view.camtoworld[:, 3]
+        pose = _numbers([*quaternion, *shift])
         # No keypoints are known: their line is empty.
         images += [f"{number} {pose} {camera} {view.name}", ""]
     _write_lines(
@@ -143,3 +145,15 @@ def _quaternion(rotation: np.ndarray) -> np.ndarray:
         [yx - xy, xz + zx, yz + zy, zz - xx - yy],
     ]
     return np.linalg.eigh(matrix)[1][:, -1]
+
+
+def _matrix(quaternion: np.ndarray) -> np.ndarray:
+    """Return the rotation `[3, 3]` of a unit quaternion (w, x, y, z)."""
+    w, x, y, z = quaternion
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

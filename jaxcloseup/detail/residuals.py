@@ -107,8 +107,7 @@ def render_residuals(
       cameras: stacked `[V]`, of photographs at the size that the model learned from.
       pyramid: the photographs with their weights; its last level has that size.
       chosen: indices of the photographs; None takes all.
-      near: smallest z-depth of a surface, world units.
-      far: largest one.
+      near, far: smallest and largest z-depth of a surface, world units.
       brightest: see `Detail`.
       rendered: finest level that is rendered; `enlarge` makes finer ones.
       enlarge: `(rgb, camera, finer_camera) -> rgb` of a render; not called where `rendered` is 0.
@@ -130,12 +129,11 @@ def render_residuals(
             else:
                 assert enlarge is not None, "levels that are not rendered need `enlarge`"
                 rgb, shown_by = enlarge(rgb, shown_by, camera), camera
-            if not levels:
-                # The model reproduces the exposure best at the size that it learned from.
+            if not levels:  # at the size that the model learned from, where exposure is best known
                 colors = _match(photograph, rendering.rgb, rendering.alpha, brightest)
             if level == depth_level:
                 depth = label_depth(rendering, near=near, far=far)
-            residual = np.asarray(_subtract(photograph, rgb, colors, brightest))
+            residual = _subtract(photograph, rgb, colors, brightest)
             levels.append(_filled(residual, photograph[..., 3] == 0, *levels[-1:]))
         return np.concatenate([level.reshape(-1, 6) for level in levels[::-1]]), depth
 
@@ -180,7 +178,7 @@ def reproduced(shown: Pyramid, *, blur: Callable[[Any, float], Any] = blur_image
 
 
 def _filled(
-    residual: np.ndarray, masked: jax.Array, coarser: np.ndarray | None = None
+    residual: jax.Array, masked: jax.Array, coarser: np.ndarray | None = None
 ) -> np.ndarray:
     """Return a level whose masked pixels repeat those of the coarser level, if there is one.
 
@@ -188,7 +186,7 @@ def _filled(
     The coarser one has the mean of what the mask leaves.
     """
     if coarser is None or not masked.any():
-        return residual
+        return np.asarray(residual)
     rows, columns = (
         np.arange(size) * old // size
         for size, old in zip(masked.shape, coarser.shape, strict=False)

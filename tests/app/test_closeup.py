@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 from types import SimpleNamespace
 
@@ -16,6 +17,8 @@ from browser import open_browser, wait
 
 from jaxcloseup.app.cli import closeup as program
 from jaxcloseup.app.methods.registry import METHODS
+from jaxcloseup.app.share.closeups import CloseUp
+from jaxcloseup.app.share.scene_page import write_page
 
 
 @pytest.fixture
@@ -298,6 +301,26 @@ def test_a_page_of_one_file_needs_no_other(closeup, presented):
     text = (out / "share" / "index.html").read_text()
     assert "<script src" not in text and "<link" not in text and "data:image/webp" in text
     assert sorted(path.name for path in (out / "share").iterdir()) == ["index.html", "licenses.txt"]
+
+
+def test_a_photographs_name_is_no_markup_of_the_page(tmp_path):
+    """Browsers take `<!--<script` for the begin of what only `</script>` twice would end."""
+    camera, gray = plane.camera_above(0.0, 0.0, 3.0), np.full((24, 32, 3), 99, np.uint8)
+    name = "<!--<script>_16_12_2x"
+    one = CloseUp(name, camera, np.zeros(3), gray, gray, "here", "by little")
+    page = write_page(
+        tmp_path,
+        [one],
+        title="a </script> b",
+        splats=b"",
+        overview=camera,
+        distance=3.0,
+        up=np.array([0.0, 0, 1]),
+        single_file=True,
+    )
+    (data,) = re.findall(r"const DATA = (.*);\n", page.read_text())
+    assert "<" not in data
+    assert json.loads(data)["closeups"][0]["name"] == name
 
 
 def differ(image, expected):

@@ -10,11 +10,14 @@ import plane
 import pytest
 from absl import flags
 from absl.testing import flagsaver
+from reference_splats import rotation_of
 from tiny_capture import own_points, own_poses
 
 from jaxcloseup.app.cli import export as program
 from jaxcloseup.app.methods.registry import METHODS
+from jaxcloseup.app.store.stored_run import load_run_scene, read_run
 from jaxcloseup.app.view import exporting
+from jaxcloseup.artifacts.capture_files import FileView, write_colmap
 from jaxcloseup.artifacts.surfel_ply import read_surfels
 from jaxcloseup.captures.load import load_scene
 from jaxcloseup.io.placement import Placement
@@ -48,6 +51,18 @@ def test_splats_are_written_in_every_format(exported):
     assert sizes["splats.spz"] < sizes["splats.compressed.ply"] < sizes["splats.ply"] / 3
     header = (exported / "splats.compressed.ply").read_bytes().partition(b"end_header")[0]
     assert f"element vertex {len(splats.means)}\n".encode() in header
+
+
+def test_the_offset_that_spz_cannot_hold_is_printed(kept, tmp_path, capsys):
+    record = read_run(kept)
+    scene = load_run_scene(record)
+    files = ["splats.ply", "splats.spz"]
+    for origin, said in ((np.zeros(3), 0), (np.array([4e5, 5e6, 100.0]), 1)):
+        placed = dataclasses.replace(scene, placement=Placement(origin, 1.0))
+        exporting.export_splats(tmp_path, record, placed, "baseline", files)
+        out = capsys.readouterr().out
+        offset = "splats.spz has the capture's coordinates minus 400000, 5000000, 100, then turned"
+        assert out.count(offset) == out.count("coordinates minus") == said
 
 
 def test_our_loader_reads_the_cameras_back(exported, capture_folder):
@@ -85,6 +100,25 @@ def test_pycolmap_reads_the_cameras(exported, capture_folder):
         )
         lens = getattr(scene, split).cameras.intrinsics[0]
         np.testing.assert_allclose(camera.params, lens, rtol=1e-6)
+
+
+def test_a_reader_of_colmaps_text_finds_cameras_far_from_the_origin(tmp_path):
+    """It computes -R^T t with the R of the quaternion, and float32 has rounded the rotation."""
+    rng = np.random.default_rng(0)
+    turns = [cv2.Rodrigues(rng.normal(size=3))[0].astype(np.float32) for _ in range(8)]
+    positions = np.array([4e5, 5e6, 100]) + rng.normal(size=(8, 3))
+    views = [
+        FileView(f"{i}.png", "train", np.column_stack([turn, position]), np.ones(4), 24, 32, False)
+        for i, (turn, position) in enumerate(zip(turns, positions, strict=True))
+    ]
+    write_colmap(tmp_path, views, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    lines = (tmp_path / "images.txt").read_text().splitlines()[1::2]
+    for line, turn, position in zip(lines, turns, positions, strict=True):
+        _, *pose, _, _ = line.split()
+        quaternion, shift = np.split(np.array(pose, float), [4])
+        rotation = rotation_of(quaternion)
+        np.testing.assert_allclose(rotation.T, turn, atol=1e-6)
+        np.testing.assert_allclose(-rotation.T @ shift, position, rtol=0, atol=1e-7)
 
 
 def test_masks_and_far_origins_are_kept(capture_folder, tmp_path):

@@ -6,8 +6,10 @@ from types import SimpleNamespace
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcloseup.app.methods.registry import METHODS
+from jaxcloseup.app.run.photograph_sizes import describe_training
 from jaxcloseup.app.run.residuals import enlarge
-from jaxcloseup.app.score.targets import targets_by_split
+from jaxcloseup.app.score.targets import make_targets, targets_by_split
 from jaxcloseup.captures.load import SceneError, load_scene
 from jaxcloseup.geometry.cameras import Camera, pixel_grid
 from jaxcloseup.photos.pyramids import scene_pyramid
@@ -48,6 +50,22 @@ def test_held_out_parts_of_photographs_are_not_read(capture_folder):
     scene = load_scene(str(capture_folder), split="zoom", zoom=2)
     assert scene.photographs_at is None
     assert scene_pyramid(scene)[0].sizes[0] == scene.train.rgb.shape[1:3]
+
+
+def test_photographs_hold_no_finer_detail_than_is_read_of_them(capture_folder):
+    """Half as large, and a further fourth with the split that holds their own pixels out."""
+    scene = load_scene(str(capture_folder), split="zoom", zoom=2, downscale=2)
+    flat = lambda camera: SimpleNamespace(depth=jnp.full((camera.height, camera.width), 3.0))  # noqa: E731
+    depths = jnp.full(scene.train.weight.shape, 3.0)
+    (found, *_) = make_targets(scene, "test", depths, flat)
+    camera, whole = found.camera, dataclasses.replace(scene, metadata={**scene.metadata})
+    whole.metadata["downscale"] = 1
+    assert found.could_resolve == make_targets(whole, "test", depths, flat)[0].could_resolve > 2.5
+    finer = dataclasses.replace(scene, photographs_at=lambda *_: [])
+    held = make_targets(finer, "test", depths, flat)[0].could_resolve
+    assert camera.width == 8 and held == max(2, found.could_resolve / 2)
+    preset = METHODS["surfels"].presets["quick"]
+    assert "photographs of 8 x 6, 1 / 4 of their size" in describe_training(preset, scene)
 
 
 def test_views_are_scored_at_their_own_size_only_where_finer_photographs_are_kept(

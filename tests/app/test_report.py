@@ -20,6 +20,9 @@ from jaxcloseup.geometry.cameras import Camera
 from jaxcloseup.photos.pyramids import Pyramid
 
 
+CONFIG = {"labels": {"label": "warp"}, "targets": None}
+
+
 def results(psnr, *, weight=None, detail=None, **changes):
     """Results of stages with these PSNRs of close-ups; ordinary views have 10 dB more."""
 
@@ -33,7 +36,7 @@ def results(psnr, *, weight=None, detail=None, **changes):
             for stage, value in psnr.items()
         },
         "gate": gate,
-        "config": {"targets": None},
+        "config": CONFIG,
         "detail": detail and {"stage": detail},
         "history": {"closeup": [{"label_coverage": 0.254}]},
         "resolution": [120, 68],
@@ -70,24 +73,30 @@ def test_without_close_ups_the_ordinary_views_count():
 
 
 @pytest.mark.parametrize(
-    ("weight", "targets", "stages"),
+    ("weight", "labels", "targets", "stages"),
     [
-        (0.0, None, ["baseline", "control, closeup", "test_time_control, test_time"]),
-        (0.1, None, ["baseline", "control", "closeup", "test_time", "test_time_control"]),
+        (0.0, "warp", None, ["baseline", "control, closeup", "test_time_control, test_time"]),
+        (0.1, "warp", None, ["baseline", "control", "closeup", "test_time", "test_time_control"]),
         # Labels with detail have no gate.
         (
-            *(0.0, {"label": "residual"}),
+            *(0.0, "warp", {"label": "residual"}),
             ["baseline", "control, closeup", "test_time", "test_time_control"],
+        ),
+        (
+            *(0.0, "residual", {"label": "warp"}),
+            ["baseline", "control", "closeup", "test_time_control, test_time"],
         ),
     ],
 )
-def test_stages_without_labels_share_the_row_of_their_control(weight, targets, stages):
+def test_stages_without_labels_share_the_row_of_their_control(weight, labels, targets, stages):
     psnr = {"baseline": 19.0, "control": 20.0, "closeup": 20.0, "test_time": 20.5}
-    found = results(psnr | {"test_time_control": 20.0}, weight=weight, config={"targets": targets})
+    config = {"labels": {"label": labels}, "targets": targets}
+    found = results(psnr | {"test_time_control": 20.0}, weight=weight, config=config)
     table = run_tables(found)[0]
     assert table.header == ["stage", "PSNR (dB)", "SSIM", "color-corrected", "depth off by"]
     assert table.rows[1][1:] == ["20.00", "0.5000", "21.00", "1.23%"]
     assert [row[0] for row in table.rows] == stages
+    assert ("not used" in conclusion(found)) == ("control, closeup" in stages)
 
 
 def test_tables_show_the_reduced_size_and_perceptual_distances():
@@ -132,7 +141,7 @@ def written(tmp_path_factory):
     tried |= {"label_psnr": 30.0, "model_psnr": 31.0}
     found["gate"] = {"weight": 0.0, "agreement": 0.08, "left_out": [tried]}
     found |= {"labels": {"exact_depth": audit}, "left_out": None}
-    found |= {"config": {"targets": None, "name": "long " * 50}}
+    found |= {"config": {**CONFIG, "name": "long " * 50}}
     errors = [{"expected": 0.1, "actual": 0.2}]
     found["detail"] = {"stage": "baseline", "errors": errors, "sizes": [[36, 48]]}
     found["detail"] |= {"ause": 0.123, "pearson": 0.456}

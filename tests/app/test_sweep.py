@@ -22,6 +22,8 @@ from tiny_runs import TINY, TINY_SURFELS, programs_of
 from tiny_training import assert_same_step
 
 from jaxcloseup.app.cli import sweep
+from jaxcloseup.app.methods.registry import METHODS
+from jaxcloseup.app.methods.settings import with_settings
 from jaxcloseup.app.report.pictures import comparisons
 from jaxcloseup.app.report.sweep_tables import write_sweep
 from jaxcloseup.app.run.labels import start_labels
@@ -187,6 +189,27 @@ def test_flags_that_make_no_sense_are_one_sentence(
     with flagsaver.flagsaver(output_dir=out, **changes), pytest.raises(SystemExit, match=message):
         sweep.main(["sweep"])
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arm", "settings"),
+    [
+        ("test_time", ["label_loss_weight=0.3"]),
+        ("test_time", ["targets.label_loss_weight=0.7"]),
+        ("test_time+label_loss_weight=0.7", []),
+        ("diverse+label=residual+label_loss_weight=0.2", []),
+        ("depth_error=0+label_loss_weight=0.2", []),
+        ("label_loss_weight=0.3", ["num_label_rays=none"]),
+    ],
+)
+def test_losses_that_are_added_may_have_any_weight(parsed_flags, arm, settings):
+    """The preset pools losses in steps that label single pixels of close-ups anew, and there alone.
+
+    `test_flags_that_make_no_sense_are_one_sentence` has an arm of these.
+    """
+    preset = with_settings(METHODS["ngp"].presets["quick"], settings)
+    with flagsaver.flagsaver(arms=["control", arm]):
+        sweep._check_flags(preset)
 
 
 def test_an_arm_may_have_labels_from_the_other_depth(capture_folder, tmp_path):

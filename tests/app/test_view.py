@@ -271,9 +271,15 @@ def test_closeups_are_found_by_pixels_and_gone_back_to(serve, kept):
             detail=True,
         )[0]
         np.testing.assert_array_equal(shown(client), expected)
+        visitor._visit(2)
+        assert np.linalg.norm(client.camera.position - cameras[-1]) > 0.05
+        visitor._on_back(None)  # from the photograph
+        np.testing.assert_allclose(client.camera.position, cameras[-1], atol=1e-6)
     assert np.linalg.norm(cameras[0] - cameras[1]) > 0.05
     visitor._on_back(None)
     np.testing.assert_allclose(client.camera.position, cameras[0], atol=1e-6)
+    visitor._on_back(None)
+    assert "no earlier" in visitor._status.content
 
 
 def test_fine_tuning_is_shown_and_sent_until_the_camera_moves(serve, kept, monkeypatch):

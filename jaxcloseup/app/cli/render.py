@@ -104,6 +104,7 @@ _ONLY_WITH = {
     "frames": ("orbit", "from"),
     **dict.fromkeys(("width", "height", "scale"), ("views", "orbit", "from")),
     **dict.fromkeys(("pixel", "magnification"), ("from",)),
+    "fps": ("camera_path", "target", "orbit", "from"),  # views are no video
     "up": ("orbit",),
     "camera_transform": ("camera_path", "target"),
 }

@@ -17,6 +17,7 @@ Splits = Mapping[str, Mapping[str, Any]]  # metrics by split
 
 # Perceptual distances where their networks are available, else PSNR of corrected colors.
 _LAST = ("lpips_vgg", "lpips_alex", "cc_psnr")
+_CONTROLS = {"closeup": "control", "test_time": "test_time_control"}  # of stages with labels
 _SHORT = {"cc_psnr": "color-corrected"} | dict.fromkeys(DEPTH_ERRORS, "depth off by")
 
 
@@ -26,9 +27,12 @@ def best_stage(stages: Iterable[str]) -> str:
     return "detail" if "detail" in stages else stages[-1]
 
 
-def used_labels(results: Mapping[str, Any]) -> bool:
-    """Return True if the gate, or a run without one, used labels."""
-    return results["gate"] is None or results["gate"]["weight"] > 0
+def used_labels(results: Mapping[str, Any], stage: str = "closeup") -> bool:
+    """Return True if `closeup` or `test_time` used labels; the gate can disable warped ones."""
+    config, gate = results["config"], results["gate"]
+    targets = config.get("targets") if stage == "test_time" else None
+    labels = targets or config["labels"]
+    return labels["label"] != "warp" or gate is None or gate["weight"] > 0
 
 
 def conclusion(results: Mapping[str, Any]) -> str:
@@ -80,15 +84,10 @@ def compare_psnr(change: float, digits: int) -> str:
 def run_tables(results: Mapping[str, Any]) -> list[Table]:
     """Return `score_tables` of a run; stages that used no labels share a row with their control."""
     names = {stage: stage for stage in results["stages"]}
-    if not used_labels(results):
-        targets = results["config"].get("targets")
-        gated = {"closeup": "control"}
-        if targets is None or targets["label"] == "warp":
-            gated["test_time"] = "test_time_control"
-        for stage, control in gated.items():
-            if stage in names and control in names:
-                del names[stage]
-                names[control] = f"{control}, {stage}"
+    for stage, control in _CONTROLS.items():
+        if {stage, control} <= set(names) and not used_labels(results, stage):
+            del names[stage]
+            names[control] = f"{control}, {stage}"
     return score_tables(results["stages"], reduced_size=results["resolution"], names=names)
 
 

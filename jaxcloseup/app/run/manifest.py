@@ -106,7 +106,8 @@ def write_dataparser_transforms(folder: pathlib.Path, scene: Scene) -> None:
 
     Exports use the world of the capture's files. `transform` and `scale` lead to it from the
     capture's original world: they are the `applied_transform` and `applied_scale` of the capture's
-    `transforms.json`, less the offset that exports leave out.
+    `transforms.json`, less the offset that exports leave out. As in nerfstudio's own records, this
+    shift is in the unit of the files, which `applied_scale` has led to already.
     """
     applied = scene.metadata.get("applied_transform")
     transform = np.eye(3, 4) if applied is None else applied

@@ -84,8 +84,9 @@ def make_targets(
     """
     photographs = photographs or unpadded(getattr(scene, split), scene.sizes(split))
     surface = _geometry(scene.surface) if scene.surface else None
-    find, own = jax.jit(find_support), scene.metadata.get("downscale", 1)
-    measure = jax.jit(measure_proximity)
+    find, measure = jax.jit(find_support), jax.jit(measure_proximity)
+    # With --split=zoom, the photographs' own pixels are held out.
+    own = scene.metadata.get("downscale", 1) if scene.photographs_at else 1
 
     def make(i: int) -> Target:
         camera, rgb, weight = photographs[i]

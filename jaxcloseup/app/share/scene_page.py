@@ -65,7 +65,9 @@ def write_page(
         "splats": base64.b64encode(splats).decode(),
     }
     texts = {name: (_ASSETS / name).read_text() for name in ("page.css", "viewer.js", "page.js")}
-    texts["data.js"] = f"const DATA = {json.dumps(data)};\n"
+    # Within a page, `<!--<script` of a photograph's name would hide the script's end.
+    encoded = json.dumps(data).replace("<", "\\u003c")
+    texts["data.js"] = f"const DATA = {encoded};\n"
     scripts = [(name, texts[name]) for name in ("viewer.js", "data.js", "page.js")]
     environment = jinja2.Environment(autoescape=True)
     page = environment.from_string((_ASSETS / "index.html").read_text()).render(

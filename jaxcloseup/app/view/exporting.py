@@ -49,6 +49,9 @@ def export_splats(
 ) -> None:
     """Write the splats of a stage to files in the capture's coordinates, and print their sizes.
 
+    Files leave out the offset of a far origin and say it themselves; for SPZ, which cannot, it is
+    printed.
+
     Args:
       output_dir: folder to write.
       record: the run.
@@ -79,6 +82,12 @@ def export_splats(
         else:
             write_surfels(path, surfels, alive, placement=scene.placement)
         print(f"wrote {path}, {path.stat().st_size / 1e6:.1f} MB")
+        if name == "splats.spz" and scene.placement.offset.any():
+            shift = ", ".join(f"{value:.15g}" for value in scene.placement.offset)
+            print(
+                f"{path} has the capture's coordinates minus {shift}, then turned so that y is up; "
+                "the format has no place to say so"
+            )
 
 
 def _shown(programs: Programs, state: TrainState, alive: jax.Array) -> np.ndarray:

@@ -34,6 +34,7 @@ class Visitor:
         self._viewer, self._client = viewer, client
         self._aim: tuple[Camera, np.ndarray] | None = None  # source camera, point
         self._history: list[tuple[Camera, float]] = []  # cameras, and how far ahead their point is
+        self._at_photograph = False  # whether a visit to a photograph has left the close-up
         self._prepared: Prepared | None = None  # what rendered the window last
         self._rendered: Camera | None = None  # the window's camera while its render is shown
         self._size = (0, 0)  # of the rendered window
@@ -192,6 +193,7 @@ class Visitor:
         for i, frustum in enumerate(self._frustums):
             frustum.visible = i != index
         self._bring(self._viewer.scene.camera("train", index), self._viewer.distance)
+        self._at_photograph = True
 
     def _on_click(self, event: Any) -> None:
         # Viser reports a click on a training camera a second time, as a click on the scene.
@@ -213,12 +215,14 @@ class Visitor:
         self._viewer.later("finding that surface", lambda: self._aim_at(*ray), self._say)
 
     def _on_back(self, _: Any) -> None:
-        """Go back to the close-up before this one."""
-        if len(self._history) < 2:
+        """Go back to the close-up before this one, or before the visit to a photograph."""
+        visiting = self._at_photograph
+        if len(self._history) < (1 if visiting else 2):
             self._say("There is no earlier close-up.")
             return
-        self._history.pop()
-        self._aim = None  # the slider moves along the ray of the newest click alone
+        if not visiting:
+            self._history.pop()
+            self._aim = None  # the slider moves along the ray of the newest click alone
         self._bring(*self._history[-1])
 
     def _on_tune(self, _: Any) -> None:
@@ -274,7 +278,7 @@ class Visitor:
     def _bring(self, camera: Camera, distance: float) -> None:
         """Move the visitor to a camera; dragging then orbits a point `distance` ahead."""
         position, forward = np.asarray(camera.position), np.asarray(camera.rotation)[:, 2]
-        client = self._client
+        client, self._at_photograph = self._client, False
         with client.atomic():
             client.camera.position = position
             client.camera.look_at = position + distance * forward
