@@ -6,7 +6,7 @@ A correction is a text, so that a run can record it:
     inverse         the file's matrices are world-to-camera in place of camera-to-world
     order=2,0,1     photograph i has the pose of photograph 2, 0, 1, ... in the file's order
     turn=1          photographs are turned back by so many quarter turns, counterclockwise
-    size=2          intrinsics are of photographs so many times as large
+    size=2          intrinsics are of photographs so many times as large as stated
     focal=0.5       focal lengths are multiplied
     center=0.1,0    the principal point moves by so many widths and heights
     points=none     the capture's points are not used
