@@ -4,7 +4,7 @@ import dataclasses
 
 from jaxcloseup.app.methods import surfels
 from jaxcloseup.app.methods.method import Preset, TargetConfig
-from jaxcloseup.fields.splats.config import AdaptiveConfig, GaussianConfig
+from jaxcloseup.fields.splats.config import GaussianConfig
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,10 +28,14 @@ def _as_gaussians(config: surfels.SurfelTrainingConfig) -> GaussianTrainingConfi
     return GaussianTrainingConfig(**values | {"distortion_weight": 0.0, "raster": raster})
 
 
-_MIN_OPACITY = 0.005  # as published; surfels are removed below 0.05
+def _pruned_as_published(preset: Preset) -> Preset:
+    """Return the preset of clone, split and prune that keeps fainter splats than surfels'."""
+    density = dataclasses.replace(preset.field.density, min_opacity=0.005)
+    return dataclasses.replace(preset, field=dataclasses.replace(preset.field, density=density))
+
 
 PAPER_MCMC = of_gaussians(surfels.PAPER)
-PAPER = surfels.with_adaptive_density(PAPER_MCMC, AdaptiveConfig(min_opacity=_MIN_OPACITY))
+PAPER = _pruned_as_published(of_gaussians(surfels.PAPER_ADAPTIVE))
 _QUICK = of_gaussians(surfels.QUICK)
 # The published learning rates; what is faster for surfels was not measured for volumes.
 QUICK = dataclasses.replace(
@@ -41,11 +45,7 @@ QUICK = dataclasses.replace(
     ),
     targets=TargetConfig("residual", lr_scale=5.0, control_lr_scale=5.0),
 )
-QUICK_ADAPTIVE = of_gaussians(
-    surfels.with_adaptive_density(
-        surfels.REDUCED, AdaptiveConfig(start=200, stop=1200, min_opacity=_MIN_OPACITY)
-    )
-)
+QUICK_ADAPTIVE = _pruned_as_published(of_gaussians(surfels.QUICK_ADAPTIVE))
 
 METHOD = dataclasses.replace(
     surfels.METHOD,

@@ -180,8 +180,8 @@ def _grow_when_due(state: Any, config: TensorfConfig) -> Any:
         due = state.buffers.vertices != vertices
         return jax.lax.cond(due, lambda s: _grown(s, vertices), lambda s: s, state)
 
-    # Of a batch of states, `follow` computes the growth whether it is due or not; they share their
-    # step, after which all have grown.
+    # In a batch of states, `follow` computes the growth in every step, due or not. The states share
+    # their step, so that this ends when all have grown.
     return jax.lax.cond(growths <= config.growths, follow, lambda s: s, state)
 
 
